@@ -1,0 +1,95 @@
+"""What every reader offers, and the checks that its frames pass before they reach a model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+
+from logvggt_jax.types import Frames
+
+SPLITS = ("train", "val", "test", "all")
+
+
+class Dataset(Protocol):
+    """Posed frames with depth, in named sequences.
+
+    Frames that count have an image, a calibration and a finite pose; they are numbered 0 … num_frames - 1 in
+    time order. Sets without poses give NaN extrinsics and keep their frames.
+    """
+
+    @property
+    def sequences(self) -> Sequence[str]:
+        """Unique sequence names."""
+        ...
+
+    def num_frames(self, sequence: str) -> int:
+        """Number of frames of `sequence` that count."""
+        ...
+
+    def frame_names(self, sequence: str) -> Sequence[str]:
+        """Unique names of these frames, in time order."""
+        ...
+
+    def read(self, sequence: str, indices: Sequence[int]) -> Frames:
+        """Frames `indices` of `sequence`, in the order asked for."""
+        ...
+
+
+def check_split(split: str) -> None:
+    """Raises ValueError unless `split` is one of `SPLITS`."""
+    if split not in SPLITS:
+        raise ValueError(f"unknown split {split!r}: choose one of {', '.join(SPLITS)}")
+
+
+def check_sequence(sequence: str, sequences: Sequence[str], where: str) -> None:
+    """Raises KeyError naming the data set `where` unless it has `sequence`."""
+    if sequence not in sequences:
+        known = ", ".join(list(sequences)[:3])
+        raise KeyError(f"{where} has no sequence {sequence!r}; it has {len(sequences)}, for example {known}")
+
+
+def check_indices(indices: Sequence[int], num_frames: int, where: str) -> list[int]:
+    """`indices` as a list of integers; raises IndexError naming `where` for none or one outside [0, num_frames)."""
+    checked = [int(i) for i in indices]
+    if not checked:
+        raise IndexError(f"{where}: no frame indices given; ask for at least one of 0 … {num_frames - 1}")
+    for index in checked:
+        if not 0 <= index < num_frames:
+            raise IndexError(f"{where}: frame {index} does not exist; indices go from 0 to {num_frames - 1}")
+    return checked
+
+
+def check_frames(frames: Frames, where: str) -> None:
+    """Raises ValueError, naming `where` and the frame, unless `frames` can be trained or evaluated on.
+
+    Checked: shapes and dtypes as `Frames` documents them, depth finite and not negative, intrinsics finite with
+    positive focal lengths, extrinsics finite and rigid (rotation orthonormal to 1e-3, determinant +1).
+    """
+    if frames.images.ndim != 4 or frames.images.shape[3] != 3 or frames.images.dtype != np.uint8:
+        raise ValueError(
+            f"{where}: images must be uint8 [T, H, W, 3], got {frames.images.dtype} {frames.images.shape}"
+        )
+    count, height, width = frames.images.shape[:3]
+    expected = {"depth": (count, height, width), "intrinsics": (count, 3, 3), "extrinsics": (count, 4, 4)}
+    for name, shape in expected.items():
+        array = getattr(frames, name)
+        if array.shape != shape or array.dtype != np.float32:
+            raise ValueError(f"{where}: {name} must be float32 {shape}, got {array.dtype} {array.shape}")
+    focal = frames.intrinsics[:, (0, 1), (0, 1)]
+    rotation = frames.extrinsics[:, :3, :3].astype(np.float64)
+    orthonormal = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max((1, 2)) < 1e-3
+    checks = {
+        "depth must be finite": np.isfinite(frames.depth).all((1, 2)),
+        "depth must not be negative (0 marks invalid pixels)": (frames.depth >= 0).all((1, 2)),
+        "intrinsics must be finite with positive focal lengths": np.isfinite(frames.intrinsics).all((1, 2))
+        & (focal > 0).all(1),
+        "extrinsics must be finite": np.isfinite(frames.extrinsics).all((1, 2)),
+        "extrinsics must hold rotations (R R^T = I to 1e-3, determinant +1)": orthonormal
+        & (np.linalg.det(rotation) > 0),
+    }
+    for requirement, passed in checks.items():
+        if not passed.all():
+            frame = int(np.argmin(passed))
+            raise ValueError(f"{where}: {requirement}; frame {frame} of this read fails: repair or drop that frame")

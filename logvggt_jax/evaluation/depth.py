@@ -1,0 +1,168 @@
+"""Video depth: alignment of a clip's depth to the ground truth, and the field's error measures.
+
+Source: the evaluation code of CUT3R and its descendants (`eval/video_depth/tools.py`), in float64.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+ALIGNMENTS = ("metric", "scale", "median", "lstsq", "scale_shift")
+DEPTH_KEYS = ("abs_rel", "sq_rel", "rmse", "log_rmse", "delta_1.25", "delta_1.25^2", "delta_1.25^3")
+
+_SMALLEST_DEPTH = 1e-5
+_SMALLEST_SCALE = 1e-3
+
+
+def depth_metrics(
+    prediction: np.ndarray,
+    target: np.ndarray,
+    *,
+    alignment: str,
+    max_depth: float | None = None,
+    clip: float | None = None,
+    mask: np.ndarray | None = None,
+) -> dict[str, float]:
+    """Errors of predicted z-depth, aligned and pooled over all pixels of a clip.
+
+    Args:
+      prediction: [..., H, W] depth of any unit; sizes that differ from the target's need `resize_depth`
+        first.
+      target: [..., H, W] true depth; pixels with 0 < target (< `max_depth`) are valid.
+      alignment: `metric` none; `scale` ten reweighted steps towards the least absolute error; `median` ratio
+        of the lower medians; `lstsq` least-squares scale and shift; `scale_shift` at most 1,000 Adam steps on
+        the sum of absolute errors.
+      max_depth: exclusive upper bound of valid target depth.
+      clip: upper bound put on the aligned prediction (Sintel: 70 m).
+      mask: [..., H, W] bool; restricts the errors, not the alignment.
+
+    Returns:
+      `abs_rel`, `sq_rel`, `rmse`, `log_rmse`, `delta_1.25`, `delta_1.25^2`, `delta_1.25^3` (fractions) and
+      `valid_pixels`; all 0 without a valid pixel. A NaN in a valid pixel makes the means NaN and counts as a
+      miss in the fractions.
+
+    Raises:
+      ValueError: unknown alignment, shapes that differ, a mask that is not boolean.
+    """
+    prediction, target = np.asarray(prediction, np.float64), np.asarray(target, np.float64)
+    if prediction.shape != target.shape:
+        raise ValueError(
+            f"depth_metrics: prediction {prediction.shape} and target {target.shape} must agree; "
+            "resize the prediction with resize_depth"
+        )
+    if mask is not None and (mask.shape != target.shape or mask.dtype != np.bool_):
+        raise ValueError(f"depth_metrics: mask must be bool of shape {target.shape}, got {mask.dtype} {mask.shape}")
+    if alignment not in ALIGNMENTS:
+        raise ValueError(f"depth_metrics: alignment must be one of {ALIGNMENTS}, got {alignment!r}")
+    valid = target > 0
+    if max_depth is not None:
+        valid &= target < max_depth
+    scored = valid if mask is None else valid & mask
+    if not scored.any():
+        return {**dict.fromkeys(DEPTH_KEYS, 0.0), "valid_pixels": 0.0}
+
+    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+        scale, shift = align_depth(prediction[valid], target[valid], alignment)
+        predicted, true = scale * prediction[scored] + shift, target[scored]
+        if clip is not None:
+            predicted = np.minimum(predicted, clip)
+        error = predicted - true
+        clamped = np.maximum(predicted, _SMALLEST_DEPTH)
+        ratio = np.maximum(clamped / true, true / clamped)
+        return {
+            "abs_rel": float(np.mean(np.abs(error) / true)),
+            "sq_rel": float(np.mean(error**2 / true)),
+            "rmse": float(np.sqrt(np.mean(error**2))),
+            "log_rmse": float(np.sqrt(np.mean((np.log(clamped) - np.log(true)) ** 2))),
+            "delta_1.25": float(np.mean(ratio < 1.25)),
+            "delta_1.25^2": float(np.mean(ratio < 1.25**2)),
+            "delta_1.25^3": float(np.mean(ratio < 1.25**3)),
+            "valid_pixels": float(true.size),
+        }
+
+
+def align_depth(prediction: np.ndarray, target: np.ndarray, alignment: str) -> tuple[float, float]:
+    """Scale and shift that carry valid depths `prediction` [N] onto `target` [N]; see `depth_metrics`."""
+    if alignment == "metric":
+        return 1.0, 0.0
+    if alignment == "scale":
+        return _least_absolute_scale(prediction, target), 0.0
+    if alignment == "median":
+        return lower_median(target) / lower_median(prediction), 0.0
+    if alignment == "lstsq":
+        return _least_squares(prediction, target)
+    return _adam_scale_shift(prediction, target)
+
+
+def lower_median(values: np.ndarray) -> float:
+    """Median that takes the lower of two middle values, as torch.median; NaN if any value is NaN."""
+    values = np.ravel(values)
+    if np.isnan(values).any():
+        return float("nan")
+    middle = (values.size - 1) // 2
+    return float(np.partition(values, middle)[middle])
+
+
+def mean_depth_metrics(clips: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Data-set score: the mean over clips weighted by valid pixels. NaN without a valid pixel."""
+    weights = np.array([clip["valid_pixels"] for clip in clips], np.float64)
+    total = float(weights.sum())
+    scores = {
+        key: float(weights @ np.array([clip[key] for clip in clips])) / total if total else float("nan")
+        for key in DEPTH_KEYS
+    }
+    return {**scores, "valid_pixels": total}
+
+
+def resize_depth(depth: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Predicted depth [T, h, w] at `size` (H, W), resampled as the reference does: OpenCV bicubic.
+
+    For predictions only: ground truth has holes that must not be interpolated.
+    """
+    import cv2
+
+    height, width = size
+    frames = [cv2.resize(frame, (width, height), interpolation=cv2.INTER_CUBIC) for frame in depth]
+    return np.stack(frames)
+
+
+def _least_absolute_scale(prediction: np.ndarray, target: np.ndarray, iterations: int = 10) -> float:
+    scale = target.mean() / prediction.mean()
+    for _ in range(iterations):
+        weights = 1.0 / (np.abs(scale * prediction - target) + 1e-8)
+        scale = (weights * prediction * target).sum() / (weights * prediction**2).sum()
+    return float(np.maximum(scale, _SMALLEST_SCALE))
+
+
+def _least_squares(prediction: np.ndarray, target: np.ndarray) -> tuple[float, float]:
+    if not np.isfinite(prediction).all():
+        return float("nan"), float("nan")
+    design = np.stack([prediction, np.ones_like(prediction)], axis=1)
+    (scale, shift), *_ = np.linalg.lstsq(design, target)
+    return float(scale), float(shift)
+
+
+def _adam_scale_shift(prediction: np.ndarray, target: np.ndarray) -> tuple[float, float]:
+    """Follows the reference step by step, since it stops far from the optimum."""
+    rate, beta1, beta2, epsilon = 1e-4, 0.9, 0.999, 1e-8
+    start = lower_median(target) / lower_median(prediction)
+    # Float32 as the reference: the start puts one residual at round-off, and its sign decides the first steps.
+    prediction, target = prediction.astype(np.float32), target.astype(np.float32)
+    parameters = np.array([start, 0.0], np.float32)
+    first, second = np.zeros(2, np.float32), np.zeros(2, np.float32)
+    previous = np.inf
+    for step in range(1, 1001):
+        residual = parameters[0] * prediction + parameters[1] - target
+        loss = float(np.abs(residual).sum())
+        sign = np.sign(residual)
+        gradient = np.array([(sign * prediction).sum(), sign.sum()])
+        first = beta1 * first + (1 - beta1) * gradient
+        second = beta2 * second + (1 - beta2) * gradient**2
+        denominator = np.sqrt(second / (1 - beta2**step)) + epsilon
+        parameters = parameters - rate * (first / (1 - beta1**step)) / denominator
+        if abs(previous - loss) < 1e-6:
+            break
+        previous = loss
+    return float(parameters[0]), float(parameters[1])

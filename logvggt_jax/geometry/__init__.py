@@ -1,0 +1,44 @@
+"""Pure functions on arrays: rotations, cameras, pose encodings, similarity transforms.
+
+Functions take numpy or JAX arrays and answer in kind (the array API's namespace of the argument). Products are
+written as multiply-and-sum, so that no accelerator rounds them to bfloat16 or TF32.
+"""
+
+from logvggt_jax.geometry.cameras import (
+    as_matrix,
+    camera_centres,
+    compose,
+    invert,
+    project,
+    relative_to_first,
+    transform_points,
+    unproject,
+)
+from logvggt_jax.geometry.pose_encoding import decode_poses, encode_poses
+from logvggt_jax.geometry.rotations import (
+    matrix_to_quaternion,
+    nearest_rotation,
+    quaternion_to_matrix,
+    rotation_angle,
+)
+from logvggt_jax.geometry.similarity import Similarity, robust_similarity, umeyama
+
+__all__ = [
+    "Similarity",
+    "as_matrix",
+    "camera_centres",
+    "compose",
+    "decode_poses",
+    "encode_poses",
+    "invert",
+    "matrix_to_quaternion",
+    "nearest_rotation",
+    "project",
+    "quaternion_to_matrix",
+    "relative_to_first",
+    "robust_similarity",
+    "rotation_angle",
+    "transform_points",
+    "umeyama",
+    "unproject",
+]

@@ -1,0 +1,67 @@
+"""Similarity transforms between corresponding points (numpy, float64): Umeyama and a robust variant."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Similarity(NamedTuple):
+    """y = scale * rotation @ x + translation; rotation [3, 3], translation [3], float64."""
+
+    scale: float
+    rotation: np.ndarray
+    translation: np.ndarray
+
+    def apply(self, points: np.ndarray) -> np.ndarray:
+        """Transforms points [..., 3]."""
+        return self.scale * points @ self.rotation.T + self.translation
+
+
+def umeyama(source: np.ndarray, target: np.ndarray, weights: np.ndarray | None = None) -> Similarity:
+    """Least-squares similarity that maps `source` [N, 3] onto `target` [N, 3] (Umeyama 1991).
+
+    Optional `weights` [N]. Raises ValueError for fewer than three points or points on a line, where no unique
+    similarity exists. The degeneracy test is relative, so tiny trajectories are not refused.
+    """
+    source, target = np.asarray(source, np.float64), np.asarray(target, np.float64)
+    if source.shape != target.shape or source.ndim != 2 or source.shape[1] != 3:
+        raise ValueError(f"need two [N, 3] arrays of corresponding points, got {source.shape} and {target.shape}")
+    if len(source) < 3:
+        raise ValueError(f"a similarity needs at least 3 corresponding points, got {len(source)}")
+    w = np.full(len(source), 1.0 / len(source)) if weights is None else np.asarray(weights, np.float64)
+    w = w / w.sum()
+    mean_source, mean_target = w @ source, w @ target
+    centred_source, centred_target = source - mean_source, target - mean_target
+    covariance = (centred_target * w[:, None]).T @ centred_source
+    u, singular, vt = np.linalg.svd(covariance)
+    variance = float(w @ (centred_source**2).sum(1))
+    spread = np.sqrt(variance * float(w @ (centred_target**2).sum(1)))
+    if not np.isfinite(spread) or singular[1] <= 1e-12 * max(spread, np.finfo(np.float64).tiny):
+        raise ValueError("no unique similarity: the points coincide, lie on one line or are not finite")
+    sign = np.ones(3)
+    sign[2] = np.sign(np.linalg.det(u) * np.linalg.det(vt))
+    rotation = (u * sign) @ vt
+    scale = float(singular @ sign) / variance
+    return Similarity(scale, rotation, mean_target - scale * rotation @ mean_source)
+
+
+def robust_similarity(
+    source: np.ndarray,
+    target: np.ndarray,
+    weights: np.ndarray | None = None,
+    *,
+    threshold: float = 0.1,
+    iterations: int = 5,
+) -> Similarity:
+    """Umeyama reweighted with Huber weights, for points with outliers.
+
+    `threshold` is the residual in units of `target` beyond which a point's influence stops growing.
+    """
+    base = np.ones(len(source)) if weights is None else np.asarray(weights, np.float64)
+    similarity = umeyama(source, target, base)
+    for _ in range(iterations):
+        residual = np.linalg.norm(similarity.apply(np.asarray(source, np.float64)) - target, axis=1)
+        similarity = umeyama(source, target, base * np.minimum(1.0, threshold / np.maximum(residual, 1e-12)))
+    return similarity

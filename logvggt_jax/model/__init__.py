@@ -1,0 +1,1 @@
+"""The network: images to tokens, windows, heads, refinement."""

@@ -1,0 +1,163 @@
+"""DPT: the four key layers' patch tokens to a dense map with confidence."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from logvggt_jax.config import DPTConfig
+from logvggt_jax.model.layers import layer_norm
+
+
+class DPTHead(nn.Module):
+    """`out_channels` values a pixel, the last one the raw confidence. Frames are independent."""
+
+    config: DPTConfig
+    out_channels: int
+    dtype: str
+
+    @nn.compact
+    def __call__(self, levels: Sequence[jax.Array], *, grid: tuple[int, int], image_size: tuple[int, int]) -> jax.Array:
+        """Patch tokens of the key layers, four times [N, h * w, 2C], to [N, H, W, out_channels] float32."""
+        config, aspect = self.config, image_size[1] / image_size[0]
+        norm = layer_norm(1e-5, "norm")
+        maps = []
+        for i, (tokens, channels) in enumerate(zip(levels, config.out_channels, strict=True)):
+            x = norm(tokens).reshape(-1, *grid, tokens.shape[-1])
+            x = self._conv(channels, 1, f"project_{i}")(x)
+            x = x + _uv_embedding(x.shape[1:], aspect).astype(x.dtype)
+            if i < 2:
+                x = UpConv(channels, 4 // 2**i, self.dtype, name=f"resize_{i}")(x)
+            elif i == 3:
+                x = self._conv(channels, 3, "resize_3", strides=2)(x)
+            maps.append(self._conv(config.features, 3, f"layer_{i + 1}", use_bias=False)(x))
+
+        x = self._fuse(4, maps[3], None, maps[2].shape[1:3])
+        x = self._fuse(3, x, maps[2], maps[1].shape[1:3])
+        x = self._fuse(2, x, maps[1], maps[0].shape[1:3])
+        x = self._fuse(1, x, maps[0], (2 * maps[0].shape[1], 2 * maps[0].shape[2]))
+        x = self._conv(config.features // 2, 3, "output_1")(x)
+        x = _resize_bilinear(x, image_size)
+        x = x + _uv_embedding(x.shape[1:], aspect).astype(x.dtype)
+        x = jax.nn.relu(self._conv(32, 3, "output_2_hidden")(x))
+        return self._conv(self.out_channels, 1, "output_2")(x).astype(jnp.float32)
+
+    def _conv(self, features: int, size: int, name: str, *, strides: int = 1, use_bias: bool = True) -> nn.Conv:
+        padding = (size - 1) // 2  # explicit: "SAME" pads strided convolutions on one side only
+        return nn.Conv(
+            features,
+            (size, size),
+            strides=(strides, strides),
+            padding=((padding, padding), (padding, padding)),
+            use_bias=use_bias,
+            dtype=self.dtype,
+            name=name,
+        )
+
+    def _fuse(self, level: int, x: jax.Array, lateral: jax.Array | None, size: tuple[int, int]) -> jax.Array:
+        return Fusion(self.config.features, self.dtype, name=f"refine_{level}")(x, lateral, size)
+
+
+class UpConv(nn.Module):
+    """Transposed convolution with kernel = stride: every pixel becomes a k x k tile."""
+
+    features: int
+    factor: int
+    dtype: str
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        k = self.factor
+        shape = (k, k, x.shape[-1], self.features)
+        kernel = self.param("kernel", nn.initializers.lecun_normal(in_axis=2, batch_axis=(0, 1)), shape)
+        bias = self.param("bias", nn.initializers.zeros_init(), (self.features,))
+        dtype = jnp.dtype(self.dtype)
+        tiles = jnp.einsum("nijc,abco->niajbo", x.astype(dtype), kernel.astype(dtype))
+        count, height, _, width, _, _ = tiles.shape
+        return tiles.reshape(count, height * k, width * k, self.features) + bias.astype(dtype)
+
+
+class ResidualUnit(nn.Module):
+    """conv(relu(conv(r))) + r with r = relu(x): VGGT's in-place activation turns the skip into relu(x)."""
+
+    features: int
+    dtype: str
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        r = jax.nn.relu(x)
+        pad = ((1, 1), (1, 1))
+        x = nn.Conv(self.features, (3, 3), padding=pad, dtype=self.dtype, name="conv1")(r)
+        return nn.Conv(self.features, (3, 3), padding=pad, dtype=self.dtype, name="conv2")(jax.nn.relu(x)) + r
+
+
+class Fusion(nn.Module):
+    """Adds a level's residual unit, refines, resizes to `size`, mixes channels."""
+
+    features: int
+    dtype: str
+
+    @nn.compact
+    def __call__(self, x: jax.Array, lateral: jax.Array | None, size: tuple[int, int]) -> jax.Array:
+        if lateral is not None:
+            x = x + ResidualUnit(self.features, self.dtype, name="residual_1")(lateral)
+        x = ResidualUnit(self.features, self.dtype, name="residual_2")(x)
+        x = _resize_bilinear(x, size)
+        return nn.Conv(self.features, (1, 1), dtype=self.dtype, name="output")(x)
+
+
+def depth_activation(raw: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Depth exp(v) and confidence 1 + exp(c), float32 [...], of raw values [..., 2]."""
+    return jnp.exp(raw[..., 0]), 1.0 + jnp.exp(raw[..., 1])
+
+
+def point_activation(raw: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Points sign(v) (e^|v| − 1), [..., 3], and confidence 1 + exp(c), [...], of raw values [..., 4]."""
+    values = raw[..., :3]
+    return jnp.sign(values) * jnp.expm1(jnp.abs(values)), 1.0 + jnp.exp(raw[..., 3])
+
+
+def _interpolation_matrix(source: int, target: int) -> np.ndarray:
+    """[target, source] weights of linear interpolation with both ends aligned (align_corners)."""
+    positions = np.zeros(target) if target == 1 else np.arange(target) * ((source - 1) / (target - 1))
+    lower = np.minimum(np.floor(positions).astype(int), max(source - 2, 0))
+    fraction = positions - lower
+    matrix = np.zeros((target, source), np.float32)
+    rows = np.arange(target)
+    matrix[rows, lower] = 1.0 - fraction
+    matrix[rows, np.minimum(lower + 1, source - 1)] += fraction
+    return matrix
+
+
+def _resize_bilinear(x: jax.Array, size: tuple[int, int]) -> jax.Array:
+    """[N, h, w, C] to [N, *size, C], corners aligned, which `jax.image.resize` does not offer."""
+    if x.shape[1:3] == tuple(size):
+        return x
+    rows = jnp.asarray(_interpolation_matrix(x.shape[1], size[0]), x.dtype)
+    columns = jnp.asarray(_interpolation_matrix(x.shape[2], size[1]), x.dtype)
+    x = jnp.einsum("yh,nhwc->nywc", rows, x)
+    return jnp.einsum("xw,nywc->nyxc", columns, x)
+
+
+def _uv_embedding(shape: tuple[int, ...], aspect: float) -> np.ndarray:
+    """0.1 times the sinusoidal code, float32 [h, w, D], of a map's normalised coordinates; x half first.
+
+    `aspect` is the image's W / H; coordinates span a box of unit half-diagonal. Phases are formed in float64.
+    """
+    height, width, channels = shape
+    diagonal = math.sqrt(aspect**2 + 1.0)
+    span_x, span_y = aspect / diagonal * (width - 1) / width, 1.0 / diagonal * (height - 1) / height
+    frequencies = 100.0 ** (-np.arange(channels // 4) / (channels / 4))
+
+    def code(extent: float, count: int) -> np.ndarray:
+        phase = np.linspace(-extent, extent, count)[:, None] * frequencies
+        return np.concatenate([np.sin(phase), np.cos(phase)], axis=-1)
+
+    x = np.broadcast_to(code(span_x, width)[None], (height, width, channels // 2))
+    y = np.broadcast_to(code(span_y, height)[:, None], (height, width, channels // 2))
+    return (0.1 * np.concatenate([x, y], axis=-1)).astype(np.float32)

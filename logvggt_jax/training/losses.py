@@ -1,0 +1,81 @@
+"""The paper's training objective as sums and counts, so that devices can add theirs before dividing."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+
+class Mean(NamedTuple):
+    """A mean that is not divided yet: `total` and `count`, float32 scalars.
+
+    Means over different numbers of valid pixels cannot be averaged; their totals and counts can be added.
+    """
+
+    total: jax.Array
+    count: jax.Array
+
+    def value(self) -> jax.Array:
+        """total / count, 0 (with zero gradient) where nothing was counted."""
+        return self.total / jnp.maximum(self.count, 1.0)
+
+
+def camera_loss(
+    pose_encodings: jax.Array,
+    target: jax.Array,
+    frame_valid: jax.Array,
+    *,
+    translation_weight: float,
+    rotation_weight: float,
+    field_of_view_weight: float,
+    gamma: float,
+) -> Mean:
+    """L_camera, the mean over frames of (1/S) sum_s gamma^(S-s) |g_s - g|_1.
+
+    The distance is the weighted sum of the l1 norms of translation, quaternion and fields of view. Source:
+    LoG-VGGT, "Training Objective", second and third equation; the mean over frames instead of their sum makes
+    clips of different lengths weigh alike.
+
+    Args:
+      pose_encodings: [B, T, S, 9], the S rounds of the camera head.
+      target: [B, T, 9].
+      frame_valid: [B, T] bool.
+    """
+    rounds = pose_encodings.shape[-2]
+    weights = jnp.asarray([translation_weight] * 3 + [rotation_weight] * 4 + [field_of_view_weight] * 2, jnp.float32)
+    decay = jnp.asarray([gamma ** (rounds - 1 - s) / rounds for s in range(rounds)], jnp.float32)
+    distance = (jnp.abs(pose_encodings - target[..., None, :]) * weights).sum(-1)
+    per_frame = (distance * decay).sum(-1)
+    return Mean(jnp.where(frame_valid, per_frame, 0.0).sum(), frame_valid.sum().astype(jnp.float32))
+
+
+def depth_losses(
+    depth: jax.Array, confidence: jax.Array, target: jax.Array, valid: jax.Array, *, alpha: float
+) -> dict[str, Mean]:
+    """The three terms of L_depth, each a mean over valid pixels.
+
+    `depth_error` is S |D' - D|, `depth_gradient` S (|dx(D' - D)| + |dy(D' - D)|) with forward differences where
+    both pixels are valid, `depth_confidence` -alpha log S; S is the predicted confidence. Source: LoG-VGGT,
+    "Training Objective", fourth equation, as means, with absolute values for the norm over one channel.
+
+    Args:
+      depth: [B, T, H, W], predicted.
+      confidence: [B, T, H, W], at least 1.
+      target: [B, T, H, W], finite everywhere.
+      valid: [B, T, H, W] bool.
+    """
+    count = valid.sum().astype(jnp.float32)
+    error = jnp.where(valid, depth - target, 0.0)
+    weight = jnp.where(valid, confidence, 1.0)
+    both_x = valid[..., :, 1:] & valid[..., :, :-1]
+    both_y = valid[..., 1:, :] & valid[..., :-1, :]
+    along_x = weight[..., :, :-1] * jnp.abs(error[..., :, 1:] - error[..., :, :-1])
+    along_y = weight[..., :-1, :] * jnp.abs(error[..., 1:, :] - error[..., :-1, :])
+    gradient = jnp.where(both_x, along_x, 0.0).sum() + jnp.where(both_y, along_y, 0.0).sum()
+    return {
+        "depth_error": Mean((weight * jnp.abs(error)).sum(), count),
+        "depth_gradient": Mean(gradient, count),
+        "depth_confidence": Mean(-alpha * jnp.log(weight).sum(), count),
+    }

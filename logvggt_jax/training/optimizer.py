@@ -1,0 +1,79 @@
+"""AdamW, clipped by module, and its learning-rate schedule."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from logvggt_jax.training.config import OptimizerConfig, StageConfig
+
+
+def learning_rate_schedule(config: OptimizerConfig, stages: tuple[StageConfig, ...]) -> optax.Schedule:
+    """The rate at a step of the run: one schedule over the whole run, or one for each stage."""
+    lengths = [stage.steps for stage in stages]
+    if not config.restart_each_stage:
+        lengths = [sum(lengths)]
+    boundaries = [sum(lengths[: i + 1]) for i in range(len(lengths) - 1)]
+    return optax.join_schedules([_schedule(config, length) for length in lengths], boundaries)
+
+
+def make_optimizer(config: OptimizerConfig, params: Any, *, frozen: tuple[str, ...]) -> optax.GradientTransformation:
+    """Update directions for `params`, a dict of modules; the step multiplies them with the rate.
+
+    Every module is a group of its own, so that an exploding head is clipped without slowing the rest. `frozen`
+    modules get zero updates and no moments.
+
+    Source: groups and clipping as in VGGT's released trainer; weight decay spares vectors unless
+    `config.decay_all`.
+    """
+    labels = {module: jax.tree.map(lambda _, m=module: m, tree) for module, tree in params.items()}
+    groups = {
+        module: optax.set_to_zero() if module in frozen else _module_optimizer(config) for module in params
+    }
+    return optax.partition(groups, labels)
+
+
+def apply_updates(params: Any, directions: Any, learning_rate: jax.Array) -> Any:
+    """params - learning_rate * directions."""
+    return jax.tree.map(lambda p, u: (p - learning_rate * u).astype(p.dtype), params, directions)
+
+
+def module_norms(gradients: Any) -> dict[str, jax.Array]:
+    """l2 norm of each module's gradient."""
+    return {module: optax.global_norm(tree) for module, tree in gradients.items()}
+
+
+def _schedule(config: OptimizerConfig, steps: int) -> optax.Schedule:
+    warmup = round(config.warmup_fraction * steps)
+    if config.schedule == "cosine":
+        return optax.warmup_cosine_decay_schedule(
+            0.0, config.learning_rate, warmup, max(steps, warmup + 1), end_value=config.final_learning_rate
+        )
+    tail = steps - steps // 4
+    return optax.join_schedules(
+        [
+            optax.linear_schedule(0.0, config.learning_rate, warmup),
+            optax.constant_schedule(config.learning_rate),
+            optax.linear_schedule(config.learning_rate, config.final_learning_rate, steps - tail),
+        ],
+        [warmup, tail],
+    )
+
+
+def _module_optimizer(config: OptimizerConfig) -> optax.GradientTransformation:
+    def matrices(tree: Any) -> Any:
+        return jax.tree.map(lambda x: config.decay_all or _is_matrix(x), tree)
+
+    return optax.chain(
+        optax.clip_by_global_norm(config.clip_norm),
+        optax.scale_by_adam(config.b1, config.b2),
+        optax.add_decayed_weights(config.weight_decay, matrices),
+    )
+
+
+def _is_matrix(x: jax.Array) -> bool:
+    # Special tokens are stored as [1, 1, C]: vectors, whatever their rank.
+    return sum(size > 1 for size in jnp.shape(x)) > 1

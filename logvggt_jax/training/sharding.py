@@ -1,0 +1,43 @@
+"""Where arrays live: parameters on every device, batches split along the mesh axis `data`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import jax
+import numpy as np
+from jax.sharding import AxisType, Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
+
+DATA_AXIS = "data"
+
+
+def data_mesh(num_devices: int | None = None) -> Mesh:
+    """A one-dimensional mesh over the first `num_devices` devices, all by default."""
+    devices = jax.devices()[:num_devices]
+    return jax.make_mesh((len(devices),), (DATA_AXIS,), axis_types=(AxisType.Auto,), devices=devices)
+
+
+def replicated(mesh: Mesh) -> NamedSharding:
+    """The whole array on each device."""
+    return NamedSharding(mesh, P())
+
+
+def split(mesh: Mesh) -> NamedSharding:
+    """The leading axis split over the devices."""
+    return NamedSharding(mesh, P(DATA_AXIS))
+
+
+def local_batch_size(batch_size: int, mesh: Mesh) -> int:
+    """Clips that this process loads; ValueError unless devices and processes share `batch_size` evenly."""
+    if batch_size % mesh.size:
+        raise ValueError(
+            f"batch_size={batch_size} does not split over {mesh.size} devices; use a multiple of {mesh.size}"
+        )
+    return batch_size // jax.process_count()
+
+
+def put_batch(batch: Mapping[str, np.ndarray], mesh: Mesh) -> dict[str, jax.Array]:
+    """Arrays of this process [b, ...] as global arrays [B, ...], split over the mesh."""
+    sharding = split(mesh)
+    return {key: jax.make_array_from_process_local_data(sharding, value) for key, value in batch.items()}

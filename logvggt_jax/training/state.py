@@ -1,0 +1,43 @@
+"""What a training step takes and returns."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+
+
+@struct.dataclass
+class TrainState:
+    """State of a run; donated to every step.
+
+    Attributes:
+      step: int32 scalar, batches seen.
+      params: Parameter tree of the model, float32.
+      opt_state: The optimiser's.
+      skipped: int32 scalar, updates left out for a non-finite loss or gradient.
+      skipped_in_a_row: int32 scalar.
+      longest_skip: int32 scalar, the longest row so far.
+    """
+
+    step: jax.Array
+    params: Any
+    opt_state: Any
+    skipped: jax.Array
+    skipped_in_a_row: jax.Array
+    longest_skip: jax.Array
+
+
+def initial_state(params: Any, optimizer: optax.GradientTransformation) -> TrainState:
+    """The state before the first step."""
+    return TrainState(
+        step=jnp.zeros((), jnp.int32),
+        params=params,
+        opt_state=optimizer.init(params),
+        skipped=jnp.zeros((), jnp.int32),
+        skipped_in_a_row=jnp.zeros((), jnp.int32),
+        longest_skip=jnp.zeros((), jnp.int32),
+    )

@@ -1,0 +1,307 @@
+"""Model folders: parameters in Orbax's format, and beside them the configuration and a digest of every leaf.
+
+    <folder>/config.json   format version, ModelConfig, digests, versions of the libraries that wrote it
+    <folder>/params/       Orbax
+
+Orbax restores flipped bytes without complaint; the digests find them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import importlib.metadata
+import json
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import orbax.checkpoint as ocp
+from rich.console import Console
+from rich.progress import Progress
+
+from logvggt_jax.config import ModelConfig
+from logvggt_jax.model.logvggt import LogVGGT
+from logvggt_jax.weights.files import open_state_dict
+from logvggt_jax.weights.hub import resolve
+from logvggt_jax.weights.lazy import LazyTensors
+from logvggt_jax.weights.vggt import (
+    ConversionReport,
+    config_from_vggt,
+    parameter_shapes,
+    params_from_vggt,
+    vggt_rules,
+)
+
+FORMAT = "logvggt-jax model"
+VERSION = 1
+_MEND = "the checkpoint is damaged: copy or convert it again"
+
+
+def digests(tree: Any) -> dict[str, str]:
+    """BLAKE2b of dtype, shape and bytes of every leaf, under its path (`encoder/norm/scale`).
+
+    Args:
+      tree: Pytree of arrays, Python numbers or typed random keys. Arrays of several processes have to be
+        replicated.
+    """
+    return {name: _digest(leaf) for name, leaf in _named_leaves(tree)}
+
+
+def verify_digests(tree: Any, expected: dict[str, str], where: str) -> None:
+    """Compares a restored tree with the digests stored when it was saved.
+
+    Args:
+      tree: Pytree of arrays.
+      expected: What `digests` gave for the saved tree.
+      where: The checkpoint's path, for the message.
+
+    Raises:
+      ValueError: A leaf differs, is missing or has no digest; names it.
+    """
+    found = digests(tree)
+    for name in sorted(found.keys() | expected.keys()):
+        if name not in found or name not in expected:
+            which = "is not in the checkpoint" if name not in found else "has no digest"
+            raise ValueError(f"{where}: leaf {name} {which}; {_MEND}")
+        if found[name] != expected[name]:
+            raise ValueError(
+                f"{where}: leaf {name} differs from its digest ({found[name]}, expected {expected[name]}); {_MEND}"
+            )
+
+
+def save_model(path: str | Path, config: ModelConfig, params: Any) -> None:
+    """Writes a model folder; an older model folder at `path` is replaced once the new one is complete.
+
+    Args:
+      path: The folder to make.
+      config: Configuration of the model.
+      params: Its parameter tree, `variables["params"]`.
+
+    Raises:
+      FileExistsError: `path` exists and is not a model folder.
+    """
+    path = Path(path).expanduser().absolute()
+    check_destination(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    description = {
+        "format": FORMAT,
+        "version": VERSION,
+        "config": config.to_dict(),
+        "digests": digests(params),
+        "libraries": {
+            name: importlib.metadata.version(name) for name in ("logvggt-jax", "jax", "flax", "orbax-checkpoint")
+        },
+    }
+    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch:
+        fresh, old = Path(scratch) / "new", Path(scratch) / "old"
+        fresh.mkdir()
+        with ocp.StandardCheckpointer() as checkpointer:
+            checkpointer.save(fresh / "params", params)
+            checkpointer.wait_until_finished()
+        (fresh / "config.json").write_text(json.dumps(description, indent=2) + "\n")
+        if path.exists():
+            path.replace(old)
+        try:
+            fresh.replace(path)
+        except OSError:
+            if old.exists():
+                old.replace(path)
+            raise
+
+
+def check_destination(path: Path) -> None:
+    """Raises FileExistsError where `save_model` would have to overwrite something other than a model folder."""
+    if not path.exists() or (path.is_dir() and not any(path.iterdir())):
+        return
+    try:
+        _read_description(path)
+    except (FileNotFoundError, ValueError) as error:
+        raise FileExistsError(f"{path}: exists and is not a model folder; give another path or remove it") from error
+
+
+def load_model(path: str | Path) -> tuple[LogVGGT, dict[str, Any]]:
+    """Reads a model folder onto the default device.
+
+    Args:
+      path: A folder of `save_model`, `logvggt convert` or training (`<workdir>/model`).
+
+    Returns:
+      The model and its variables {"params": …}, float32.
+
+    Raises:
+      FileNotFoundError: Nothing is at `path`, or it is not a model folder.
+      ValueError: The configuration has an unknown field, the parameters do not fit it, a file is damaged, or a
+        leaf differs from its digest.
+    """
+    path = Path(path).expanduser().absolute()
+    description = _read_description(path)
+    try:
+        config = ModelConfig.from_dict(description["config"])
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path / 'config.json'}: {error}; written by another version of this package?") from error
+    model = LogVGGT(config)
+    params = _restore(path / "params", parameter_shapes(config))
+    verify_digests(params, description["digests"], str(path))
+    return model, {"params": params}
+
+
+def from_pretrained(
+    path_or_repo: str | Path, *, dtype: str | None = None, point_head: bool = False
+) -> tuple[LogVGGT, dict[str, Any]]:
+    """A model and its variables from whatever holds weights.
+
+    VGGT-1B is converted in memory; its sizes are read off the tensors' shapes (`config_from_vggt`).
+
+    Args:
+      path_or_repo: A model folder of this package; a VGGT `.safetensors` or `.pt` file or the folder that holds
+        `model.safetensors` or `model.pt`; or a hub repository such as `facebook/VGGT-1B`.
+      dtype: Compute type of the model, `float32` or `bfloat16`; None keeps the checkpoint's (VGGT: float32).
+      point_head: Keep VGGT's point head. A model folder has it or not.
+
+    Raises:
+      FileNotFoundError, ValueError: As `load_model`, `open_state_dict` and `params_from_vggt`; one line naming the
+        file or tensor.
+    """
+    path = resolve(path_or_repo)
+    if path.is_dir() and _is_model_folder(path):
+        model, variables = load_model(path)
+        if point_head and model.config.point_head is None:
+            raise ValueError(f"{path}: the model has no point head; convert VGGT with point_head, or leave it out")
+    else:
+        with open_state_dict(path) as state_dict, _naming(path):
+            config = config_from_vggt(state_dict, point_head=point_head)
+            model, variables = LogVGGT(config), {"params": params_from_vggt(state_dict, config)[0]}
+    if dtype is not None:
+        model = LogVGGT(dataclasses.replace(model.config, dtype=dtype))
+    return model, variables
+
+
+def convert(source: str | Path, destination: str | Path, *, point_head: bool = False) -> ConversionReport:
+    """Writes a VGGT checkpoint as a model folder that computes the same as VGGT.
+
+    Shows progress and prints how many names were used, skipped and initialised.
+
+    Args:
+      source: VGGT checkpoint: a file, its folder, or a hub repository.
+      destination: The model folder to make.
+      point_head: Keep the point head.
+
+    Returns:
+      The names that were used, skipped and initialised.
+
+    Raises:
+      FileExistsError: The destination exists and is not a model folder.
+      FileNotFoundError, ValueError: As `from_pretrained`. Nothing is left behind.
+    """
+    destination = Path(destination).expanduser().absolute()
+    check_destination(destination)
+    path, console = resolve(source), Console()
+    with open_state_dict(path) as state_dict, _naming(path):
+        config = config_from_vggt(state_dict, point_head=point_head)
+        with Progress(console=console, transient=True) as progress:
+            task = progress.add_task("Reading tensors", total=len(vggt_rules(config)))
+
+            def read(name: str) -> np.ndarray:
+                progress.advance(task)
+                return state_dict[name]
+
+            params, report = params_from_vggt(LazyTensors(list(state_dict), read), config)
+    with console.status("Writing the model folder"):
+        save_model(destination, config, params)
+    console.print(
+        f"{path}: {len(report.used)} tensors used, {len(report.skipped)} skipped, "
+        f"{len(report.initialised)} parameters initialised",
+        soft_wrap=True,
+    )
+    return report
+
+
+def _named_leaves(tree: Any) -> Iterator[tuple[str, Any]]:
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+        yield jax.tree_util.keystr(path, simple=True, separator="/"), leaf
+
+
+def _digest(leaf: Any) -> str:
+    if isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+        leaf = jax.random.key_data(leaf)
+    array = np.asarray(leaf)
+    digest = hashlib.blake2b(f"{array.dtype.name}{array.shape}".encode(), digest_size=16)
+    digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+def _is_model_folder(path: Path) -> bool:
+    # A hub repository has a config.json as well, but no such folder.
+    return (path / "params").is_dir()
+
+
+def _read_description(path: Path) -> dict[str, Any]:
+    file = path / "config.json"
+    if not file.is_file():
+        raise FileNotFoundError(
+            f"{file}: no such file, so the folder is not a model's; give one made by `logvggt convert` or training"
+        )
+    try:
+        description = json.loads(file.read_text())
+    except ValueError as error:
+        raise ValueError(f"{file}: not valid JSON ({error}); {_MEND}") from error
+    if not isinstance(description, dict) or description.get("format") != FORMAT:
+        raise ValueError(f"{file}: not the description of a model of this package (format {FORMAT!r})")
+    if description.get("version") != VERSION:
+        raise ValueError(
+            f"{file}: format version {description.get('version')!r}, this package reads {VERSION}; "
+            "use the version of logvggt-jax that wrote it"
+        )
+    if not all(isinstance(description.get(part), dict) for part in ("config", "digests")):
+        raise ValueError(f"{file}: config or digests are missing; {_MEND}")
+    return description
+
+
+def _restore(path: Path, target: Any) -> Any:
+    """Parameters in the shapes and placement of `target`, after a check that these are the stored shapes."""
+    if not path.is_dir():
+        raise FileNotFoundError(f"{path}: the parameters are missing; {_MEND}")
+    try:
+        with ocp.StandardCheckpointer() as checkpointer:
+            stored = checkpointer.metadata(path).item_metadata
+            if stored is None:
+                raise FileNotFoundError("Orbax's description of the parameters is missing")
+            found = {name: tuple(leaf.shape) for name, leaf in _named_leaves(stored.tree)}
+            _check_shapes(found, {name: leaf.shape for name, leaf in _named_leaves(target)}, path)
+            return checkpointer.restore(path, target)
+    except _OtherModelError:
+        raise
+    except Exception as error:
+        # Orbax raises bare Exception, among others, for truncated and missing files.
+        reason = " ".join(str(error).split())
+        raise ValueError(f"{path}: cannot be read ({type(error).__name__}: {reason:.200}); {_MEND}") from error
+
+
+class _OtherModelError(ValueError):
+    """The stored parameters are not those of the configuration."""
+
+
+def _check_shapes(found: dict[str, tuple[int, ...]], expected: dict[str, tuple[int, ...]], path: Path) -> None:
+    for name in sorted(found.keys() | expected.keys()):
+        if found.get(name) != expected.get(name):
+            raise _OtherModelError(
+                f"{path}: {name} has shape {found.get(name, 'none')}, the configuration in config.json asks for "
+                f"{expected.get(name, 'none')}; the two belong to different models"
+            )
+
+
+@contextlib.contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Puts the file's path before errors that know only the tensor."""
+    try:
+        yield
+    except ValueError as error:
+        if str(error).startswith(str(path)):
+            raise
+        raise ValueError(f"{path}: {error}") from error

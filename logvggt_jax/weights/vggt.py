@@ -1,0 +1,372 @@
+"""VGGT's PyTorch parameters, names and layouts, as this package's parameter tree.
+
+`vggt_rules` is the one table: every tensor of a VGGT state dict, the shape PyTorch gives it, and the parameters
+made from it. Source: the VGGT-1B checkpoint (1797 tensors).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from logvggt_jax.config import (
+    AggregatorConfig,
+    CameraHeadConfig,
+    DPTConfig,
+    EncoderConfig,
+    ModelConfig,
+    RefinementConfig,
+)
+from logvggt_jax.model.logvggt import LogVGGT
+
+ParamPath = tuple[str, ...]
+Layout = Callable[[np.ndarray], np.ndarray]
+
+_OUTPUT_HIDDEN = 32  # width between the two convolutions of the DPT head's output, in every VGGT
+_DTYPES = ("float32", "float16", "bfloat16", "float64")
+
+
+@dataclasses.dataclass(frozen=True)
+class Rule:
+    """One tensor of the PyTorch state dict.
+
+    Attributes:
+      name: Its name there.
+      shape: Its shape there.
+      targets: The parameters made from it: path in our tree, and the change of layout.
+    """
+
+    name: str
+    shape: tuple[int, ...]
+    targets: tuple[tuple[ParamPath, Layout], ...]
+
+
+@dataclasses.dataclass
+class ConversionReport:
+    """What became of each name.
+
+    Attributes:
+      used: PyTorch names whose tensors went into the parameters.
+      skipped: PyTorch names left out: the track head, and the point head where the configuration has none.
+      initialised: Paths (`gccr/query/kernel`) of parameters that VGGT does not have.
+    """
+
+    used: list[str] = dataclasses.field(default_factory=list)
+    skipped: list[str] = dataclasses.field(default_factory=list)
+    initialised: list[str] = dataclasses.field(default_factory=list)
+
+
+def _same(x: np.ndarray) -> np.ndarray:
+    return x
+
+
+def _conv_layout(x: np.ndarray) -> np.ndarray:
+    return x.transpose(2, 3, 1, 0)
+
+
+def _transposed_conv_layout(x: np.ndarray) -> np.ndarray:
+    return x.transpose(2, 3, 0, 1)
+
+
+def _first_third(x: np.ndarray) -> np.ndarray:
+    return x[: len(x) // 3].T
+
+
+def _other_thirds(x: np.ndarray) -> np.ndarray:
+    return x[len(x) // 3 :].T
+
+
+def _raw(name: str, path: ParamPath, *shape: int) -> Iterator[Rule]:
+    yield Rule(name, shape, ((path, _same),))
+
+
+def _norm(name: str, path: ParamPath, width: int) -> Iterator[Rule]:
+    yield from _raw(f"{name}.weight", (*path, "scale"), width)
+    yield from _raw(f"{name}.bias", (*path, "bias"), width)
+
+
+def _linear(name: str, path: ParamPath, inputs: int, outputs: int) -> Iterator[Rule]:
+    yield Rule(f"{name}.weight", (outputs, inputs), (((*path, "kernel"), np.transpose),))
+    yield from _raw(f"{name}.bias", (*path, "bias"), outputs)
+
+
+def _conv(name: str, path: ParamPath, inputs: int, outputs: int, size: int, *, bias: bool = True) -> Iterator[Rule]:
+    yield Rule(f"{name}.weight", (outputs, inputs, size, size), (((*path, "kernel"), _conv_layout),))
+    if bias:
+        yield from _raw(f"{name}.bias", (*path, "bias"), outputs)
+
+
+def _transposed_conv(name: str, path: ParamPath, width: int, size: int) -> Iterator[Rule]:
+    yield Rule(f"{name}.weight", (width, width, size, size), (((*path, "kernel"), _transposed_conv_layout),))
+    yield from _raw(f"{name}.bias", (*path, "bias"), width)
+
+
+def _block(name: str, path: ParamPath, width: int, mlp_ratio: int, head_norm: int | None = None) -> Iterator[Rule]:
+    """A transformer block; `head_norm` is the head size where queries and keys are normalised."""
+    attention = (*path, "attention")
+    yield from _norm(f"{name}.norm1", (*path, "norm1"), width)
+    # Rows of the fused projection: queries of all heads, then keys, then values.
+    for leaf, ours, shape in (("weight", "kernel", (3 * width, width)), ("bias", "bias", (3 * width,))):
+        targets = (((*attention, "query", ours), _first_third), ((*attention, "key_value", ours), _other_thirds))
+        yield Rule(f"{name}.attn.qkv.{leaf}", shape, targets)
+    if head_norm is not None:
+        yield from _norm(f"{name}.attn.q_norm", (*attention, "query_norm"), head_norm)
+        yield from _norm(f"{name}.attn.k_norm", (*attention, "key_norm"), head_norm)
+    yield from _linear(f"{name}.attn.proj", (*attention, "output"), width, width)
+    yield from _raw(f"{name}.ls1.gamma", (*path, "scale1", "gamma"), width)
+    yield from _norm(f"{name}.norm2", (*path, "norm2"), width)
+    yield from _linear(f"{name}.mlp.fc1", (*path, "mlp", "fc1"), width, mlp_ratio * width)
+    yield from _linear(f"{name}.mlp.fc2", (*path, "mlp", "fc2"), mlp_ratio * width, width)
+    yield from _raw(f"{name}.ls2.gamma", (*path, "scale2", "gamma"), width)
+
+
+def _encoder(config: EncoderConfig) -> Iterator[Rule]:
+    name, path, width = "aggregator.patch_embed", ("encoder",), config.embed_dim
+    yield from _raw(f"{name}.cls_token", (*path, "cls_token"), 1, 1, width)
+    yield from _raw(f"{name}.pos_embed", (*path, "pos_embed"), 1, 1 + config.position_grid**2, width)
+    yield from _raw(f"{name}.register_tokens", (*path, "register_tokens"), 1, config.num_registers, width)
+    yield from _raw(f"{name}.mask_token", (*path, "mask_token"), 1, width)
+    yield from _conv(f"{name}.patch_embed.proj", (*path, "patch_embed"), 3, width, config.patch_size)
+    for i in range(config.depth):
+        yield from _block(f"{name}.blocks.{i}", (*path, f"block_{i}"), width, config.mlp_ratio)
+    yield from _norm(f"{name}.norm", (*path, "norm"), width)
+
+
+def _aggregator(config: AggregatorConfig, width: int) -> Iterator[Rule]:
+    name, path = "aggregator", ("aggregator",)
+    yield from _raw(f"{name}.camera_token", (*path, "camera_token"), 1, 2, 1, width)
+    yield from _raw(f"{name}.register_token", (*path, "register_token"), 1, 2, config.num_registers, width)
+    head = width // config.num_heads
+    for kind in ("frame", "global"):
+        for i in range(config.depth):
+            block = (*path, f"{kind}_block_{i}")
+            yield from _block(f"{name}.{kind}_blocks.{i}", block, width, config.mlp_ratio, head)
+
+
+def _camera_head(config: CameraHeadConfig, width: int) -> Iterator[Rule]:
+    name, path = "camera_head", ("camera_head",)
+    yield from _raw(f"{name}.empty_pose_tokens", (*path, "empty_pose_tokens"), 1, 1, 9)
+    for i in range(config.depth):
+        yield from _block(f"{name}.trunk.{i}", (*path, f"trunk_{i}"), width, 4)
+    for norm in ("token_norm", "trunk_norm"):
+        yield from _norm(f"{name}.{norm}", (*path, norm), width)
+    yield from _linear(f"{name}.embed_pose", (*path, "embed_pose"), 9, width)
+    yield from _linear(f"{name}.poseLN_modulation.1", (*path, "modulation"), width, 3 * width)
+    yield from _linear(f"{name}.pose_branch.fc1", (*path, "pose_branch", "fc1"), width, width // 2)
+    yield from _linear(f"{name}.pose_branch.fc2", (*path, "pose_branch", "fc2"), width // 2, 9)
+
+
+def _dpt_head(head: str, config: DPTConfig, width: int, outputs: int) -> Iterator[Rule]:
+    path, features, channels = (head,), config.features, config.out_channels
+    yield from _norm(f"{head}.norm", (*path, "norm"), width)
+    for i, out in enumerate(channels):
+        yield from _conv(f"{head}.projects.{i}", (*path, f"project_{i}"), width, out, 1)
+    yield from _transposed_conv(f"{head}.resize_layers.0", (*path, "resize_0"), channels[0], 4)
+    yield from _transposed_conv(f"{head}.resize_layers.1", (*path, "resize_1"), channels[1], 2)
+    yield from _conv(f"{head}.resize_layers.3", (*path, "resize_3"), channels[3], channels[3], 3)
+    for i, out in enumerate(channels, start=1):
+        yield from _conv(f"{head}.scratch.layer{i}_rn", (*path, f"layer_{i}"), out, features, 3, bias=False)
+    for i in range(1, 5):
+        name, fusion = f"{head}.scratch.refinenet{i}", (*path, f"refine_{i}")
+        yield from _conv(f"{name}.out_conv", (*fusion, "output"), features, features, 1)
+        # The coarsest level has nothing to add its own features to, hence no first residual unit.
+        for unit in (1, 2) if i < 4 else (2,):
+            for conv in ("conv1", "conv2"):
+                target = (*fusion, f"residual_{unit}", conv)
+                yield from _conv(f"{name}.resConfUnit{unit}.{conv}", target, features, features, 3)
+    half = features // 2
+    yield from _conv(f"{head}.scratch.output_conv1", (*path, "output_1"), features, half, 3)
+    yield from _conv(f"{head}.scratch.output_conv2.0", (*path, "output_2_hidden"), half, _OUTPUT_HIDDEN, 3)
+    yield from _conv(f"{head}.scratch.output_conv2.2", (*path, "output_2"), _OUTPUT_HIDDEN, outputs, 1)
+
+
+def vggt_rules(config: ModelConfig) -> list[Rule]:
+    """Every VGGT tensor that a model of this configuration uses, in the order of VGGT's modules."""
+    width = 2 * config.encoder.embed_dim
+    rules = [
+        *_aggregator(config.aggregator, config.encoder.embed_dim),
+        *_encoder(config.encoder),
+        *_camera_head(config.camera_head, width),
+        *_dpt_head("depth_head", config.depth_head, width, 2),
+    ]
+    if config.point_head is not None:
+        rules += _dpt_head("point_head", config.point_head, width, 4)
+    return rules
+
+
+def params_from_vggt(
+    state_dict: Mapping[str, np.ndarray], config: ModelConfig
+) -> tuple[dict[str, Any], ConversionReport]:
+    """Parameters of a model of the given configuration from a VGGT state dict.
+
+    Parameters that VGGT lacks (GCCR) are drawn as `LogVGGT.init` draws them from a fixed seed; GCCR's output
+    projection is zero there, so that the network equals VGGT.
+
+    Args:
+      state_dict: PyTorch names to arrays in PyTorch layouts, floating point of any width. Each is read once, so a
+        lazy mapping never holds two copies of the weights.
+      config: Sizes of the model; `config_from_vggt` reads them off a state dict.
+
+    Returns:
+      The parameter tree (float32, on the default device) and the report of names.
+
+    Raises:
+      ValueError: A name is unknown or missing, or a tensor has another shape or is not floating point.
+    """
+    rules = vggt_rules(config)
+    report = ConversionReport()
+    known = {rule.name for rule in rules}
+    heads = ("track_head.",) if config.point_head is not None else ("track_head.", "point_head.")
+    for name in state_dict:
+        if name not in known and not name.startswith(heads):
+            raise ValueError(f"unknown key {name!r} in the state dict{_differences(state_dict, config)}")
+    report.skipped = [name for name in state_dict if name not in known]
+    missing = [rule.name for rule in rules if rule.name not in state_dict]
+    if missing:
+        raise ValueError(
+            f"{len(missing)} of {len(rules)} keys are missing from the state dict, first {', '.join(missing[:3])}"
+            f"{_differences(state_dict, config)}"
+        )
+    params: dict[str, Any] = {}
+    for rule in rules:
+        tensor = np.asarray(state_dict[rule.name])
+        if tensor.shape != rule.shape:
+            raise ValueError(
+                f"{rule.name} has shape {tensor.shape}, expected {rule.shape}{_differences(state_dict, config)}"
+            )
+        if tensor.dtype.name not in _DTYPES:
+            raise ValueError(f"{rule.name} is {tensor.dtype.name}, expected one of {', '.join(_DTYPES)}")
+        for path, layout in rule.targets:
+            # A copy, because a view would keep the caller's array alive and follow its changes.
+            _insert(params, path, jnp.array(layout(tensor).astype(np.float32)))
+        report.used.append(rule.name)
+    for path, value in _initial(config, params):
+        _insert(params, path, value)
+        report.initialised.append("/".join(path))
+    return params, report
+
+
+def config_from_vggt(state_dict: Mapping[str, np.ndarray], *, point_head: bool = False) -> ModelConfig:
+    """Sizes of the VGGT that a state dict holds, with the paper's windows and refinement.
+
+    All sizes come from shapes but these, which leave no trace there: the encoder and the camera head have as many
+    attention heads as the aggregator, whose head size is that of its query norm (16 in VGGT-1B); the key layers
+    are VGGT's (4, 11, 17, 23) and need its depth of 24; the camera head runs 4 rounds.
+
+    Args:
+      state_dict: PyTorch names to arrays; a dozen small ones are read.
+      point_head: Whether the model gets the point head, which the checkpoint then has to hold.
+
+    Raises:
+      ValueError: A tensor that tells a size is missing or has another rank, or the depth is not 24.
+    """
+
+    def shape(name: str, rank: int) -> tuple[int, ...]:
+        if name not in state_dict:
+            raise ValueError(f"not a VGGT state dict: {name} is missing")
+        found = np.shape(state_dict[name])
+        if len(found) != rank:
+            raise ValueError(f"not a VGGT state dict: {name} has shape {found}, expected {rank} axes")
+        return found
+
+    def count(prefix: str) -> int:
+        indices = {n[len(prefix) :].split(".", 1)[0] for n in state_dict if n.startswith(prefix)}
+        return sum(index.isdecimal() for index in indices)
+
+    def dpt(head: str) -> DPTConfig:
+        channels = tuple(shape(f"{head}.projects.{i}.bias", 1)[0] for i in range(4))
+        return DPTConfig(shape(f"{head}.scratch.output_conv1.weight", 4)[1], channels)
+
+    encoder, frame = "aggregator.patch_embed", "aggregator.frame_blocks"
+    embed_dim = shape("aggregator.camera_token", 4)[3]
+    positions = shape(f"{encoder}.pos_embed", 3)[1] - 1
+    grid = round(positions**0.5)
+    if grid * grid != positions:
+        raise ValueError(f"{encoder}.pos_embed holds {positions} grid positions, expected a square number")
+    depth = count(f"{frame}.")
+    if depth != 24:
+        raise ValueError(
+            f"the state dict has {depth} aggregator blocks of each kind, VGGT has 24: the key layers are unknown; "
+            "build a ModelConfig with aggregator.key_layers and call params_from_vggt"
+        )
+    num_heads = embed_dim // shape(f"{frame}.0.attn.q_norm.weight", 1)[0]
+    return ModelConfig(
+        encoder=EncoderConfig(
+            embed_dim=embed_dim,
+            depth=count(f"{encoder}.blocks."),
+            num_heads=num_heads,
+            mlp_ratio=shape(f"{encoder}.blocks.0.mlp.fc1.bias", 1)[0] // embed_dim,
+            num_registers=shape(f"{encoder}.register_tokens", 3)[1],
+            position_grid=grid,
+            patch_size=shape(f"{encoder}.patch_embed.proj.weight", 4)[2],
+        ),
+        aggregator=AggregatorConfig(
+            depth=depth,
+            num_heads=num_heads,
+            mlp_ratio=shape(f"{frame}.0.mlp.fc1.bias", 1)[0] // embed_dim,
+            num_registers=shape("aggregator.register_token", 4)[2],
+        ),
+        camera_head=CameraHeadConfig(depth=count("camera_head.trunk."), num_heads=num_heads),
+        depth_head=dpt("depth_head"),
+        point_head=dpt("point_head") if point_head else None,
+        refinement=RefinementConfig(num_heads=num_heads),
+    )
+
+
+def parameter_shapes(config: ModelConfig) -> dict[str, Any]:
+    """The parameter tree as `jax.ShapeDtypeStruct`s placed on the default device, nothing computed."""
+    init = LogVGGT(config).init
+    shapes = jax.eval_shape(init, jax.random.key(0), _smallest_images(config))["params"]
+    sharding = jnp.zeros(()).sharding
+    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding), shapes)
+
+
+def _differences(state_dict: Mapping[str, np.ndarray], config: ModelConfig) -> str:
+    """How the configuration's sizes differ from those the state dict shows, as the end of an error's line."""
+    try:
+        found = config_from_vggt(state_dict, point_head=config.point_head is not None)
+    except ValueError as error:
+        return f"; {error}"
+    texts = []
+    for part in ("encoder", "aggregator", "depth_head", "camera_head", "point_head"):
+        theirs, ours = getattr(found, part), getattr(config, part)
+        for field in dataclasses.fields(theirs) if theirs is not None and ours is not None else ():
+            pair = getattr(ours, field.name), getattr(theirs, field.name)
+            if pair[0] != pair[1] and field.name not in ("frozen", "layer_scale", "initial_pose", "iterations"):
+                texts.append(f"{part}.{field.name} is {pair[0]}, the state dict's {pair[1]}")
+    return f"; in the configuration {'; '.join(texts)}" if texts else "; the file is damaged or another model's"
+
+
+def _insert(tree: dict[str, Any], path: ParamPath, value: jax.Array) -> None:
+    for key in path[:-1]:
+        tree = tree.setdefault(key, {})
+    tree[path[-1]] = value
+
+
+def _initial(config: ModelConfig, params: dict[str, Any]) -> list[tuple[ParamPath, jax.Array]]:
+    """Initial values of the model's parameters that `params` lacks."""
+    known = {_path(path) for path, _ in jax.tree_util.tree_leaves_with_path(params)}
+    shapes = jax.tree_util.tree_leaves_with_path(parameter_shapes(config))
+    missing = [_path(path) for path, _ in shapes if _path(path) not in known]
+
+    # Under jit the initial values that nobody asks for are never computed.
+    @jax.jit
+    def draw(key: jax.Array) -> list[jax.Array]:
+        drawn = LogVGGT(config).init(key, _smallest_images(config))["params"]
+        leaves = {_path(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(drawn)}
+        return [leaves[path] for path in missing]
+
+    return list(zip(missing, draw(jax.random.key(0)), strict=True))
+
+
+def _smallest_images(config: ModelConfig) -> jax.Array:
+    return jnp.zeros((1, 1, config.encoder.patch_size, config.encoder.patch_size, 3))
+
+
+def _path(path: Any) -> ParamPath:
+    return tuple(key.key for key in path)

@@ -1,0 +1,79 @@
+"""Shared fixtures: a small model, and the reference data that lie beside the repository where they exist."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from absl import flags
+
+# Before any computation: sharded code is tested on sixteen devices.
+jax.config.update("jax_platforms", "cpu")
+jax.config.update("jax_num_cpu_devices", 16)
+
+from logvggt_jax import (  # noqa: E402
+    AggregatorConfig,
+    CameraHeadConfig,
+    DPTConfig,
+    EncoderConfig,
+    LogVGGT,
+    ModelConfig,
+    RefinementConfig,
+)
+
+# Grain reads absl flags, which only `app.run` parses.
+if not flags.FLAGS.is_parsed():
+    flags.FLAGS.mark_as_parsed()
+
+SHARED = Path(os.environ.get("LOGVGGT_SHARED", Path(__file__).parents[2] / "shared"))
+
+
+def _shared(*parts: str) -> Path:
+    path = SHARED.joinpath(*parts)
+    if not path.exists():
+        pytest.skip(f"reference data {'/'.join(parts)} not found in {SHARED} (set LOGVGGT_SHARED)")
+    return path
+
+
+@pytest.fixture(scope="session")
+def golden_dir() -> Path:
+    """Outputs of the original VGGT and of the reference metrics."""
+    return _shared("golden")
+
+
+@pytest.fixture(scope="session")
+def seven_scenes_dir() -> Path:
+    """1,000 real RGB-D frames with poses in the official 7-Scenes layout."""
+    return _shared("data", "7scenes")
+
+
+@pytest.fixture(scope="session")
+def examples_dir() -> Path:
+    """Photographs and a video without ground truth."""
+    return _shared("data", "examples")
+
+
+@pytest.fixture(scope="session")
+def small_config() -> ModelConfig:
+    """A model of about 0.2 M parameters that has every part; images of 28 x 42 give it 2 x 3 patches."""
+    return ModelConfig(
+        encoder=EncoderConfig(embed_dim=32, depth=1, num_heads=2, position_grid=4),
+        aggregator=AggregatorConfig(depth=4, num_heads=2, key_layers=(0, 1, 2, 3), layer_scale=0.5),
+        camera_head=CameraHeadConfig(depth=1, num_heads=2, layer_scale=0.5),
+        depth_head=DPTConfig(features=8, out_channels=(8, 8, 8, 8)),
+        refinement=RefinementConfig(num_heads=2),
+    )
+
+
+@pytest.fixture(scope="session")
+def small_variables(small_config: ModelConfig) -> dict:
+    """Parameters of the small model, all of them moved off their initial value: no gate is zero."""
+    images = np.zeros((1, 1, 28, 42, 3), np.float32)
+    variables = LogVGGT(small_config).init(jax.random.key(0), images)
+    generator = np.random.default_rng(0)
+    return jax.tree.map(
+        lambda x: x + 0.1 * generator.standard_normal(x.shape).astype(np.float32), jax.device_get(variables)
+    )
