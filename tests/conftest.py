@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 from absl import flags
 
-# Before any computation: sharded code is tested on sixteen devices.
+# Before any computation: sharded code is tested on sixteen devices, and as most of a test's time is compilation,
+# the code generator optimises little.
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 jax.config.update("jax_platforms", "cpu")
 jax.config.update("jax_num_cpu_devices", 16)
 

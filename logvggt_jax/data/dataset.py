@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -43,7 +43,7 @@ def check_split(split: str) -> None:
         raise ValueError(f"unknown split {split!r}: choose one of {', '.join(SPLITS)}")
 
 
-def check_sequence(sequence: str, sequences: Sequence[str], where: str) -> None:
+def check_sequence(sequence: str, sequences: Collection[str], where: str) -> None:
     """Raises KeyError naming the data set `where` unless it has `sequence`."""
     if sequence not in sequences:
         known = ", ".join(list(sequences)[:3])
@@ -68,9 +68,7 @@ def check_frames(frames: Frames, where: str) -> None:
     positive focal lengths, extrinsics finite and rigid (rotation orthonormal to 1e-3, determinant +1).
     """
     if frames.images.ndim != 4 or frames.images.shape[3] != 3 or frames.images.dtype != np.uint8:
-        raise ValueError(
-            f"{where}: images must be uint8 [T, H, W, 3], got {frames.images.dtype} {frames.images.shape}"
-        )
+        raise ValueError(f"{where}: images must be uint8 [T, H, W, 3], got {frames.images.dtype} {frames.images.shape}")
     count, height, width = frames.images.shape[:3]
     expected = {"depth": (count, height, width), "intrinsics": (count, 3, 3), "extrinsics": (count, 4, 4)}
     for name, shape in expected.items():
@@ -78,7 +76,7 @@ def check_frames(frames: Frames, where: str) -> None:
         if array.shape != shape or array.dtype != np.float32:
             raise ValueError(f"{where}: {name} must be float32 {shape}, got {array.dtype} {array.shape}")
     focal = frames.intrinsics[:, (0, 1), (0, 1)]
-    rotation = frames.extrinsics[:, :3, :3].astype(np.float64)
+    rotation = np.nan_to_num(frames.extrinsics[:, :3, :3].astype(np.float64), posinf=0.0, neginf=0.0)
     orthonormal = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max((1, 2)) < 1e-3
     checks = {
         "depth must be finite": np.isfinite(frames.depth).all((1, 2)),

@@ -49,7 +49,9 @@ class _View:
             return None
         return slice(top, bottom + 1), slice(left, right + 1)
 
-    def keep_nearest(self, where: tuple[slice, slice], depth: np.ndarray, hit: np.ndarray, surface) -> None:
+    def keep_nearest(
+        self, where: tuple[slice, slice], depth: np.ndarray, hit: np.ndarray, surface: np.ndarray | int
+    ) -> None:
         """Records `surface` (number or array) where `hit` and `depth` beats what is known in the rectangle."""
         nearest = self.depth[where]
         hit = hit & (depth > 0) & (depth < nearest)
@@ -65,13 +67,18 @@ def render(
     `extrinsics` [4, 4] world-to-camera (OpenCV), camera inside the room; `intrinsics` [3, 3] in pixels with
     centres at integers. Deterministic: no randomness, no threads, one frame at a time.
     """
+    view = _cast(room, extrinsics, intrinsics, height, width)
+    return _shade(view, room.textures), view.depth
+
+
+def _cast(room: Room, extrinsics: np.ndarray, intrinsics: np.ndarray, height: int, width: int) -> _View:
     view = _View(np.asarray(extrinsics, np.float64), np.asarray(intrinsics, np.float64), height, width)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         _cast_room(view, room)
         _cast_boxes(view, room)
         _cast_spheres(view, room)
         _cast_cylinders(view, room)
-    return _shade(view, room.textures), view.depth
+    return view
 
 
 def _cast_room(view: _View, room: Room) -> None:
@@ -104,10 +111,10 @@ def _cast_boxes(view: _View, room: Room) -> None:
             far.append(middle + reach)
         enter = np.maximum(np.maximum(near[0], near[1]), near[2])
         leave = np.minimum(np.minimum(far[0], far[1]), far[2])
-        axis = np.where(enter == near[0], 0, np.where(enter == near[1], 1, 2))
+        entered = np.where(enter == near[0], 0, np.where(enter == near[1], 1, 2))
         # A ray enters by the positive face where it runs in the negative direction.
-        positive = np.where(axis == 0, rays[0] < 0, np.where(axis == 1, rays[1] < 0, rays[2] < 0))
-        view.keep_nearest(where, enter, enter <= leave, 6 + 6 * index + 2 * axis + positive)
+        positive = np.where(entered == 0, rays[0] < 0, np.where(entered == 1, rays[1] < 0, rays[2] < 0))
+        view.keep_nearest(where, enter, enter <= leave, 6 + 6 * index + 2 * entered + positive)
 
 
 def _cast_spheres(view: _View, room: Room) -> None:

@@ -1,0 +1,114 @@
+"""Pictures from files, with the damage that decoders let pass reported.
+
+OpenCV decodes truncated JPEG and PNG files without complaint and fills the missing part with grey; files are
+therefore walked to their end marker first.
+"""
+
+from __future__ import annotations
+
+import re
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+_JPEG_START = b"\xff\xd8"
+_PNG_START = b"\x89PNG\r\n\x1a\n"
+# Within entropy-coded data a real marker is FF followed by neither 00, a restart marker nor a fill byte.
+_JPEG_MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
+_JPEG_END, _JPEG_SCAN = 0xD9, 0xDA
+
+
+def read_rgb(path: str | Path) -> np.ndarray:
+    """8-bit colour picture [H, W, 3] uint8 RGB; grey is repeated, alpha is composited over white.
+
+    Orientation tags are ignored: calibrations belong to the pixels as stored.
+
+    Raises:
+      FileNotFoundError: no such file.
+      ValueError: truncated, damaged or undecodable file, or not 8 bits a channel; names the file.
+    """
+    picture = _decode(Path(path))
+    if picture.dtype != np.uint8:
+        raise ValueError(f"{path}: expected 8-bit colour, got {picture.dtype}: convert it to 8 bits a channel")
+    if picture.ndim == 2:
+        return np.repeat(picture[:, :, None], 3, axis=2)
+    if picture.shape[2] == 4:
+        alpha = picture[:, :, 3:].astype(np.float32) / 255.0
+        picture = (picture[:, :, :3] * alpha + 255.0 * (1.0 - alpha) + 0.5).astype(np.uint8)
+    return np.ascontiguousarray(picture[:, :, ::-1])
+
+
+def read_depth(path: str | Path) -> np.ndarray:
+    """16-bit single-channel picture [H, W] uint16, in the file's own unit.
+
+    Raises:
+      FileNotFoundError: no such file.
+      ValueError: truncated, damaged or undecodable file, or not 16-bit with one channel; names the file.
+    """
+    picture = _decode(Path(path))
+    if picture.dtype != np.uint16 or picture.ndim != 2:
+        raise ValueError(
+            f"{path}: expected 16-bit depth with one channel, got {picture.dtype} with shape {picture.shape}: "
+            "replace it with the data set's original file"
+        )
+    return picture
+
+
+def _decode(path: Path) -> np.ndarray:
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file; fetch it again or remove the frame's other files")
+    data = path.read_bytes()
+    if data.startswith(_JPEG_START):
+        complete = _jpeg_is_complete(data)
+    elif data.startswith(_PNG_START):
+        complete = _png_is_complete(data)
+    else:
+        complete = bool(data)
+    if not complete:
+        raise ValueError(f"{path}: truncated or damaged picture of {len(data)} bytes: fetch it again")
+    try:
+        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise ValueError(f"{path}: not a picture that OpenCV can decode ({error.err}): fetch it again") from error
+    if picture is None:
+        raise ValueError(f"{path}: not a picture that OpenCV can decode: fetch it again")
+    return picture
+
+
+def _jpeg_is_complete(data: bytes) -> bool:
+    """Whether the segments up to the end-of-image marker are all there (ITU T.81, annex B)."""
+    position = len(_JPEG_START)
+    while position + 2 <= len(data):
+        if data[position] != 0xFF:
+            return False
+        kind = data[position + 1]
+        if kind == 0xFF:
+            position += 1
+            continue
+        if kind == _JPEG_END:
+            return True
+        if position + 4 > len(data):
+            return False
+        position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
+        if kind == _JPEG_SCAN:
+            marker = _JPEG_MARKER.search(data, position)
+            if marker is None:
+                return False
+            position = marker.start()
+    return False
+
+
+def _png_is_complete(data: bytes) -> bool:
+    """Whether all chunks up to IEND are there with correct checksums (PNG specification, section 5)."""
+    position = len(_PNG_START)
+    while position + 12 <= len(data):
+        length = int.from_bytes(data[position : position + 4], "big")
+        end = position + 12 + length
+        if end > len(data) or zlib.crc32(data[position + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
+            return False
+        if data[position + 4 : position + 8] == b"IEND":
+            return True
+        position = end
+    return False

@@ -1,0 +1,204 @@
+"""Resizing: model input from pictures of any size, and crops whose cameras follow.
+
+Pixel centres are at integers; resizing by a factor s maps c' = (c + 0.5) s - 0.5. Images are resampled with the
+antialiased bicubic filter (a = -0.5) of Pillow, which VGGT's weights were trained with; depth takes the nearest
+pixel, since a mean across an edge is on neither surface.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from logvggt_jax.types import Frames
+
+PATCH = 14
+_BLOCK = 32  # output rows of one product: the filter is local, so most of a full matrix is zero
+
+
+@dataclass(frozen=True)
+class ResizeTransform:
+    """Maps between original pictures and the model input that `preprocess` made of them.
+
+    Attributes:
+      original_size: (H, W) of the originals.
+      size: (h, w) of the model input.
+    """
+
+    original_size: tuple[int, int]
+    size: tuple[int, int]
+
+    @property
+    def scale(self) -> np.ndarray:
+        """[2] float64: w / W and h / H."""
+        return np.array([self.size[1] / self.original_size[1], self.size[0] / self.original_size[0]])
+
+    def pixels_to_original(self, pixels: np.ndarray) -> np.ndarray:
+        """Pixels [..., 2] (u, v) of the model input as pixels of the original."""
+        return (np.asarray(pixels) + 0.5) / self.scale - 0.5
+
+    def pixels_from_original(self, pixels: np.ndarray) -> np.ndarray:
+        """Pixels [..., 2] (u, v) of the original as pixels of the model input."""
+        return (np.asarray(pixels) + 0.5) * self.scale - 0.5
+
+    def intrinsics_to_original(self, intrinsics: np.ndarray) -> np.ndarray:
+        """Intrinsics [..., 3, 3] for the model input's pixels as intrinsics for the original's."""
+        return _rescaled(np.asarray(intrinsics), 1.0 / self.scale)
+
+    def intrinsics_from_original(self, intrinsics: np.ndarray) -> np.ndarray:
+        """Intrinsics [..., 3, 3] for the original's pixels as intrinsics for the model input's."""
+        return _rescaled(np.asarray(intrinsics), self.scale)
+
+    def depth_to_original(self, depth: np.ndarray) -> np.ndarray:
+        """Depth or confidence [..., h, w] at the original size [..., H, W], nearest neighbour."""
+        depth = np.asarray(depth)
+        if depth.shape[-2:] != self.size:
+            raise ValueError(f"depth must end in the model input's size {self.size}, got shape {depth.shape}")
+        columns = _nearest(self.original_size[1], 1.0 / self.scale[0], 0.0, self.size[1])
+        rows = _nearest(self.original_size[0], 1.0 / self.scale[1], 0.0, self.size[0])
+        return depth[..., rows[:, None], columns]
+
+
+def preprocess(
+    frames: np.ndarray | Sequence[np.ndarray], *, longer_edge: int = 518
+) -> tuple[np.ndarray, ResizeTransform]:
+    """Model input from pictures of any one size, and how to map results back.
+
+    The longer edge becomes `longer_edge`, the other is rounded to the nearest multiple of 14 (ties to even, at
+    least 14), so the aspect ratio changes by a little. Same rule and, to a grey level, same values as VGGT's loader
+    in pad mode without its padding.
+
+    Args:
+      frames: uint8 RGB, [T, H, W, 3] or a sequence of [H, W, 3].
+      longer_edge: pixels, a multiple of 14.
+
+    Returns:
+      Images [T, h, w, 3] float32 in [0, 1], and the transform.
+
+    Raises:
+      ValueError: wrong shape, dtype or `longer_edge`, no frames, or frames of unequal size.
+    """
+    if longer_edge < PATCH or longer_edge % PATCH:
+        raise ValueError(f"longer_edge must be a positive multiple of {PATCH}, got {longer_edge}")
+    frames = [np.asarray(frame) for frame in frames]
+    if not frames:
+        raise ValueError("no frames given: pass at least one uint8 picture [H, W, 3]")
+    for index, frame in enumerate(frames):
+        if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
+            raise ValueError(
+                f"frame {index} must be a uint8 RGB picture [H, W, 3], got {frame.dtype} with shape {frame.shape}"
+            )
+        if frame.shape != frames[0].shape:
+            raise ValueError(
+                f"frame {index} has size {frame.shape[:2]}, frame 0 has {frames[0].shape[:2]}: "
+                "preprocess frames of one size at a time"
+            )
+    height, width = frames[0].shape[:2]
+    if not height or not width:
+        raise ValueError(f"frames are empty: their size is {(height, width)}")
+    longer = max(height, width)
+    size = tuple(
+        longer_edge if edge == longer else max(PATCH, PATCH * round(edge * longer_edge / longer / PATCH))
+        for edge in (height, width)
+    )
+    rows = _resize_matrix(height, size[0], size[0] / height, 0.0)
+    columns = _resize_matrix(width, size[1], size[1] / width, 0.0)
+    images = np.empty((len(frames), *size, 3), np.float32)
+    for frame, image in zip(frames, images, strict=True):
+        np.divide(_resample(frame, rows, columns), np.float32(255.0), out=image)
+    return images, ResizeTransform(original_size=(height, width), size=(size[0], size[1]))
+
+
+def fit(frames: Frames, size: tuple[int, int]) -> Frames:
+    """`frames` cropped and resized to exactly `size` (H, W) with the principal point at (W/2, H/2).
+
+    The crop is the largest with the target's aspect ratio whose principal point lands there; its borders need
+    not fall on whole pixels, since images are resampled at the exact offset, so the intrinsics are exact as well.
+    Pixel aspect is kept. Depth is sampled from the nearest pixel; depth values and extrinsics do not change.
+    Frames that already fit are returned as they are.
+
+    Raises:
+      ValueError: `size` is not two multiples of 14, or a principal point lies outside its image.
+    """
+    height, width = size
+    if height < PATCH or width < PATCH or height % PATCH or width % PATCH:
+        raise ValueError(f"size must be two positive multiples of {PATCH}, got {size}")
+    source_height, source_width = frames.images.shape[1:3]
+    crops = [_crop(matrix, (source_height, source_width), size) for matrix in frames.intrinsics.astype(np.float64)]
+    if (source_height, source_width) == (height, width) and all(crop == (1.0, 0.0, 0.0) for crop in crops):
+        return frames
+    images = np.empty((len(crops), height, width, 3), np.uint8)
+    depth = np.empty((len(crops), height, width), np.float32)
+    intrinsics = frames.intrinsics.copy()
+    for index, (scale, left, top) in enumerate(crops):
+        rows = _resize_matrix(source_height, height, scale, top)
+        columns = _resize_matrix(source_width, width, scale, left)
+        images[index] = _resample(frames.images[index], rows, columns)
+        nearest_rows = _nearest(height, scale, top, source_height)
+        nearest_columns = _nearest(width, scale, left, source_width)
+        depth[index] = frames.depth[index][nearest_rows[:, None], nearest_columns]
+        intrinsics[index, :2, :2] *= scale
+        intrinsics[index, :2, 2] = width / 2, height / 2
+    return frames._replace(images=images, depth=depth, intrinsics=intrinsics)
+
+
+def _rescaled(intrinsics: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    result = intrinsics.copy()
+    result[..., :2, :2] *= scale[:, None]
+    result[..., :2, 2] = (intrinsics[..., :2, 2] + 0.5) * scale - 0.5
+    return result
+
+
+def _crop(matrix: np.ndarray, source: tuple[int, int], size: tuple[int, int]) -> tuple[float, float, float]:
+    """Scale, left and top of the crop: pixel c maps to (c - left + 0.5) scale - 0.5."""
+    edges = (source[1], source[0])
+    centre, target = matrix[:2, 2], np.array([size[1] / 2, size[0] / 2])
+    before, after = centre + 0.5, np.array(edges) - 0.5 - centre
+    if not (np.isfinite(centre).all() and (before > 0).all() and (after > 0).all()):
+        raise ValueError(
+            f"the principal point ({centre[0]:g}, {centre[1]:g}) lies outside the image of size {source}: "
+            "correct the intrinsics"
+        )
+    scale = float(max(((target + 0.5) / before).max(), ((target - 0.5) / after).max()))
+    left, top = (float(c) for c in centre + 0.5 - (target + 0.5) / scale)
+    return scale, left, top
+
+
+def _nearest(out_size: int, scale: float, start: float, in_size: int) -> np.ndarray:
+    centres = (np.arange(out_size) + 0.5) / scale + start
+    return np.clip(np.floor(centres).astype(np.intp), 0, in_size - 1)
+
+
+@functools.lru_cache(maxsize=64)
+def _resize_matrix(in_size: int, out_size: int, scale: float, start: float) -> np.ndarray:
+    """Filter weights [out_size, in_size] float32, rows sum to 1; the kernel widens when shrinking."""
+    centres = (np.arange(out_size) + 0.5) / scale - 0.5 + start
+    distance = np.abs(np.arange(in_size) - centres[:, None]) * min(scale, 1.0)
+    near = (1.5 * distance - 2.5) * distance**2 + 1.0
+    far = ((-0.5 * distance + 2.5) * distance - 4.0) * distance + 2.0
+    weights = np.where(distance < 1.0, near, np.where(distance < 2.0, far, 0.0))
+    matrix = (weights / weights.sum(1, keepdims=True)).astype(np.float32)
+    matrix.flags.writeable = False
+    return matrix
+
+
+def _apply(matrix: np.ndarray, image: np.ndarray) -> np.ndarray:
+    """matrix [n, N] times image [N, ...] uint8, rounded to uint8."""
+    flat = image.reshape(len(image), -1)
+    result = np.empty((len(matrix), flat.shape[1]), np.uint8)
+    for first in range(0, len(matrix), _BLOCK):
+        block = matrix[first : first + _BLOCK]
+        used = np.flatnonzero(block.any(0))
+        span = slice(used[0], used[-1] + 1)
+        product = block[:, span] @ flat[span].astype(np.float32)
+        result[first : first + _BLOCK] = np.clip(np.floor(product + np.float32(0.5)), 0, 255)
+    return result.reshape(len(matrix), *image.shape[1:])
+
+
+def _resample(image: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Columns first and 8 bits in between, as Pillow does."""
+    narrowed = _apply(columns, np.ascontiguousarray(image.transpose(1, 0, 2)))
+    return _apply(rows, np.ascontiguousarray(narrowed.transpose(1, 0, 2)))
