@@ -11,9 +11,11 @@ from logvggt_jax.config import (
     RefinementConfig,
     WindowConfig,
 )
+from logvggt_jax.data.transforms import preprocess
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.model.windows import WindowState
 from logvggt_jax.types import Frames, Predictions, WindowOutput
+from logvggt_jax.weights.checkpoints import from_pretrained, load_model
 
 __version__ = version("logvggt-jax")
 
@@ -30,4 +32,7 @@ __all__ = [
     "WindowConfig",
     "WindowOutput",
     "WindowState",
+    "from_pretrained",
+    "load_model",
+    "preprocess",
 ]

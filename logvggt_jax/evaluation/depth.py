@@ -150,8 +150,9 @@ def _adam_scale_shift(prediction: np.ndarray, target: np.ndarray) -> tuple[float
     start = lower_median(target) / lower_median(prediction)
     # Float32 as the reference: the start puts one residual at round-off, and its sign decides the first steps.
     prediction, target = prediction.astype(np.float32), target.astype(np.float32)
-    parameters = np.array([start, 0.0], np.float32)
-    first, second = np.zeros(2, np.float32), np.zeros(2, np.float32)
+    parameters: np.ndarray = np.array([start, 0.0], np.float32)
+    first: np.ndarray = np.zeros(2, np.float32)
+    second: np.ndarray = np.zeros(2, np.float32)
     previous = np.inf
     for step in range(1, 1001):
         residual = parameters[0] * prediction + parameters[1] - target

@@ -126,6 +126,32 @@ def align_median(prediction: np.ndarray, target: np.ndarray) -> tuple[np.ndarray
     return (prediction - [0.0, 0.0, predicted.shift_z]) * factor, target - [0.0, 0.0, true.shift_z]
 
 
+def align_bounding_boxes(prediction: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Prediction [N, 3] scaled and moved so that its bounding box has the target's diagonal and centre.
+
+    FastVGGT's alignment; a single outlier decides it, so prefer a similarity or `align_median`.
+    """
+    prediction, target = _cloud(prediction, "prediction"), _cloud(target, "target")
+    scale = np.linalg.norm(np.ptp(target, axis=0)) / np.linalg.norm(np.ptp(prediction, axis=0))
+    centre = (prediction.min(0) + prediction.max(0)) / 2
+    return (prediction - centre) * scale + (target.min(0) + target.max(0)) / 2
+
+
+def voxel_chamfer(
+    prediction: np.ndarray, target: np.ndarray, *, voxel: float = 0.05, max_distance: float = 0.5
+) -> float:
+    """FastVGGT's Chamfer distance: sum of both mean nearest distances between voxel centroids, each held to a maximum.
+
+    `voxel` is the side of the voxels and `max_distance` the bound on each distance, in the unit of the points.
+    """
+    reduced = [
+        np.array(_open3d_cloud(_cloud(points, name)).voxel_down_sample(voxel).points)
+        for points, name in ((prediction, "prediction"), (target, "target"))
+    ]
+    forth, back = _nearest(*reduced)[0], _nearest(*reduced[::-1])[0]
+    return float(np.minimum(forth, max_distance).mean() + np.minimum(back, max_distance).mean())
+
+
 def sample_indices(count: int, max_points: int | None, seed: int) -> np.ndarray:
     """Sorted indices [min(count, max_points)] drawn without replacement; all where `max_points` is None.
 

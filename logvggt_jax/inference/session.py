@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -18,7 +19,8 @@ from logvggt_jax.model.windows import WindowState
 from logvggt_jax.types import WindowOutput
 
 
-class FrameResult(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class FrameResult:
     """One frame whose depth is final, numpy arrays.
 
     Attributes:
@@ -132,12 +134,15 @@ class StreamSession:
       chunk: frames by which token buffers grow; a program that reads them compiles once a chunk.
     """
 
-    def __init__(
-        self, model: LogVGGT, variables: Variables, *, provisional: bool = False, chunk: int = 256
-    ) -> None:
+    def __init__(self, model: LogVGGT, variables: Variables, *, provisional: bool = False, chunk: int = 256) -> None:
         if chunk < 1:
             raise ValueError(f"StreamSession.chunk must be at least 1 frame, got {chunk}")
-        self._model, self._variables, self._provisional, self._chunk = model, variables, provisional, chunk
+        self._model, self._provisional, self._chunk = model, provisional, chunk
+        # Once, not at every call, where they are numpy arrays.
+        self._variables = jax.device_put(variables)
+        # Windows know nothing of refinement: sessions that differ in its mode share their programs.
+        plain = dataclasses.replace(model.config.refinement, enabled=True, period=None, context=None)
+        self._windows = LogVGGT(dataclasses.replace(model.config, refinement=plain))
         self._store = TokenStore(chunk=chunk, keep_registers=model.config.refinement.enabled)
         self._pending: list[np.ndarray] = []
         self._state: WindowState | None = None
@@ -186,7 +191,7 @@ class StreamSession:
         if self._pending or self._steps == 0:
             outputs.append(self._one_step())
         assert self._state is not None  # set by _begin
-        outputs.append(_finish(self._model, self._variables, self._state))
+        outputs.append(_finish(self._windows, self._variables, self._state))
         self._state = self._newest = None
         return self._collect(outputs)
 
@@ -197,7 +202,9 @@ class StreamSession:
             encodings = np.concatenate([encodings, self._refined_until(self.num_frames)[1]])
         is_final = np.arange(len(encodings)) < len(self._encodings)
         size = self._image_size if len(encodings) else (1, 1)
-        extrinsics, intrinsics = decode_poses(encodings, size)
+        # A field of view of zero, which untrained models predict, is an infinite focal length.
+        with np.errstate(divide="ignore"):
+            extrinsics, intrinsics = decode_poses(encodings, size)
         return Cameras(encodings, extrinsics, intrinsics, is_final)
 
     def _check(self, frames: np.ndarray) -> None:
@@ -238,12 +245,12 @@ class StreamSession:
 
     def _begin(self) -> None:
         config = self._model.config.windows
-        self._state = _start(self._model, self._variables, *self._take(config.size - config.stride))
+        self._state = _start(self._windows, self._variables, *self._take(config.size - config.stride))
 
     def _one_step(self) -> WindowOutput:
         frames, mask = self._take(self._model.config.windows.stride)
         assert self._state is not None
-        self._state, out = _step(self._model, self._variables, self._state, frames, mask)
+        self._state, out = _step(self._windows, self._variables, self._state, frames, mask)
         self._steps += 1
         return out
 

@@ -12,7 +12,7 @@ from typing import NamedTuple, TypeVar
 import cv2
 import numpy as np
 
-from logvggt_jax.data.image_files import read_image
+from logvggt_jax.data.image_files import read_rgb
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 SEVEN_SCENES_COLOUR = (".color.png", ".color.jpg")
@@ -63,10 +63,17 @@ class FolderSource:
             )
         colour = [file for file in images if file.name.lower().endswith(SEVEN_SCENES_COLOUR)]
         ordered = sorted(colour or images, key=_natural_order)
-        self._files = list(enumerate(ordered))[::stride][:max_frames]
+        names = [_stem(file.name) for file in ordered]
+        if len(set(names)) < len(names):
+            # 1.jpg beside 1.png: results are named after frames, so that names must differ.
+            names = [file.name for file in ordered]
+        listing = [
+            (float(position), name, file) for position, (name, file) in enumerate(zip(names, ordered, strict=True))
+        ]
+        self._frames = listing[::stride][:max_frames]
 
     def __len__(self) -> int:
-        return len(self._files)
+        return len(self._frames)
 
     @property
     def expected_frames(self) -> int:
@@ -75,15 +82,15 @@ class FolderSource:
 
     def __iter__(self) -> Iterator[SourceFrame]:
         first: tuple[Path, tuple[int, ...]] | None = None
-        for position, file in self._files:
-            image = read_image(file)
+        for timestamp, name, file in self._frames:
+            image = read_rgb(file)
             first = first or (file, image.shape)
             if image.shape != first[1]:
                 raise ValueError(
                     f"{file} is {_size(image.shape)} pixels but {first[0].name} is {_size(first[1])}: all frames "
                     "of a sequence need one size; resize them or put them into folders of their own"
                 )
-            yield SourceFrame(_stem(file.name), float(position), image)
+            yield SourceFrame(name, timestamp, image)
 
 
 class VideoSource:

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from logvggt_jax.config import ModelConfig
+from logvggt_jax.model.initializers import normal
 from logvggt_jax.model.layers import Block
 from logvggt_jax.model.rope import frame_positions, rope_table
 
@@ -93,10 +94,10 @@ class Aggregator(nn.Module):
 
     def _special_tokens(self, starts_sequence: jax.Array, batch: int, frames: int, width: int) -> jax.Array:
         """Camera and register tokens [B, K, 5, C]: copy 0 for the sequence's first frame, copy 1 for others."""
-        initial = nn.initializers.normal(1e-6)
-        camera = self.param("camera_token", initial, (1, 2, 1, width), jnp.float32)
+        initial = normal(1e-6)
+        camera = self.param("camera_token", initial, (1, 2, 1, width))
         shape = (1, 2, self.config.aggregator.num_registers, width)
-        register = self.param("register_token", initial, shape, jnp.float32)
+        register = self.param("register_token", initial, shape)
         copies = jnp.concatenate([camera, register], axis=2)[0]
         is_first = starts_sequence[:, None] & (jnp.arange(frames) == 0)
         return jnp.where(is_first[..., None, None], copies[0], copies[1])

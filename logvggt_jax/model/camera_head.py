@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from logvggt_jax.config import CameraHeadConfig
-from logvggt_jax.model.layers import MLP, Block, layer_norm
+from logvggt_jax.model.initializers import constant
+from logvggt_jax.model.layers import MLP, Block, dense, layer_norm
 
 
 class CameraHead(nn.Module):
@@ -27,7 +28,7 @@ class CameraHead(nn.Module):
         config = self.config
         width = camera_tokens.shape[-1]
         tokens = layer_norm(1e-5, "token_norm")(camera_tokens.astype(jnp.float32))
-        empty = self.param("empty_pose_tokens", nn.initializers.zeros_init(), (1, 1, 9), jnp.float32)
+        empty = self.param("empty_pose_tokens", constant(0.0), (1, 1, 9))
         plain = layer_norm(1e-6, "adaptive_norm", affine=False)(tokens)
 
         def one_round(
@@ -35,8 +36,8 @@ class CameraHead(nn.Module):
         ) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
             del module  # the submodules below attach to this module's scope by themselves
             embedded, pose = carry
-            features = jax.nn.silu(nn.Dense(width, name="embed_pose")(embedded))
-            shift, scale, gate = jnp.split(nn.Dense(3 * width, name="modulation")(features), 3, axis=-1)
+            features = jax.nn.silu(dense(width, "embed_pose")(embedded))
+            shift, scale, gate = jnp.split(dense(3 * width, "modulation")(features), 3, axis=-1)
             z = gate * (plain * (1.0 + scale) + shift) + tokens
             for i in range(config.depth):
                 z = Block(

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from logvggt_jax.config import EncoderConfig
+from logvggt_jax.model.initializers import constant, fan_in_normal, normal
 from logvggt_jax.model.layers import Block, layer_norm
 
 _IMAGE_MEAN = np.array([0.485, 0.456, 0.406], np.float32)
@@ -26,8 +27,8 @@ class PatchEmbedding(nn.Module):
         """[N, H, W, 3] -> [N, h * w, C], row by row."""
         size = self.patch_size
         shape = (size, size, images.shape[-1], self.features)
-        kernel = self.param("kernel", nn.initializers.lecun_normal(in_axis=(0, 1, 2)), shape, jnp.float32)
-        bias = self.param("bias", nn.initializers.zeros_init(), (self.features,), jnp.float32)
+        kernel = self.param("kernel", fan_in_normal, shape)
+        bias = self.param("bias", constant(0.0), (self.features,))
         count, height, width, channels = images.shape
         patches = images.reshape(count, height // size, size, width // size, size, channels)
         patches = patches.transpose(0, 1, 3, 2, 4, 5).reshape(count, -1, size * size * channels)
@@ -49,12 +50,12 @@ class DinoV2(nn.Module):
         tokens = PatchEmbedding(width, config.patch_size, self.dtype, name="patch_embed")(
             (images - _IMAGE_MEAN) / _IMAGE_STD
         ).astype(jnp.float32)
-        tiny, small = nn.initializers.normal(1e-6), nn.initializers.truncated_normal(0.02)
-        cls_token = self.param("cls_token", tiny, (1, 1, width), jnp.float32)
-        pos_embed = self.param("pos_embed", small, (1, 1 + side * side, width), jnp.float32)
-        registers = self.param("register_tokens", tiny, (1, config.num_registers, width), jnp.float32)
+        tiny, small = normal(1e-6), normal(0.02)
+        cls_token = self.param("cls_token", tiny, (1, 1, width))
+        pos_embed = self.param("pos_embed", small, (1, 1 + side * side, width))
+        registers = self.param("register_tokens", tiny, (1, config.num_registers, width))
         # Part of every DINOv2 checkpoint; only masked-image pre-training reads it.
-        self.param("mask_token", nn.initializers.zeros_init(), (1, width), jnp.float32)
+        self.param("mask_token", constant(0.0), (1, width))
 
         grid = (images.shape[1] // config.patch_size, images.shape[2] // config.patch_size)
         tokens = tokens + _resize_positions(pos_embed[:, 1:], side, grid)

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from logvggt_jax.config import DPTConfig
-from logvggt_jax.model.layers import layer_norm
+from logvggt_jax.model.initializers import constant, normal
+from logvggt_jax.model.layers import Convolution, layer_norm
 
 
 class DPTHead(nn.Module):
@@ -29,35 +30,23 @@ class DPTHead(nn.Module):
         maps = []
         for i, (tokens, channels) in enumerate(zip(levels, config.out_channels, strict=True)):
             x = norm(tokens).reshape(-1, *grid, tokens.shape[-1])
-            x = self._conv(channels, 1, f"project_{i}")(x)
+            x = Convolution(channels, 1, self.dtype, name=f"project_{i}")(x)
             x = x + _uv_embedding(x.shape[1:], aspect).astype(x.dtype)
             if i < 2:
                 x = UpConv(channels, 4 // 2**i, self.dtype, name=f"resize_{i}")(x)
             elif i == 3:
-                x = self._conv(channels, 3, "resize_3", strides=2)(x)
-            maps.append(self._conv(config.features, 3, f"layer_{i + 1}", use_bias=False)(x))
+                x = Convolution(channels, 3, self.dtype, strides=2, name="resize_3")(x)
+            maps.append(Convolution(config.features, 3, self.dtype, use_bias=False, name=f"layer_{i + 1}")(x))
 
-        x = self._fuse(4, maps[3], None, maps[2].shape[1:3])
-        x = self._fuse(3, x, maps[2], maps[1].shape[1:3])
-        x = self._fuse(2, x, maps[1], maps[0].shape[1:3])
+        x = self._fuse(4, maps[3], None, _size(maps[2]))
+        x = self._fuse(3, x, maps[2], _size(maps[1]))
+        x = self._fuse(2, x, maps[1], _size(maps[0]))
         x = self._fuse(1, x, maps[0], (2 * maps[0].shape[1], 2 * maps[0].shape[2]))
-        x = self._conv(config.features // 2, 3, "output_1")(x)
+        x = Convolution(config.features // 2, 3, self.dtype, name="output_1")(x)
         x = _resize_bilinear(x, image_size)
         x = x + _uv_embedding(x.shape[1:], aspect).astype(x.dtype)
-        x = jax.nn.relu(self._conv(32, 3, "output_2_hidden")(x))
-        return self._conv(self.out_channels, 1, "output_2")(x).astype(jnp.float32)
-
-    def _conv(self, features: int, size: int, name: str, *, strides: int = 1, use_bias: bool = True) -> nn.Conv:
-        padding = (size - 1) // 2  # explicit: "SAME" pads strided convolutions on one side only
-        return nn.Conv(
-            features,
-            (size, size),
-            strides=(strides, strides),
-            padding=((padding, padding), (padding, padding)),
-            use_bias=use_bias,
-            dtype=self.dtype,
-            name=name,
-        )
+        x = jax.nn.relu(Convolution(32, 3, self.dtype, name="output_2_hidden")(x))
+        return Convolution(self.out_channels, 1, self.dtype, name="output_2")(x).astype(jnp.float32)
 
     def _fuse(self, level: int, x: jax.Array, lateral: jax.Array | None, size: tuple[int, int]) -> jax.Array:
         return Fusion(self.config.features, self.dtype, name=f"refine_{level}")(x, lateral, size)
@@ -74,8 +63,8 @@ class UpConv(nn.Module):
     def __call__(self, x: jax.Array) -> jax.Array:
         k = self.factor
         shape = (k, k, x.shape[-1], self.features)
-        kernel = self.param("kernel", nn.initializers.lecun_normal(in_axis=2, batch_axis=(0, 1)), shape)
-        bias = self.param("bias", nn.initializers.zeros_init(), (self.features,))
+        kernel = self.param("kernel", normal(x.shape[-1] ** -0.5), shape)
+        bias = self.param("bias", constant(0.0), (self.features,))
         dtype = jnp.dtype(self.dtype)
         tiles = jnp.einsum("nijc,abco->niajbo", x.astype(dtype), kernel.astype(dtype))
         count, height, _, width, _, _ = tiles.shape
@@ -91,9 +80,8 @@ class ResidualUnit(nn.Module):
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         r = jax.nn.relu(x)
-        pad = ((1, 1), (1, 1))
-        x = nn.Conv(self.features, (3, 3), padding=pad, dtype=self.dtype, name="conv1")(r)
-        return nn.Conv(self.features, (3, 3), padding=pad, dtype=self.dtype, name="conv2")(jax.nn.relu(x)) + r
+        x = Convolution(self.features, 3, self.dtype, name="conv1")(r)
+        return Convolution(self.features, 3, self.dtype, name="conv2")(jax.nn.relu(x)) + r
 
 
 class Fusion(nn.Module):
@@ -108,7 +96,7 @@ class Fusion(nn.Module):
             x = x + ResidualUnit(self.features, self.dtype, name="residual_1")(lateral)
         x = ResidualUnit(self.features, self.dtype, name="residual_2")(x)
         x = _resize_bilinear(x, size)
-        return nn.Conv(self.features, (1, 1), dtype=self.dtype, name="output")(x)
+        return Convolution(self.features, 1, self.dtype, name="output")(x)
 
 
 def depth_activation(raw: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -120,6 +108,10 @@ def point_activation(raw: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Points sign(v) (e^|v| − 1), [..., 3], and confidence 1 + exp(c), [...], of raw values [..., 4]."""
     values = raw[..., :3]
     return jnp.sign(values) * jnp.expm1(jnp.abs(values)), 1.0 + jnp.exp(raw[..., 3])
+
+
+def _size(x: jax.Array) -> tuple[int, int]:
+    return x.shape[1], x.shape[2]
 
 
 def _interpolation_matrix(source: int, target: int) -> np.ndarray:
@@ -136,7 +128,7 @@ def _interpolation_matrix(source: int, target: int) -> np.ndarray:
 
 def _resize_bilinear(x: jax.Array, size: tuple[int, int]) -> jax.Array:
     """[N, h, w, C] to [N, *size, C], corners aligned, which `jax.image.resize` does not offer."""
-    if x.shape[1:3] == tuple(size):
+    if _size(x) == size:
         return x
     rows = jnp.asarray(_interpolation_matrix(x.shape[1], size[0]), x.dtype)
     columns = jnp.asarray(_interpolation_matrix(x.shape[2], size[1]), x.dtype)

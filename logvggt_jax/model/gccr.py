@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from logvggt_jax.model.attention import attention
-from logvggt_jax.model.layers import layer_norm
+from logvggt_jax.model.layers import dense, layer_norm
 
 
 class GCCR(nn.Module):
@@ -30,7 +30,7 @@ class GCCR(nn.Module):
         context = layer_norm(1e-5, "register_norm")(registers)
 
         def heads(tokens: jax.Array, name: str) -> jax.Array:
-            projected = nn.Dense(width, dtype=self.dtype, name=name)(tokens)
+            projected = dense(width, name, self.dtype)(tokens)
             return projected.reshape(*tokens.shape[:2], self.num_heads, width // self.num_heads)
 
         out = attention(
@@ -40,6 +40,7 @@ class GCCR(nn.Module):
             jnp.repeat(register_mask, per_frame, axis=1),
             implementation=self.implementation,
         )
-        zeros = nn.initializers.zeros_init()
-        update = nn.Dense(width, dtype=self.dtype, kernel_init=zeros, name="output")(out.reshape(camera_tokens.shape))
+        update = dense(width, "output", self.dtype, kernel_init=nn.initializers.zeros_init())(
+            out.reshape(camera_tokens.shape)
+        )
         return camera_tokens + update.astype(jnp.float32)

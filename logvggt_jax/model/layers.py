@@ -2,12 +2,71 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
 from logvggt_jax.model.attention import attention
+from logvggt_jax.model.initializers import constant, fan_in_normal
 from logvggt_jax.model.rope import RopeTable, apply_rope
+
+# Neighbourhoods of more channels than this would cost more memory than they save time.
+_GATHERED_CHANNELS = 1024
+
+
+def dense(features: int, name: str, dtype: str = "float32", *, kernel_init: Any = fan_in_normal) -> nn.Dense:
+    """Linear layer with a float32 kernel and products in `dtype`."""
+    return nn.Dense(features, dtype=dtype, kernel_init=kernel_init, bias_init=constant(0.0), name=name)
+
+
+class Convolution(nn.Module):
+    """Square convolution [N, H, W, C] -> [N, H / strides, W / strides, features], padded so that stride 1 keeps
+    the size ("SAME" would pad strided ones on one side only).
+
+    XLA's CPU compiler turns the gradient of a convolution into matrix products only outside of loops; within the
+    scan over windows it falls back to scalar code, 12 times slower. On CPUs, convolutions of few channels are
+    therefore products over gathered neighbourhoods from the start.
+    """
+
+    features: int
+    size: int
+    dtype: str
+    strides: int = 1
+    use_bias: bool = True
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        size, channels, dtype = self.size, x.shape[-1], jnp.dtype(self.dtype)
+        kernel = self.param("kernel", fan_in_normal, (size, size, channels, self.features)).astype(dtype)
+        x = x.astype(dtype)
+        if size == 1:
+            y = x @ kernel[0, 0]
+        elif jax.default_backend() == "cpu" and size * size * channels <= _GATHERED_CHANNELS:
+            y = self._gathered(x, kernel)
+        else:
+            margin = (size - 1) // 2
+            y = jax.lax.conv_general_dilated(
+                x,
+                kernel,
+                (self.strides, self.strides),
+                ((margin, margin), (margin, margin)),
+                dimension_numbers=("NHWC", "HWIO", "NHWC"),
+            )
+        if self.use_bias:
+            y = y + self.param("bias", constant(0.0), (self.features,)).astype(dtype)
+        return y
+
+    def _gathered(self, x: jax.Array, kernel: jax.Array) -> jax.Array:
+        """A matrix product for each row of the kernel, over columns gathered side by side."""
+        size, strides, margin = self.size, self.strides, (self.size - 1) // 2
+        height, width = x.shape[1], x.shape[2]
+        padded = jnp.pad(x, ((0, 0), (margin, margin), (margin, margin), (0, 0)))
+        columns = [padded[:, :, j : j + width : strides] for j in range(size)]
+        gathered = jnp.concatenate(columns, axis=-1)
+        rows = kernel.reshape(size, -1, self.features)
+        return sum(gathered[:, i : i + height : strides] @ rows[i] for i in range(size))
 
 
 def layer_norm(epsilon: float, name: str, *, affine: bool = True) -> nn.LayerNorm:
@@ -18,6 +77,8 @@ def layer_norm(epsilon: float, name: str, *, affine: bool = True) -> nn.LayerNor
         use_bias=affine,
         use_scale=affine,
         use_fast_variance=False,
+        scale_init=constant(1.0),
+        bias_init=constant(0.0),
         name=name,
     )
 
@@ -29,7 +90,7 @@ class LayerScale(nn.Module):
 
     @nn.compact
     def __call__(self, branch: jax.Array) -> jax.Array:
-        gamma = self.param("gamma", nn.initializers.constant(self.initial, jnp.float32), (branch.shape[-1],))
+        gamma = self.param("gamma", constant(self.initial), (branch.shape[-1],))
         return gamma * branch.astype(jnp.float32)
 
 
@@ -42,9 +103,9 @@ class MLP(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        x = nn.Dense(self.hidden, dtype=self.dtype, name="fc1")(x)
+        x = dense(self.hidden, "fc1", self.dtype)(x)
         x = jax.nn.gelu(x, approximate=False)
-        return nn.Dense(self.features, dtype=self.dtype, name="fc2")(x)
+        return dense(self.features, "fc2", self.dtype)(x)
 
 
 class Attention(nn.Module):
@@ -64,8 +125,8 @@ class Attention(nn.Module):
     ) -> jax.Array:
         width = x.shape[-1]
         head_dim = width // self.num_heads
-        query = nn.Dense(width, dtype=self.dtype, name="query")(x)
-        key, value = jnp.split(nn.Dense(2 * width, dtype=self.dtype, name="key_value")(context), 2, axis=-1)
+        query = dense(width, "query", self.dtype)(x)
+        key, value = jnp.split(dense(2 * width, "key_value", self.dtype)(context), 2, axis=-1)
         query, key, value = (t.reshape(*t.shape[:-1], self.num_heads, head_dim) for t in (query, key, value))
         if self.qk_norm:
             query = layer_norm(1e-5, "query_norm")(query)
@@ -80,7 +141,7 @@ class Attention(nn.Module):
             key_valid,
             implementation=self.implementation,
         )
-        return nn.Dense(width, dtype=self.dtype, name="output")(out.reshape(x.shape))
+        return dense(width, "output", self.dtype)(out.reshape(x.shape))
 
 
 class Block(nn.Module):

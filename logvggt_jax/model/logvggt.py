@@ -6,6 +6,7 @@ import dataclasses
 import functools
 from typing import Any
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
@@ -47,7 +48,7 @@ class LogVGGT:
         jitted program would inline one for each parameter.
         """
         self._check_images(images, "images")
-        config, image_size = self.config, tuple(images.shape[2:4])
+        config, image_size = self.config, _image_size(images)
         grid = self._grid(image_size)
         width, patches = config.encoder.embed_dim, grid[0] * grid[1]
         registers = config.aggregator.num_registers
@@ -59,7 +60,7 @@ class LogVGGT:
         mask, first = jax.ShapeDtypeStruct((1, 1), bool), jax.ShapeDtypeStruct((1,), bool)
         cached = floats(1, len(config.aggregator.key_layers), 1, patches + 1 + registers, width)
         camera, levels = floats(1, 1, 2 * width), [floats(1, patches, 2 * width)] * 4
-        dense = {"grid": grid, "image_size": image_size}
+        dense: Any = {"grid": grid, "image_size": image_size}
         modules = {
             "encoder": self._encoder.lazy_init(next(keys), floats(1, *image_size, 3)),
             "aggregator": self._aggregator.lazy_init(
@@ -96,7 +97,7 @@ class LogVGGT:
         out = self.run_windows(variables, images, frame_mask, remat=remat)
         pose_encodings = self.refine_sequence(variables, out.camera_tokens, out.register_tokens, frame_mask)
         pose_encoding = pose_encodings[:, :, -1]
-        extrinsics, intrinsics = decode_poses(pose_encoding, images.shape[2:4])
+        extrinsics, intrinsics = decode_poses(pose_encoding, _image_size(images))
         return Predictions(
             pose_encoding=pose_encoding,
             pose_encodings=pose_encodings,
@@ -173,8 +174,8 @@ class LogVGGT:
           frame_mask: bool [B, K − s], False for padding.
         """
         frame_mask = self._mask(frames, frame_mask, count=self._overlap, name="start")
-        config, batch = self.config, frames.shape[0]
-        grid = self._grid(frames.shape[2:4])
+        config, batch, image_size = self.config, frames.shape[0], _image_size(frames)
+        grid = self._grid(image_size)
         width, registers = config.encoder.embed_dim, config.aggregator.num_registers
         patch_tokens = self._encode(variables, frames)
         tokens = grid[0] * grid[1] + 1 + registers
@@ -190,7 +191,7 @@ class LogVGGT:
             key_tokens=zeros(key_shape, config.dtype),
             special_tokens=zeros(special_shape, jnp.float32),
             frame_mask=frame_mask,
-            image_size=tuple(frames.shape[2:4]),
+            image_size=image_size,
             step=zeros((batch,), jnp.int32),
         )
 
@@ -212,7 +213,7 @@ class LogVGGT:
         """
         stride = self.config.windows.stride
         frame_mask = self._mask(frames, frame_mask, count=stride, name="step")
-        image_size = tuple(frames.shape[2:4])
+        image_size = _image_size(frames)
         grid = self._grid(image_size)
         fresh = self._encode(variables, frames)
         patch_tokens = jnp.concatenate([state.patch_tokens, fresh], axis=1)
@@ -220,8 +221,9 @@ class LogVGGT:
         is_first = state.step == 0
         width = self.config.encoder.embed_dim
         halves = slice(width, None) if self.config.windows.cache == "output" else slice(None, width)
-        key_tokens, special_tokens = self._aggregator.apply(
-            {"params": variables["params"]["aggregator"]},
+        key_tokens, special_tokens = _run(
+            self._aggregator,
+            variables["params"]["aggregator"],
             patch_tokens,
             window_mask,
             state.key_tokens[..., halves],
@@ -288,13 +290,12 @@ class LogVGGT:
         """GCCR alone: [B, N, 2C], [B, M, 4, 2C], bool [B, M] -> [B, N, 2C]; the identity when disabled."""
         if not self.config.refinement.enabled:
             return camera_tokens
-        params = {"params": variables["params"]["gccr"]}
-        return self._gccr.apply(params, camera_tokens, register_tokens, register_mask)
+        params = variables["params"]["gccr"]
+        return _run(self._gccr, params, camera_tokens, register_tokens, register_mask)
 
     def decode_cameras(self, variables: Variables, camera_tokens: jax.Array, camera_mask: jax.Array) -> jax.Array:
         """Camera head alone: refined tokens [B, N, 2C], bool [B, N] -> pose encodings [B, N, R, 9]."""
-        params = {"params": variables["params"]["camera_head"]}
-        return self._camera_head.apply(params, camera_tokens, camera_mask)
+        return _run(self._camera_head, variables["params"]["camera_head"], camera_tokens, camera_mask)
 
     def decode_group(
         self,
@@ -382,7 +383,7 @@ class LogVGGT:
             # At the source: nothing of the encoder's pass is then kept for a backward pass.
             params = jax.lax.stop_gradient(params)
         pixels = jnp.asarray(images, jnp.float32) / (255.0 if images.dtype == jnp.uint8 else 1.0)
-        tokens = self._encoder.apply({"params": params}, pixels.reshape(-1, *images.shape[2:]))
+        tokens = _run(self._encoder, params, pixels.reshape(-1, *images.shape[2:]))
         return tokens.reshape(*images.shape[:2], *tokens.shape[1:])
 
     def _output(
@@ -400,7 +401,7 @@ class LogVGGT:
         levels = [patches[:, i].reshape(batch * count, *patches.shape[3:]) for i in range(num_levels)]
 
         def dense(head: DPTHead, name: str) -> jax.Array:
-            raw = head.apply({"params": params[name]}, levels, grid=grid, image_size=image_size)
+            raw = _run(head, params[name], levels, grid=grid, image_size=image_size)
             return raw.reshape(batch, count, *raw.shape[1:])
 
         depth, depth_confidence = depth_activation(dense(self._depth_head, "depth_head"))
@@ -445,6 +446,15 @@ class LogVGGT:
         if tuple(mask.shape) != tuple(images.shape[:2]) or mask.dtype != jnp.bool_:
             raise ValueError(f"frame_mask must be bool {tuple(images.shape[:2])}, got {mask.dtype} {tuple(mask.shape)}")
         return jnp.asarray(mask)
+
+
+def _run(module: nn.Module, params: Any, *inputs: Any, **options: Any) -> Any:
+    """A linen module as a pure function of its own parameters."""
+    return module.apply({"params": params}, *inputs, **options)
+
+
+def _image_size(images: jax.Array) -> tuple[int, int]:
+    return images.shape[2], images.shape[3]
 
 
 def _shift_in(held: jax.Array, padding: int, *, axis: int) -> jax.Array:

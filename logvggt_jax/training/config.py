@@ -70,9 +70,7 @@ class OptimizerConfig:
     clip_norm: float
 
     def __post_init__(self) -> None:
-        _require(
-            self.schedule in SCHEDULES, f"optimizer.schedule must be one of {SCHEDULES}, got {self.schedule!r}"
-        )
+        _require(self.schedule in SCHEDULES, f"optimizer.schedule must be one of {SCHEDULES}, got {self.schedule!r}")
         _require(self.learning_rate > 0, f"optimizer.learning_rate must be positive, got {self.learning_rate}")
         _require(
             0 <= self.warmup_fraction < 0.75,
@@ -101,11 +99,156 @@ class StageConfig:
         object.__setattr__(self, "sizes", tuple((int(h), int(w)) for h, w in self.sizes))
         for field in ("steps", "clip_length", "batch_size", "min_stride", "max_stride"):
             value = getattr(self, field)
-            _require(
-                isinstance(value, int) and value >= 1, f"stage {self.name!r}: {field} must be >= 1, got {value!r}"
-            )
+            _require(isinstance(value, int) and value >= 1, f"stage {self.name!r}: {field} must be >= 1, got {value!r}")
         _require(
             self.min_stride <= self.max_stride,
             f"stage {self.name!r}: min_stride={self.min_stride} exceeds max_stride={self.max_stride}",
         )
         _require(bool(self.sizes), f"stage {self.name!r}: sizes is empty, give at least one (height, width)")
+
+
+@dataclasses.dataclass(frozen=True)
+class SourceConfig:
+    """One data set of a mixture.
+
+    `weight` is its share of the clips relative to the others'. `options` (sorted pairs) are the keyword arguments
+    of procedural rooms.
+    """
+
+    name: str
+    root: str | None
+    split: str
+    weight: float = 1.0
+    options: tuple[tuple[str, Any], ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(
+            self, "options", tuple(sorted((key, _frozen(value)) for key, value in dict(self.options).items()))
+        )
+        _require(self.weight > 0, f"data set {self.name!r}: weight must be positive, got {self.weight}")
+
+
+@dataclasses.dataclass(frozen=True)
+class DataConfig:
+    """The training mixture.
+
+    Clips run backwards in time with probability `reverse`. `worker_count` processes read ahead (0: none, this
+    process reads), each with `num_threads` threads. Rendered rooms are kept in `cache_dir`, in memory if None.
+    """
+
+    sources: tuple[SourceConfig, ...]
+    reverse: float
+    worker_count: int
+    num_threads: int
+    cache_dir: str | None
+
+    def __post_init__(self) -> None:
+        _require(bool(self.sources), "data.sources is empty: name at least one data set")
+
+
+@dataclasses.dataclass(frozen=True)
+class ValidationConfig:
+    """Every `every` steps, `num_clips` fixed clips of `clip_length` frames, `stride` apart, of a held-out set."""
+
+    source: SourceConfig
+    every: int
+    num_clips: int
+    clip_length: int
+    stride: int
+    size: tuple[int, int]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "size", tuple(self.size))
+        for field in ("every", "num_clips", "stride"):
+            _require(getattr(self, field) >= 1, f"validation.{field} must be >= 1, got {getattr(self, field)}")
+        _require(self.clip_length >= 2, "validation.clip_length must be >= 2: pose errors are of pairs of frames")
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainConfig:
+    """A whole run.
+
+    `initial_weights` is a path or hub repository that `from_pretrained` reads, None starts from random numbers.
+    The run stops in good order after `max_minutes`, and with an error after `max_skipped_in_a_row` updates in a
+    row that were not finite. `save_every` steps, and at the end, it writes a checkpoint and keeps the latest
+    `keep_checkpoints`.
+    """
+
+    model: ModelConfig
+    loss: LossConfig
+    optimizer: OptimizerConfig
+    stages: tuple[StageConfig, ...]
+    data: DataConfig
+    validation: ValidationConfig | None
+    seed: int
+    initial_weights: str | None
+    log_every: int
+    save_every: int
+    keep_checkpoints: int
+    max_skipped_in_a_row: int
+    max_minutes: float | None
+
+    def __post_init__(self) -> None:
+        _require(bool(self.stages), "stages is empty: a run needs at least one")
+        for field in ("log_every", "save_every", "keep_checkpoints", "max_skipped_in_a_row"):
+            _require(getattr(self, field) >= 1, f"{field} must be >= 1, got {getattr(self, field)}")
+
+    @property
+    def total_steps(self) -> int:
+        """Steps of all stages together."""
+        return sum(stage.steps for stage in self.stages)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain nested dict of JSON types, the form that checkpoints store."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> TrainConfig:
+        """A run from nested mappings, as files under `configs/` build them.
+
+        `stages` maps names to fields and runs in the order of the names; `data.sources` maps data-set names to
+        fields.
+
+        Raises:
+          ValueError: An unknown or missing field, or a value out of range; names it and the known ones.
+        """
+        values = dict(values)
+        _check_fields(cls, values, "config")
+        stages, data, validation = values["stages"], dict(values["data"]), values["validation"]
+        values["model"] = ModelConfig.from_dict(dict(values["model"]))
+        values["loss"] = _build(LossConfig, values["loss"], "config.loss")
+        values["optimizer"] = _build(OptimizerConfig, values["optimizer"], "config.optimizer")
+        values["stages"] = tuple(
+            _build(StageConfig, {"name": name, **stages[name]}, f"config.stages.{name}") for name in sorted(stages)
+        )
+        _check_fields(DataConfig, data, "config.data")
+        data["sources"] = tuple(
+            _build(SourceConfig, {"name": name, **data["sources"][name]}, f"config.data.sources.{name}")
+            for name in sorted(data["sources"])
+        )
+        values["data"] = _build(DataConfig, data, "config.data")
+        if validation is not None:
+            validation = dict(validation)
+            _check_fields(ValidationConfig, validation, "config.validation")
+            validation["source"] = _build(SourceConfig, validation["source"], "config.validation.source")
+            values["validation"] = _build(ValidationConfig, validation, "config.validation")
+        return cls(**values)
+
+
+def _frozen(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
+
+
+def _check_fields(cls: Any, values: Mapping[str, Any], path: str) -> None:
+    fields = dataclasses.fields(cls)
+    known = [field.name for field in fields]
+    for name in values:
+        _require(name in known, f"unknown field {path}.{name}; {cls.__name__} knows {', '.join(known)}")
+    for field in fields:
+        required = field.default is dataclasses.MISSING
+        _require(not required or field.name in values, f"missing field {path}.{field.name} of {cls.__name__}; set it")
+
+
+def _build(cls: Any, values: Mapping[str, Any], path: str) -> Any:
+    _check_fields(cls, values, path)
+    return cls(**values)

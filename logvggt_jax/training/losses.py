@@ -9,17 +9,17 @@ import jax.numpy as jnp
 
 
 class Mean(NamedTuple):
-    """A mean that is not divided yet: `total` and `count`, float32 scalars.
+    """A mean that is not divided yet: `numerator` and `denominator`, float32 scalars.
 
-    Means over different numbers of valid pixels cannot be averaged; their totals and counts can be added.
+    Means over different numbers of valid pixels cannot be averaged; their numerators and denominators can be added.
     """
 
-    total: jax.Array
-    count: jax.Array
+    numerator: jax.Array
+    denominator: jax.Array
 
     def value(self) -> jax.Array:
-        """total / count, 0 (with zero gradient) where nothing was counted."""
-        return self.total / jnp.maximum(self.count, 1.0)
+        """numerator / denominator, 0 (with zero gradient) where nothing was counted."""
+        return self.numerator / jnp.maximum(self.denominator, 1.0)
 
 
 def camera_loss(

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
-from flax import struct
 
 from logvggt_jax.geometry import encode_poses, relative_to_first, unproject
 
@@ -12,8 +13,7 @@ MIN_DEPTH = 1e-8
 MIN_SCALE, MAX_SCALE = 1e-6, 1e6
 
 
-@struct.dataclass
-class Targets:
+class Targets(NamedTuple):
     """Ground truth of a batch of clips in the units that the network is to predict.
 
     Attributes:

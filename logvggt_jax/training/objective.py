@@ -42,7 +42,9 @@ def loss_terms(predictions: Predictions, targets: Targets, config: LossConfig) -
 
 def term_weights(config: LossConfig) -> dict[str, float]:
     """Weight of each term in the objective (LoG-VGGT: all 1; VGGT's trainer: camera 5, depth 1)."""
-    depth = dict.fromkeys(("depth_error", "depth_regression", "depth_gradient", "depth_confidence"), config.depth_weight)
+    depth = dict.fromkeys(
+        ("depth_error", "depth_regression", "depth_gradient", "depth_confidence"), config.depth_weight
+    )
     parts = {
         "camera_translation": config.translation_weight,
         "camera_rotation": config.rotation_weight,

@@ -30,9 +30,7 @@ def make_optimizer(config: OptimizerConfig, params: Any, *, frozen: tuple[str, .
     `config.decay_all`.
     """
     labels = {module: jax.tree.map(lambda _, m=module: m, tree) for module, tree in params.items()}
-    groups = {
-        module: optax.set_to_zero() if module in frozen else _module_optimizer(config) for module in params
-    }
+    groups = {module: optax.set_to_zero() if module in frozen else _module_optimizer(config) for module in params}
     return optax.partition(groups, labels)
 
 

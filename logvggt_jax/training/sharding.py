@@ -9,6 +9,8 @@ import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
+from logvggt_jax.training.config import StageConfig
+
 DATA_AXIS = "data"
 
 
@@ -28,13 +30,13 @@ def split(mesh: Mesh) -> NamedSharding:
     return NamedSharding(mesh, P(DATA_AXIS))
 
 
-def local_batch_size(batch_size: int, mesh: Mesh) -> int:
-    """Clips that this process loads; ValueError unless devices and processes share `batch_size` evenly."""
-    if batch_size % mesh.size:
+def check_batch_size(stage: StageConfig, mesh: Mesh) -> None:
+    """Raises ValueError unless the stage's batches split evenly over the devices."""
+    if stage.batch_size % mesh.size:
         raise ValueError(
-            f"batch_size={batch_size} does not split over {mesh.size} devices; use a multiple of {mesh.size}"
+            f"stage {stage.name!r}: batch_size={stage.batch_size} does not split over {mesh.size} devices; "
+            f"use a multiple of {mesh.size}"
         )
-    return batch_size // jax.process_count()
 
 
 def put_batch(batch: Mapping[str, np.ndarray], mesh: Mesh) -> dict[str, jax.Array]:

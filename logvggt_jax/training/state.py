@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
-from flax import struct
 
 
-@struct.dataclass
-class TrainState:
+class TrainState(NamedTuple):
     """State of a run; donated to every step.
 
     Attributes:

@@ -11,7 +11,7 @@ import optax
 from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 
-from logvggt_jax.model import LogVGGT
+from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.training.config import LossConfig
 from logvggt_jax.training.losses import Mean
 from logvggt_jax.training.normalization import normalize_clips
@@ -37,14 +37,10 @@ def make_loss(model: LogVGGT, config: LossConfig) -> LossFunction:
     def loss(params: Any, batch: Batch) -> tuple[jax.Array, Metrics]:
         frame_mask = batch.get("frame_mask")
         predictions = model.apply({"params": params}, batch["images"], frame_mask, remat=True)
-        targets = normalize_clips(
-            batch["depth"], batch["intrinsics"], batch["extrinsics"], frame_mask=frame_mask
-        )
-        means = jax.lax.psum(loss_terms(predictions, targets, config), DATA_AXIS)
-        values = {name: mean.value() for name, mean in means.items()}
+        targets = normalize_clips(batch["depth"], batch["intrinsics"], batch["extrinsics"], frame_mask=frame_mask)
+        values = _global_means(loss_terms(predictions, targets, config))
         total = total_loss(values, config)
-        figures = progress_figures(jax.lax.stop_gradient(predictions), targets)
-        figures = {name: mean.value() for name, mean in _psum(figures).items()}
+        figures = _global_means(progress_figures(jax.lax.stop_gradient(predictions), targets))
         figures["rotation_over_identity"] = figures["rotation"] / jnp.maximum(figures["identity_rotation"], 1e-6)
         logged = {f"loss/{name}": value for name, value in {"total": total, **values}.items()}
         return total, {**logged, **{f"train/{name}": value for name, value in figures.items()}}
@@ -96,5 +92,34 @@ def make_train_step(
     return jax.jit(sharded, donate_argnums=0)
 
 
-def _psum(means: dict[str, Mean]) -> dict[str, Mean]:
-    return jax.lax.psum(means, DATA_AXIS)
+class CompiledSteps:
+    """The training step compiled ahead of time, once for each shape of batch.
+
+    A compiled program cannot be traced again: a state or batch of another shape, type or placement raises
+    instead of silently costing a second compilation.
+    """
+
+    def __init__(self, step: Any) -> None:
+        self._step = step
+        self._programs: dict[tuple[Any, ...], Any] = {}
+
+    def has(self, batch: Batch) -> bool:
+        """Whether batches of this shape have their program."""
+        return _signature(batch) in self._programs
+
+    def compile(self, state: TrainState, batch: Batch) -> None:
+        """Compiles the step for batches of this shape."""
+        self._programs[_signature(batch)] = self._step.lower(state, batch).compile()
+
+    def __call__(self, state: TrainState, batch: Batch) -> tuple[TrainState, Metrics]:
+        """Runs the program of the batch's shape; `state` is donated."""
+        return self._programs[_signature(batch)](state, batch)
+
+
+def _global_means(means: dict[str, Mean]) -> dict[str, jax.Array]:
+    """Averages over the whole batch: sums over devices first, divided once."""
+    return {name: mean.value() for name, mean in jax.lax.psum(means, DATA_AXIS).items()}
+
+
+def _signature(batch: Batch) -> tuple[Any, ...]:
+    return tuple((name, value.shape, value.dtype) for name, value in sorted(batch.items()))

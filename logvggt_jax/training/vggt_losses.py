@@ -84,9 +84,7 @@ def depth_losses(
     values = {
         "depth_confidence": _mean_below_quantile(confident, valid, quantile),
         "depth_regression": _mean_below_quantile(error, valid, quantile),
-        "depth_gradient": _gradient_loss(
-            depth - target, confidence, valid, alpha=alpha, confident=confident_gradient
-        ),
+        "depth_gradient": _gradient_loss(depth - target, confidence, valid, alpha=alpha, confident=confident_gradient),
     }
     return {name: _shard_value(jnp.where(enough, value, 0.0)) for name, value in values.items()}
 

@@ -101,7 +101,7 @@ def save_model(path: str | Path, config: ModelConfig, params: Any) -> None:
     with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch:
         fresh, old = Path(scratch) / "new", Path(scratch) / "old"
         fresh.mkdir()
-        with ocp.StandardCheckpointer() as checkpointer:
+        with _checkpointer() as checkpointer:
             checkpointer.save(fresh / "params", params)
             checkpointer.wait_until_finished()
         (fresh / "config.json").write_text(json.dumps(description, indent=2) + "\n")
@@ -222,6 +222,11 @@ def convert(source: str | Path, destination: str | Path, *, point_head: bool = F
     return report
 
 
+def _checkpointer() -> ocp.StandardCheckpointer:
+    # Orbax's default of 96 GB in flight holds every parameter twice.
+    return ocp.StandardCheckpointer(save_concurrent_gb=1, restore_concurrent_gb=1)
+
+
 def _named_leaves(tree: Any) -> Iterator[tuple[str, Any]]:
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
         yield jax.tree_util.keystr(path, simple=True, separator="/"), leaf
@@ -268,7 +273,7 @@ def _restore(path: Path, target: Any) -> Any:
     if not path.is_dir():
         raise FileNotFoundError(f"{path}: the parameters are missing; {_MEND}")
     try:
-        with ocp.StandardCheckpointer() as checkpointer:
+        with _checkpointer() as checkpointer:
             stored = checkpointer.metadata(path).item_metadata
             if stored is None:
                 raise FileNotFoundError("Orbax's description of the parameters is missing")

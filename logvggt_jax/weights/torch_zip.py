@@ -38,6 +38,10 @@ _STORAGE_DTYPES = {
 _MEND = "convert it to model.safetensors with a PyTorch and a source that you trust"
 
 
+class _RefusedError(Exception):
+    """The pickle asks for something other than tensors."""
+
+
 @dataclasses.dataclass(frozen=True)
 class _StorageType:
     """Stands for `torch.FloatStorage` and its kin; cannot be called."""
@@ -66,14 +70,14 @@ class _TensorLayout:
     def __post_init__(self) -> None:
         numbers = (self.offset, *self.shape, *self.strides)
         if not isinstance(self.storage, _Storage) or not all(type(n) is int and n >= 0 for n in numbers):
-            raise pickle.UnpicklingError("a tensor's storage, size, offset or stride is not what torch.save writes")
+            raise _RefusedError("a tensor's storage, size, offset or stride is not what torch.save writes")
         if len(self.shape) != len(self.strides):
-            raise pickle.UnpicklingError(f"a tensor of {len(self.shape)} axes has {len(self.strides)} strides")
+            raise _RefusedError(f"a tensor of {len(self.shape)} axes has {len(self.strides)} strides")
         size = math.prod(self.shape)
         last = self.offset + sum((n - 1) * s for n, s in zip(self.shape, self.strides, strict=True))
         # A zero stride would let a few bytes stand for a tensor of any size.
         if size and (last >= self.storage.numel or size > self.storage.numel):
-            raise pickle.UnpicklingError(
+            raise _RefusedError(
                 f"a tensor of shape {self.shape} reaches beyond its storage {self.storage.key!r} "
                 f"of {self.storage.numel} elements"
             )
@@ -111,13 +115,13 @@ class _TensorUnpickler(pickle.Unpickler):
             return _RebuildTensor()
         if module == "torch" and name in _STORAGE_DTYPES:
             return _StorageType(_STORAGE_DTYPES[name])
-        raise pickle.UnpicklingError(f"the pickle holds code or objects other than tensors: refused {module}.{name}")
+        raise _RefusedError(f"the pickle holds code or objects other than tensors: refused {module}.{name}")
 
     def persistent_load(self, pid: Any, /) -> _Storage:
         match pid:
             case ("storage", _StorageType(dtype=dtype), str(key), str(), int(numel)) if numel >= 0:
                 return _Storage(key, dtype, numel)
-        raise pickle.UnpicklingError(f"unknown persistent id {pid!r:.80}, expected a tensor's storage")
+        raise _RefusedError(f"unknown persistent id {pid!r:.80}, expected a tensor's storage")
 
 
 @contextmanager
@@ -191,11 +195,13 @@ def _read(archive: zipfile.ZipFile, member: str, path: Path) -> bytes:
 def _layouts(pickled: bytes, path: Path) -> dict[str, _TensorLayout]:
     try:
         state_dict = _TensorUnpickler(io.BytesIO(pickled)).load()
-    except pickle.UnpicklingError as error:
+    except _RefusedError as error:
         raise ValueError(f"{path}: {error}; {_MEND}") from error
     except Exception as error:
         # A malformed pickle raises whatever its broken instructions run into.
-        raise ValueError(f"{path}: data.pkl is damaged ({type(error).__name__}: {error}); copy it again") from error
+        raise ValueError(
+            f"{path}: data.pkl is damaged ({type(error).__name__}: {error}); copy or download it again"
+        ) from error
     if not isinstance(state_dict, dict):
         raise ValueError(f"{path}: holds a {type(state_dict).__name__}, expected a flat state dict of tensors")
     for name, value in state_dict.items():

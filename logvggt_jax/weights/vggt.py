@@ -7,6 +7,7 @@ made from it. Source: the VGGT-1B checkpoint (1797 tensors).
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -29,6 +30,14 @@ Layout = Callable[[np.ndarray], np.ndarray]
 
 _OUTPUT_HIDDEN = 32  # width between the two convolutions of the DPT head's output, in every VGGT
 _DTYPES = ("float32", "float16", "bfloat16", "float64")
+# The fields that shapes tell.
+_SIZES = {
+    "encoder": ("embed_dim", "depth", "mlp_ratio", "num_registers", "position_grid", "patch_size"),
+    "aggregator": ("depth", "num_heads", "mlp_ratio", "num_registers"),
+    "camera_head": ("depth",),
+    "depth_head": ("features", "out_channels"),
+    "point_head": ("features", "out_channels"),
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -245,7 +254,7 @@ def params_from_vggt(
             # A copy, because a view would keep the caller's array alive and follow its changes.
             _insert(params, path, jnp.array(layout(tensor).astype(np.float32)))
         report.used.append(rule.name)
-    for path, value in _initial(config, params):
+    for path, value in _initial(config, params).items():
         _insert(params, path, value)
         report.initialised.append("/".join(path))
     return params, report
@@ -268,10 +277,10 @@ def config_from_vggt(state_dict: Mapping[str, np.ndarray], *, point_head: bool =
 
     def shape(name: str, rank: int) -> tuple[int, ...]:
         if name not in state_dict:
-            raise ValueError(f"not a VGGT state dict: {name} is missing")
+            raise ValueError(f"the state dict lacks {name}, which VGGT has")
         found = np.shape(state_dict[name])
         if len(found) != rank:
-            raise ValueError(f"not a VGGT state dict: {name} has shape {found}, expected {rank} axes")
+            raise ValueError(f"{name} has shape {found}, VGGT's has {rank} axes")
         return found
 
     def count(prefix: str) -> int:
@@ -320,10 +329,15 @@ def config_from_vggt(state_dict: Mapping[str, np.ndarray], *, point_head: bool =
 
 def parameter_shapes(config: ModelConfig) -> dict[str, Any]:
     """The parameter tree as `jax.ShapeDtypeStruct`s placed on the default device, nothing computed."""
-    init = LogVGGT(config).init
-    shapes = jax.eval_shape(init, jax.random.key(0), _smallest_images(config))["params"]
     sharding = jnp.zeros(()).sharding
-    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding), shapes)
+    return jax.tree.map(
+        lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding), _traced_shapes(config)
+    )
+
+
+@functools.lru_cache(maxsize=8)
+def _traced_shapes(config: ModelConfig) -> dict[str, Any]:
+    return jax.eval_shape(LogVGGT(config).init, jax.random.key(0), _smallest_images(config))["params"]
 
 
 def _differences(state_dict: Mapping[str, np.ndarray], config: ModelConfig) -> str:
@@ -333,12 +347,12 @@ def _differences(state_dict: Mapping[str, np.ndarray], config: ModelConfig) -> s
     except ValueError as error:
         return f"; {error}"
     texts = []
-    for part in ("encoder", "aggregator", "depth_head", "camera_head", "point_head"):
+    for part, fields in _SIZES.items():
         theirs, ours = getattr(found, part), getattr(config, part)
-        for field in dataclasses.fields(theirs) if theirs is not None and ours is not None else ():
-            pair = getattr(ours, field.name), getattr(theirs, field.name)
-            if pair[0] != pair[1] and field.name not in ("frozen", "layer_scale", "initial_pose", "iterations"):
-                texts.append(f"{part}.{field.name} is {pair[0]}, the state dict's {pair[1]}")
+        for field in fields if theirs is not None and ours is not None else ():
+            here, there = getattr(ours, field), getattr(theirs, field)
+            if here != there:
+                texts.append(f"{part}.{field} is {here}, the state dict's {there}")
     return f"; in the configuration {'; '.join(texts)}" if texts else "; the file is damaged or another model's"
 
 
@@ -348,20 +362,18 @@ def _insert(tree: dict[str, Any], path: ParamPath, value: jax.Array) -> None:
     tree[path[-1]] = value
 
 
-def _initial(config: ModelConfig, params: dict[str, Any]) -> list[tuple[ParamPath, jax.Array]]:
+def _initial(config: ModelConfig, params: dict[str, Any]) -> dict[ParamPath, jax.Array]:
     """Initial values of the model's parameters that `params` lacks."""
     known = {_path(path) for path, _ in jax.tree_util.tree_leaves_with_path(params)}
-    shapes = jax.tree_util.tree_leaves_with_path(parameter_shapes(config))
-    missing = [_path(path) for path, _ in shapes if _path(path) not in known]
 
     # Under jit the initial values that nobody asks for are never computed.
     @jax.jit
-    def draw(key: jax.Array) -> list[jax.Array]:
+    def draw(key: jax.Array) -> dict[str, jax.Array]:
         drawn = LogVGGT(config).init(key, _smallest_images(config))["params"]
         leaves = {_path(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(drawn)}
-        return [leaves[path] for path in missing]
+        return {"/".join(path): leaf for path, leaf in leaves.items() if path not in known}
 
-    return list(zip(missing, draw(jax.random.key(0)), strict=True))
+    return {tuple(name.split("/")): leaf for name, leaf in draw(jax.random.key(0)).items()}
 
 
 def _smallest_images(config: ModelConfig) -> jax.Array:

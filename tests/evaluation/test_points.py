@@ -13,11 +13,13 @@ from hypothesis import strategies as st
 
 from logvggt_jax.evaluation import point_cloud_metrics
 from logvggt_jax.evaluation.points import (
+    align_bounding_boxes,
     align_median,
     estimate_normals,
     median_scale_shift,
     register_icp,
     sample_indices,
+    voxel_chamfer,
 )
 from logvggt_jax.geometry import umeyama
 
@@ -123,6 +125,24 @@ def test_similarity_protocol_equals_the_reference(golden: tuple[dict[str, Any], 
     np.testing.assert_allclose(similarity.rotation, arrays["umeyama_protocol/R"], atol=tolerance)
     np.testing.assert_allclose(similarity.translation, arrays["umeyama_protocol/t"], atol=tolerance)
     assert_icp_metrics(point_cloud_metrics(similarity.apply(source), target), case)
+
+
+def test_voxel_chamfer_equals_the_reference(golden: tuple[dict[str, Any], Any]) -> None:
+    cases, arrays = golden
+    case = cases["chamfer_fastvggt"]
+    actual = voxel_chamfer(
+        arrays["chamfer_fastvggt/pred"],
+        arrays["chamfer_fastvggt/gt"],
+        voxel=case["params"]["voxel"],
+        max_distance=case["params"]["max_dist"],
+    )
+    assert actual == pytest.approx(case["expected"]["chamfer"], rel=case["tol_rel"])
+
+
+def test_bounding_box_alignment_equals_the_reference(golden: tuple[dict[str, Any], Any]) -> None:
+    _, arrays = golden
+    aligned = align_bounding_boxes(arrays["bbox_scale_fastvggt/src"], arrays["bbox_scale_fastvggt/dst"])
+    np.testing.assert_allclose(aligned, arrays["bbox_scale_fastvggt/aligned"], rtol=1e-6, atol=1e-6)
 
 
 def sphere(rng: np.random.Generator, count: int) -> np.ndarray:

@@ -1,0 +1,114 @@
+"""Lowers and compiles the 1B inference step for this machine's CPU, described TPUs, or CUDA (lowering only).
+
+    python benchmarks/compile_step.py --target cpu
+    python benchmarks/compile_step.py --target v5e:2x2x1 --target v5p:2x2x1
+    python benchmarks/compile_step.py --target cuda
+
+TPU targets need the `libtpu` wheel and no TPU: the compiler runs on the CPU for one device of a described slice,
+the memory figures are its own. The CUDA program is lowered with a stand-in for JAX's check of the installed cuDNN;
+nothing of it is compiled or run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import os
+import time
+from unittest import mock
+
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+os.environ.setdefault("TPU_SKIP_MDS_QUERY", "1")
+
+import jax
+import jax.numpy as jnp
+
+from logvggt_jax import LogVGGT, ModelConfig
+
+IMAGE_SIZE = (392, 518)
+GIB = 2**30
+
+
+def abstract_step(model: LogVGGT, sharding: jax.sharding.Sharding | None = None) -> tuple:
+    """Abstract arguments (variables, state, frames, frame_mask) of one step with a batch of one."""
+    windows = model.config.windows
+
+    def frames(count: int) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct((1, count, *IMAGE_SIZE, 3), jnp.uint8)
+
+    variables = jax.eval_shape(model.init, jax.random.key(0), frames(1))
+    state = jax.eval_shape(model.start, variables, frames(windows.size - windows.stride))
+    mask = jax.ShapeDtypeStruct((1, windows.stride), bool)
+    place = lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding)  # noqa: E731
+    return jax.tree.map(place, (variables, state, frames(windows.stride), mask))
+
+
+def compile_for_cpu(config: ModelConfig) -> tuple[float, float, jax.stages.Compiled]:
+    """Seconds to lower, seconds to compile, and the program."""
+    model = LogVGGT(config)
+    arguments = abstract_step(model)
+    started = time.perf_counter()
+    lowered = jax.jit(model.step, donate_argnums=1).lower(*arguments)
+    lowered_at = time.perf_counter()
+    compiled = lowered.compile()
+    return lowered_at - started, time.perf_counter() - lowered_at, compiled
+
+
+def compile_for_tpu(config: ModelConfig, topology: str) -> jax.stages.Compiled:
+    """The step for one device of a described TPU slice, such as "v5e:2x2x1", with the Pallas flash kernel."""
+    from jax.experimental import topologies
+
+    described = topologies.get_topology_desc(topology_name=topology, platform="tpu")
+    sharding = jax.sharding.SingleDeviceSharding(described.devices[0])
+    model = LogVGGT(dataclasses.replace(config, attention="tpu_flash"))
+    step = jax.jit(model.step, donate_argnums=1)
+    return step.lower(*abstract_step(model, sharding)).compile()
+
+
+def lower_for_cuda(config: ModelConfig) -> str:
+    """The step's StableHLO for CUDA with cuDNN attention, lowered with a stand-in for the cuDNN version check."""
+    from jax._src.cudnn import fused_attention_stablehlo
+
+    model = LogVGGT(dataclasses.replace(config, attention="cudnn"))
+    step = jax.jit(model.step, donate_argnums=1)
+    with (
+        mock.patch.object(fused_attention_stablehlo, "check_cudnn_version", lambda: 91000),
+        mock.patch.object(fused_attention_stablehlo, "check_compute_capability", lambda _: True),
+        mock.patch.object(fused_attention_stablehlo, "is_cuda_compute_capability_equal", lambda _: False),
+    ):
+        return step.trace(*abstract_step(model)).lower(lowering_platforms=("cuda",)).as_text()
+
+
+def describe_memory(compiled: jax.stages.Compiled) -> str:
+    """The compiler's own figures."""
+    memory = compiled.memory_analysis()
+    return (
+        f"arguments {memory.argument_size_in_bytes / GIB:.2f} GiB (of them donated "
+        f"{memory.alias_size_in_bytes / GIB:.3f}), outputs {memory.output_size_in_bytes / GIB:.3f} GiB, "
+        f"temporaries {memory.temp_size_in_bytes / GIB:.2f} GiB"
+    )
+
+
+def main() -> None:
+    """Prints a line or two for every target."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--target", action="append", help="cpu, cuda, or a TPU topology; default cpu")
+    parser.add_argument("--dtype", default="bfloat16")
+    options = parser.parse_args()
+    config = ModelConfig(dtype=options.dtype)
+    print(f"VGGT-1B sizes, one step of 2 new frames {IMAGE_SIZE[0]}x{IMAGE_SIZE[1]}, {options.dtype}")
+    for target in options.target or ["cpu"]:
+        if target == "cpu":
+            lowering, compilation, compiled = compile_for_cpu(config)
+            print(f"cpu: lowered in {lowering:.1f} s, compiled in {compilation:.1f} s; {describe_memory(compiled)}")
+        elif target == "cuda":
+            text = lower_for_cuda(config)
+            print(f"cuda: lowered, {text.count('__cudnn$fmha')} calls of cuDNN attention (not compiled, not run)")
+        else:
+            compiled = compile_for_tpu(config, target)
+            kernels = compiled.as_text().count("tpu_custom_call")
+            print(f"{target}: compiled, {kernels} calls of the flash kernel; {describe_memory(compiled)}")
+
+
+if __name__ == "__main__":
+    main()

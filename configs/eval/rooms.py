@@ -1,0 +1,28 @@
+"""Depth, poses and points on procedural rooms that training never saw.
+
+python eval.py --config=configs/eval/rooms.py --checkpoint=runs/tiny/model --output=runs/eval-rooms
+"""
+
+from ml_collections import ConfigDict
+
+
+def get_config() -> ConfigDict:
+    config = ConfigDict()
+    config.title = "Procedural rooms, test split"
+    config.dataset = "rooms"
+    config.split = "test"
+    # Rooms of the kind that configs/tiny.py trains on.
+    config.rooms = ConfigDict({"num_rooms": 24, "style": "compass", "num_frames": 96})
+    config.baselines = True
+
+    config.evaluation = evaluation = ConfigDict()
+    # The size that the model was trained at; rooms are rendered at it.
+    evaluation.image_size = (56, 70)
+    evaluation.clip_lengths = (12, 32)
+    evaluation.stride = 2
+    evaluation.clips_per_sequence = 1
+    evaluation.max_points = 10_000
+    evaluation.icp_threshold = 0.1
+    evaluation.seed = 0
+    evaluation.figures = 2
+    return config

@@ -1,0 +1,32 @@
+"""Depth, poses and points on 7-Scenes, real RGB-D frames.
+
+    python eval.py --config=configs/eval/seven_scenes.py --checkpoint=runs/tiny/model --data_root=7scenes \
+        --output=runs/eval-7scenes
+
+The folder holds `<scene>/seq-XX/frame-XXXXXX.{color.png|jpg,depth.png,pose.txt}`. This is a short setting for
+small models; it is not the paper's protocol.
+"""
+
+from ml_collections import ConfigDict
+
+
+def get_config() -> ConfigDict:
+    config = ConfigDict()
+    config.title = "7-Scenes"
+    config.dataset = "seven_scenes"
+    # "test" needs the official TestSplit.txt in every scene's folder.
+    config.split = "all"
+    config.baselines = True
+
+    config.evaluation = evaluation = ConfigDict()
+    # The tiny model's size, to which frames are scaled and cropped; VGGT-1B's would be (392, 518).
+    evaluation.image_size = (56, 70)
+    evaluation.clip_lengths = (12, 32)
+    # About 8 degrees of rotation from frame to frame, as in the procedural rooms at stride 2.
+    evaluation.stride = 5
+    evaluation.clips_per_sequence = 8
+    evaluation.max_points = 20_000
+    evaluation.icp_threshold = 0.1
+    evaluation.seed = 0
+    evaluation.figures = 2
+    return config

@@ -1,0 +1,101 @@
+"""The paper's training: VGGT-1B fine-tuned on eleven data sets, 16 accelerators of 96 GB.
+
+    python train.py --config=configs/h20.py --workdir=runs/h20 --config.initial_weights=checkpoints/vggt-1b
+
+`initial_weights` takes what `logvggt convert` wrote, a VGGT checkpoint, or a hub repository. Set the data sets'
+folders with --config.data.sources.scannet.root=/data/scannet and so on; --config=configs/h20.py:DATA_ROOT puts all
+of them under one folder. The paper gives clip lengths, epochs, windows and data sets. Optimiser, mixture, batch
+sizes and the length of an epoch are choices of this project.
+"""
+
+from ml_collections import ConfigDict
+
+STEPS_PER_EPOCH = 800
+NUM_DEVICES = 16
+# (height, width), the longer edge 518: aspect ratios of the data sets, as StreamVGGT trains them.
+LANDSCAPE = ((392, 518), (336, 518), (294, 518), (266, 518), (210, 518), (154, 518))
+PORTRAIT = ((518, 392), (518, 336), (518, 294), (518, 266))
+# Clips of each data set per 30,900: StreamVGGT's mixture, ARKitScenes' two forms as one, Replica as the smallest.
+MIXTURE = {
+    "co3dv2": 4500,
+    "wildrgbd": 4500,
+    "arkitscenes": 6750,
+    "scannet": 4500,
+    "hypersim": 1200,
+    "blendedmvs": 2250,
+    "virtual_kitti": 2250,
+    "spring": 1800,
+    "mvs_synth": 450,
+    "pointodyssey": 2250,
+    "replica": 450,
+}
+
+
+def get_config(data_root: str = "data") -> ConfigDict:
+    """The run; the model's sizes are the defaults of `ModelConfig`, VGGT-1B with windows of 4, stride 2."""
+    config = ConfigDict()
+    config.seed = 0
+    config.initial_weights = "facebook/VGGT-1B"
+    config.model = {"dtype": "bfloat16"}
+    config.loss = {
+        "name": "log_vggt",
+        "camera_weight": 1.0,
+        "depth_weight": 1.0,
+        "translation_weight": 1.0,
+        "rotation_weight": 1.0,
+        "field_of_view_weight": 0.5,
+        "gamma": 0.6,
+        "alpha": 0.2,
+    }
+    config.stages = {
+        "stage_1": _stage(epochs=100, clip_length=12, clips_a_device=4),
+        "stage_2": _stage(epochs=10, clip_length=64, clips_a_device=1),
+    }
+    config.optimizer = {
+        "learning_rate": 5e-5,
+        "final_learning_rate": 1e-8,
+        "schedule": "cosine",
+        "warmup_fraction": 0.05,
+        # The second stage is a fine-tuning of its own: at the end of one long cosine it would learn nothing.
+        "restart_each_stage": True,
+        "b1": 0.9,
+        "b2": 0.999,
+        "weight_decay": 0.05,
+        "decay_all": False,
+        "clip_norm": 1.0,
+    }
+    config.data = {
+        "sources": {
+            name: {"root": f"{data_root}/{name}", "split": "train", "weight": float(weight)}
+            for name, weight in MIXTURE.items()
+        },
+        "reverse": 0.5,
+        "worker_count": 16,
+        "num_threads": 2,
+        "cache_dir": None,
+    }
+    config.validation = {
+        "source": {"name": "scannet", "root": f"{data_root}/scannet", "split": "val"},
+        "every": 5 * STEPS_PER_EPOCH,
+        "num_clips": 2 * NUM_DEVICES,
+        "clip_length": 12,
+        "stride": 10,
+        "size": LANDSCAPE[0],
+    }
+    config.log_every = 50
+    config.save_every = STEPS_PER_EPOCH
+    config.keep_checkpoints = 3
+    config.max_skipped_in_a_row = 20
+    config.max_minutes = None
+    return config
+
+
+def _stage(*, epochs: int, clip_length: int, clips_a_device: int) -> dict:
+    return {
+        "steps": epochs * STEPS_PER_EPOCH,
+        "clip_length": clip_length,
+        "batch_size": clips_a_device * NUM_DEVICES,
+        "min_stride": 1,
+        "max_stride": 8,
+        "sizes": LANDSCAPE + PORTRAIT,
+    }

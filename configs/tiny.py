@@ -1,0 +1,105 @@
+"""A tiny LoG-VGGT from nothing on procedural rooms: half an hour on two CPU cores.
+
+    python train.py --config=configs/tiny.py --workdir=runs/tiny
+
+Any field can be changed on the command line, for example --config.optimizer.learning_rate=5e-4. The curriculum
+goes from single windows of 4 frames to clips of 12. Depth is learned within minutes; rotation stays at the
+identity for the first thousands of steps.
+"""
+
+import math
+
+from ml_collections import ConfigDict
+
+HEIGHT, WIDTH = 56, 70
+# Focal lengths of `compass` rooms in units of the image width, and their middle.
+FOCAL_RANGE = (0.55, 0.75)
+FOCAL = sum(FOCAL_RANGE) / 2
+FIELD_OF_VIEW = (2 * math.atan(HEIGHT / WIDTH / 2 / FOCAL), 2 * math.atan(1 / 2 / FOCAL))
+
+
+def get_config() -> ConfigDict:
+    """The run; fields as `logvggt_jax.training.config.TrainConfig` and `ModelConfig` document them."""
+    config = ConfigDict()
+    config.seed = 0
+    config.initial_weights = None
+    config.model = {
+        # 4 x 5 patches: the position embedding needs no more than a grid of 5.
+        "encoder": {"embed_dim": 64, "depth": 2, "num_heads": 4, "position_grid": 5, "frozen": False},
+        "aggregator": {"depth": 4, "num_heads": 4, "key_layers": (0, 1, 2, 3), "layer_scale": 1.0},
+        "camera_head": {
+            "depth": 1,
+            "num_heads": 4,
+            "layer_scale": 1.0,
+            # No motion, the mean field of view: what is right before anything is learned.
+            "initial_pose": (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, *FIELD_OF_VIEW),
+        },
+        "depth_head": {"features": 16, "out_channels": (16, 16, 16, 16)},
+        "windows": {"size": 4, "stride": 2},
+        "refinement": {"num_heads": 4},
+        "dtype": "float32",
+    }
+    config.loss = {
+        "name": "log_vggt",
+        "camera_weight": 5.0,
+        "depth_weight": 1.0,
+        "translation_weight": 1.0,
+        "rotation_weight": 1.0,
+        "field_of_view_weight": 0.5,
+        "gamma": 0.6,
+        "alpha": 0.2,
+    }
+    config.stages = {
+        "stage_1": _stage(steps=6000, clip_length=4, batch_size=8, strides=(1, 5)),
+        "stage_2": _stage(steps=1200, clip_length=12, batch_size=4, strides=(1, 2)),
+    }
+    config.optimizer = {
+        "learning_rate": 1e-3,
+        "final_learning_rate": 0.0,
+        "schedule": "linear_tail",
+        "warmup_fraction": 0.014,
+        "restart_each_stage": False,
+        "b1": 0.9,
+        "b2": 0.99,
+        "weight_decay": 0.02,
+        "decay_all": False,
+        "clip_norm": 1.0,
+    }
+    rooms = {"height": HEIGHT, "width": WIDTH, "num_frames": 24, "style": "compass", "speed": (0.7, 1.3)}
+    config.data = {
+        "sources": {"rooms": {"root": None, "split": "train", "options": {**rooms, "num_rooms": 1500}}},
+        "reverse": 0.5,
+        "worker_count": 0,
+        "num_threads": 1,
+        "cache_dir": None,
+    }
+    config.validation = {
+        "source": {
+            "name": "rooms",
+            "root": None,
+            "split": "val",
+            "options": {**rooms, "num_rooms": 16, "speed": 1.0},
+        },
+        "every": 600,
+        "num_clips": 16,
+        "clip_length": 12,
+        "stride": 2,
+        "size": (HEIGHT, WIDTH),
+    }
+    config.log_every = 50
+    config.save_every = 600
+    config.keep_checkpoints = 2
+    config.max_skipped_in_a_row = 20
+    config.max_minutes = 30.0
+    return config
+
+
+def _stage(*, steps: int, clip_length: int, batch_size: int, strides: tuple[int, int]) -> dict:
+    return {
+        "steps": steps,
+        "clip_length": clip_length,
+        "batch_size": batch_size,
+        "min_stride": strides[0],
+        "max_stride": strides[1],
+        "sizes": ((HEIGHT, WIDTH),),
+    }

@@ -1,0 +1,280 @@
+"""The `logvggt` command: convert weights, reconstruct sequences, render a room, look at results."""
+
+# Commands import what they need when they run: JAX takes seconds to load, `--help` should not.
+
+from __future__ import annotations
+
+import argparse
+import sys
+import traceback
+import warnings
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+BAD_INPUT, FAILURE, INTERRUPTED = 2, 1, 130
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs the command line and returns the exit code: 0, 2 for bad input, 1 for any other failure.
+
+    Args:
+      arguments: without the program's name; default `sys.argv[1:]`.
+    """
+    parser = _parser()
+    options = parser.parse_args(_with_dashes(sys.argv[1:] if arguments is None else arguments))
+    warnings.showwarning = _show_warning
+    try:
+        options.run(options)
+    except KeyboardInterrupt:
+        print("logvggt: interrupted; nothing half-written is left", file=sys.stderr)
+        return INTERRUPTED
+    except Exception as error:
+        if options.traceback:
+            traceback.print_exc()
+        bad_input = isinstance(error, ValueError | OSError | ImportError)
+        print(f"logvggt: error: {_one_line(error, named=not bad_input)}", file=sys.stderr)
+        return BAD_INPUT if bad_input else FAILURE
+    return 0
+
+
+def _convert(options: argparse.Namespace) -> None:
+    from logvggt_jax.weights.checkpoints import convert
+
+    report = convert(options.source, options.output, point_head=options.point_head)
+    for title, names in (("skipped", report.skipped), ("initialised", report.initialised)):
+        for name in names:
+            print(f"  {title}: {name}")
+    print(f"model: {options.output}")
+
+
+def _reconstruct(options: argparse.Namespace) -> None:
+    from logvggt_jax.inference.compilation_cache import enable_compilation_cache
+    from logvggt_jax.inference.point_cloud import PointFilter
+    from logvggt_jax.inference.reconstruct import check_request, reconstruct
+    from logvggt_jax.weights.checkpoints import from_pretrained
+
+    selection = {
+        "stride": options.stride,
+        "max_frames": options.max_frames,
+        "overwrite": options.overwrite,
+    }
+    # Before the model: a misspelt path should not have to wait for gigabytes of weights.
+    check_request(options.source, options.output, **selection)
+    enable_compilation_cache(options.compilation_cache)
+    point_filter = PointFilter(
+        confidence_percentile=options.confidence_percentile,
+        edge_threshold=options.edge_threshold or None,
+        pixel_stride=options.pixel_stride,
+        max_points=options.max_points or None,
+    )
+    model, variables = from_pretrained(options.checkpoint, dtype=options.dtype)
+    result = reconstruct(
+        options.source,
+        options.output,
+        model=model,
+        variables=variables,
+        longer_edge=options.longer_edge,
+        point_filter=point_filter,
+        num_previews=options.previews,
+        **selection,
+    )
+    print(result.summary())
+
+
+def _render_room(options: argparse.Namespace) -> None:
+    from logvggt_jax.inference.room_sequence import write_room_sequence
+
+    folder = write_room_sequence(
+        options.output,
+        num_frames=options.frames,
+        image_size=options.size,
+        seed=options.seed,
+        split=options.split,
+        overwrite=options.overwrite,
+    )
+    print(f"{options.frames} frames with depth, poses and intrinsics: {folder}")
+
+
+def _view(options: argparse.Namespace) -> None:
+    from logvggt_jax.inference.viewer import open_viewer, serve_forever
+
+    server = open_viewer(options.folder, port=options.port)
+    print(f"open http://{server.get_host()}:{server.get_port()} in a browser; Ctrl-C ends the viewer", flush=True)
+    serve_forever(server)
+
+
+def _info(options: argparse.Namespace) -> None:
+    from rich.console import Console
+
+    from logvggt_jax.inference.model_summary import model_summary
+    from logvggt_jax.weights.checkpoints import load_model
+
+    model, variables = load_model(options.checkpoint)
+    console = Console()
+    console.print(model_summary(model.config, variables["params"]))
+    console.print("every parameter equals the digest stored with it")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="logvggt",
+        description="LoG-VGGT in JAX: camera poses, depth and point clouds from image sequences of any length.",
+        epilog="`logvggt COMMAND --help` shows a command's options and an example.",
+    )
+    parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
+    parser.set_defaults(traceback=False)
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+
+    def command(name: str, run: Callable, summary: str, example: str) -> argparse.ArgumentParser:
+        added = commands.add_parser(
+            name,
+            help=summary,
+            description=summary[0].upper() + summary[1:] + ".",
+            epilog=f"example:\n  {example}",
+            formatter_class=_Formatter,
+        )
+        added.set_defaults(run=run)
+        added.add_argument("--traceback", action="store_true", help="show where in the code an error arose")
+        return added
+
+    sub = command(
+        "convert",
+        _convert,
+        "turn a public VGGT checkpoint into a LoG-VGGT model folder",
+        "logvggt convert facebook/VGGT-1B --output models/vggt-1b",
+    )
+    sub.add_argument("source", help="VGGT .safetensors or .pt file, its folder, or a hub repository")
+    sub.add_argument("--output", type=Path, required=True, metavar="DIR", help="model folder to make")
+    sub.add_argument("--point-head", action="store_true", help="keep the point head")
+
+    sub = command(
+        "reconstruct",
+        _reconstruct,
+        "cameras, depth maps and a coloured point cloud from a folder of images or a video",
+        "logvggt reconstruct walk.mp4 --stride 3 --checkpoint models/log-vggt --output runs/walk",
+    )
+    sub.add_argument("source", help="folder of images (natural order; 7-Scenes: its colour images), or a video")
+    sub.add_argument(
+        "--checkpoint", required=True, metavar="PATH_OR_REPO", help="model folder, VGGT file, or hub repository"
+    )
+    sub.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder to make")
+    sub.add_argument(
+        "--longer-edge",
+        type=int,
+        default=518,
+        metavar="PIXELS",
+        help="resize frames so that their longer edge has this size, a multiple of 14; use the size that the model "
+        "was trained with",
+    )
+    sub.add_argument("--stride", type=int, default=1, metavar="N", help="take every N-th frame")
+    sub.add_argument("--max-frames", type=int, default=None, metavar="N", help="stop after N frames")
+    sub.add_argument(
+        "--dtype", choices=("float32", "bfloat16"), default=None, help="compute type instead of the checkpoint's own"
+    )
+    points = sub.add_argument_group("point cloud")
+    points.add_argument(
+        "--confidence-percentile",
+        type=float,
+        default=25.0,
+        metavar="PERCENT",
+        help="leave out this share of pixels, the least confident",
+    )
+    points.add_argument(
+        "--edge-threshold",
+        type=float,
+        default=0.1,
+        metavar="FRACTION",
+        help="leave out pixels at relative depth steps above this; 0 keeps all",
+    )
+    points.add_argument("--pixel-stride", type=int, default=1, metavar="N", help="take every N-th pixel and row")
+    points.add_argument(
+        "--max-points", type=int, default=2_000_000, metavar="N", help="thin the cloud to N points; 0 keeps all"
+    )
+    sub.add_argument("--previews", type=int, default=8, metavar="N", help="pictures of frames beside their depth")
+    sub.add_argument("--overwrite", action="store_true", help="replace an earlier reconstruction")
+    sub.add_argument(
+        "--compilation-cache",
+        default=None,
+        metavar="DIR",
+        help="where compiled programs are kept between runs, 'none' for nowhere (default: $JAX_COMPILATION_CACHE_DIR "
+        "or the user's cache folder)",
+    )
+
+    sub = command(
+        "render-room",
+        _render_room,
+        "write a procedural room as a 7-Scenes-like sequence with exact depth, poses and intrinsics",
+        "logvggt render-room --output runs/room --frames 48 --size 120x160 --seed 1",
+    )
+    sub.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder to make")
+    sub.add_argument("--frames", type=int, default=48, metavar="N", help="length of the sequence")
+    sub.add_argument("--size", type=_size, default=(120, 160), metavar="HxW", help="height and width in pixels")
+    sub.add_argument("--seed", type=int, default=0, help="which room")
+    sub.add_argument(
+        "--split", choices=("train", "val", "test"), default="test", help="rooms of training, validation or test"
+    )
+    sub.add_argument("--overwrite", action="store_true", help="replace an earlier sequence")
+
+    sub = command(
+        "view",
+        _view,
+        "look at a reconstruction in the browser (this machine only)",
+        "logvggt view runs/walk",
+    )
+    sub.add_argument("folder", type=Path, help="output of `logvggt reconstruct`")
+    sub.add_argument("--port", type=int, default=8080, help="of the web page; the next free one if in use")
+
+    sub = command(
+        "info",
+        _info,
+        "sizes and parameters of a model folder, after a check of every stored digest",
+        "logvggt info models/vggt-1b",
+    )
+    sub.add_argument("checkpoint", type=Path, help="model folder made by `logvggt convert` or by training")
+    return parser
+
+
+class _Formatter(argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescriptionHelpFormatter):
+    """Keeps the example's line and shows defaults that say something."""
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        if action.default in (None, False):
+            return action.help
+        if isinstance(action.default, tuple):
+            return f"{action.help} (default: {'x'.join(map(str, action.default))})"
+        return super()._get_help_string(action)
+
+
+class _Version(argparse.Action):
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        from importlib.metadata import version
+
+        print(f"logvggt {version('logvggt-jax')}")
+        parser.exit()
+
+
+def _size(text: str) -> tuple[int, int]:
+    height, separator, width = text.lower().partition("x")
+    if not (separator and height.isdecimal() and width.isdecimal() and int(height) and int(width)):
+        raise argparse.ArgumentTypeError(f"expected height x width such as 120x160, got {text!r}")
+    return int(height), int(width)
+
+
+def _with_dashes(arguments: Sequence[str]) -> list[str]:
+    """Option names with underscores, as train.py and eval.py spell theirs, in the spelling with dashes."""
+    result = []
+    for argument in arguments:
+        if argument.startswith("--"):
+            name, equals, value = argument.partition("=")
+            argument = name.replace("_", "-") + equals + value
+        result.append(argument)
+    return result
+
+
+def _one_line(error: Exception, *, named: bool) -> str:
+    text = " ".join(str(error).split()) or type(error).__name__
+    return f"{type(error).__name__}: {text} (--traceback shows where)" if named else text
+
+
+def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
+    print(f"logvggt: warning: {message}", file=sys.stderr)

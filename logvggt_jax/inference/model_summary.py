@@ -1,0 +1,43 @@
+"""A model in a few lines: sizes, parameters by part, memory."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+from rich.table import Table
+
+from logvggt_jax.config import ModelConfig
+
+
+def model_summary(config: ModelConfig, params: dict[str, Any]) -> Table:
+    """A table of a model's parts with their parameters and sizes.
+
+    Args:
+      config: the model's configuration.
+      params: its parameters by part, `variables["params"]`.
+    """
+    windows, refinement = config.windows, config.refinement
+    cross = f"cross-window attention to the {windows.cache}s" if windows.cross_window else "no cross-window attention"
+    when = "at the end" if refinement.period is None else f"every {refinement.period} frames"
+    context = "all frames" if refinement.context is None else f"frame 0 and {refinement.context} frames"
+    descriptions = {
+        "encoder": f"{config.encoder.depth} blocks, width {config.encoder.embed_dim}, patches of "
+        f"{config.encoder.patch_size} pixels",
+        "aggregator": f"{config.aggregator.depth} + {config.aggregator.depth} blocks, key layers "
+        f"{', '.join(map(str, config.aggregator.key_layers))}; windows of {windows.size} frames, stride "
+        f"{windows.stride}, {cross}",
+        "camera_head": f"{config.camera_head.depth} blocks, {config.camera_head.iterations} rounds, sees {context}",
+        "depth_head": f"{config.depth_head.features} features",
+        "point_head": "" if config.point_head is None else f"{config.point_head.features} features",
+        "gccr": f"refinement {when}" if refinement.enabled else "refinement off",
+    }
+    table = Table("part", "parameters", "MiB", "what", title=f"LoG-VGGT, computing in {config.dtype}")
+    total = size = 0
+    for part in sorted(params, key=list(descriptions).index):
+        leaves = jax.tree.leaves(params[part])
+        count, mebibytes = sum(x.size for x in leaves), sum(x.nbytes for x in leaves) / 2**20
+        total, size = total + count, size + mebibytes
+        table.add_row(part, f"{count:,}", f"{mebibytes:,.1f}", descriptions[part])
+    table.add_row("all", f"{total:,}", f"{size:,.1f}", "", style="bold")
+    return table

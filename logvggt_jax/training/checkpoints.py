@@ -1,0 +1,160 @@
+"""Checkpoints from which a run goes on as if it had not stopped."""
+
+from __future__ import annotations
+
+import importlib.metadata
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import orbax.checkpoint as ocp
+
+from logvggt_jax.training.config import TrainConfig
+from logvggt_jax.training.state import TrainState
+from logvggt_jax.weights.checkpoints import digests, save_model, verify_digests
+
+LIBRARIES = ("logvggt-jax", "jax", "flax", "optax", "orbax-checkpoint", "grain")
+
+
+class Position(NamedTuple):
+    """Where a run stands: its stage (by number) and the state of that stage's data stream (JSON types)."""
+
+    stage: int
+    data: dict[str, Any]
+
+
+class RunCheckpoints:
+    """The checkpoints `<workdir>/checkpoints/<step>` and the model folder `<workdir>/model`; a context manager.
+
+    A checkpoint holds parameters, the rest of the state, the data stream's state, and the configuration with a
+    digest of every leaf, since Orbax does not notice flipped bytes. It appears under its name only when complete.
+    """
+
+    def __init__(self, workdir: Path, config: TrainConfig) -> None:
+        self.config = config
+        self.folder = workdir.expanduser().absolute() / "checkpoints"
+        self.model_folder = self.folder.parent / "model"
+        # Saving is synchronous: the next step is given the state's buffers to overwrite.
+        options = ocp.CheckpointManagerOptions(
+            max_to_keep=config.keep_checkpoints, create=True, enable_async_checkpointing=False
+        )
+        self._manager = ocp.CheckpointManager(self.folder, options=options)
+
+    def __enter__(self) -> RunCheckpoints:
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self._manager.close()
+
+    @property
+    def steps(self) -> list[int]:
+        """Steps that have a complete checkpoint, oldest first."""
+        return sorted(self._manager.all_steps())
+
+    def save(self, state: TrainState, position: Position) -> None:
+        """Writes the checkpoint of `state.step` and replaces the model folder."""
+        step = int(state.step)
+        params, rest = _parts(state)
+        meta = {
+            "step": step,
+            "stage": position.stage,
+            "config": self.config.to_dict(),
+            "digests": {"params": digests(params), "state": digests(rest)},
+            "libraries": {name: importlib.metadata.version(name) for name in LIBRARIES},
+        }
+        self._manager.save(
+            step,
+            args=ocp.args.Composite(
+                params=ocp.args.StandardSave(params),
+                state=ocp.args.StandardSave(rest),
+                data=ocp.args.JsonSave(position.data),
+                meta=ocp.args.JsonSave(meta),
+            ),
+            force=True,
+        )
+        save_model(self.model_folder, self.config.model, params)
+
+    def restore(self, like: TrainState, *, step: int | None = None) -> tuple[TrainState, Position]:
+        """The state at `step` (None: the latest), with the shapes and placement of `like`.
+
+        Raises:
+          ValueError: No such checkpoint, one of another configuration, or a damaged one; names the step, the
+            path and the other steps there are.
+        """
+        steps = self.steps
+        chosen = step if step is not None else (steps[-1] if steps else None)
+        if chosen is None or chosen not in steps:
+            raise ValueError(f"{self.folder}: no checkpoint of step {chosen}; there are {steps or 'none'}")
+        where = f"checkpoint of step {chosen} in {self.folder / str(chosen)}"
+        others = [other for other in steps if other != chosen]
+        mend = f"resume from another with --resume_step (there are {others})" if others else "start a new --workdir"
+        meta = self._read(chosen, ocp.args.Composite(meta=ocp.args.JsonRestore()), where, mend)["meta"]
+        self._check_configuration(meta["config"], where)
+        params, rest = _parts(like)
+        restored = self._read(
+            chosen,
+            ocp.args.Composite(
+                params=ocp.args.StandardRestore(_abstract(params)),
+                state=ocp.args.StandardRestore(_abstract(rest)),
+                data=ocp.args.JsonRestore(),
+            ),
+            where,
+            mend,
+        )
+        try:
+            for part in ("params", "state"):
+                verify_digests(restored[part], meta["digests"][part], where)
+        except ValueError as error:
+            raise ValueError(f"{error}; {mend}") from error
+        return TrainState(params=restored["params"], **restored["state"]), Position(meta["stage"], restored["data"])
+
+    def _read(self, step: int, args: Any, where: str, mend: str) -> Mapping[str, Any]:
+        try:
+            return self._manager.restore(step, args=args)
+        except Exception as error:
+            # Orbax raises bare Exception, among others, for truncated and missing files.
+            reason = " ".join(str(error).split())
+            raise ValueError(f"{where} cannot be read ({type(error).__name__}: {reason:.200}); {mend}") from error
+
+    def _check_configuration(self, stored: Mapping[str, Any], where: str) -> None:
+        ours = _json(self.config.to_dict())
+        for part in ("model", "stages", "data", "loss", "optimizer", "seed"):
+            difference = _first_difference(stored.get(part), ours[part], part)
+            if difference is not None:
+                name, theirs, mine = difference
+                raise ValueError(
+                    f"{where} was written with {name}={theirs!r}, the configuration says {mine!r}; "
+                    "set it back or start a new --workdir"
+                )
+
+
+def _parts(state: TrainState) -> tuple[Any, dict[str, Any]]:
+    rest = state._asdict()
+    return rest.pop("params"), rest
+
+
+def _abstract(tree: Any) -> Any:
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding), tree)
+
+
+def _json(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _json(item) for key, item in value.items()}
+    return [_json(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def _first_difference(theirs: Any, ours: Any, name: str) -> tuple[str, Any, Any] | None:
+    if isinstance(theirs, dict) and isinstance(ours, dict):
+        for key in sorted(theirs.keys() | ours.keys()):
+            found = _first_difference(theirs.get(key), ours.get(key), f"{name}.{key}")
+            if found is not None:
+                return found
+        return None
+    if isinstance(theirs, list) and isinstance(ours, list) and len(theirs) == len(ours):
+        for i, (a, b) in enumerate(zip(theirs, ours, strict=True)):
+            found = _first_difference(a, b, f"{name}[{i}]")
+            if found is not None:
+                return found
+        return None
+    return None if theirs == ours else (name, theirs, ours)

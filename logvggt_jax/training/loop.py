@@ -1,0 +1,195 @@
+"""The training loop: stages, logging, validation, checkpoints, and a clean end whatever ends it."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Mapping
+from pathlib import Path
+
+import jax
+from jax.sharding import Mesh
+from rich.console import Console
+
+from logvggt_jax.data.dataset import Dataset
+from logvggt_jax.model.logvggt import LogVGGT
+from logvggt_jax.training.batches import BatchesInTurn, open_sources, stage_batches
+from logvggt_jax.training.checkpoints import Position, RunCheckpoints
+from logvggt_jax.training.config import StageConfig, TrainConfig
+from logvggt_jax.training.initialization import initial_parameters
+from logvggt_jax.training.interruption import StopRequest
+from logvggt_jax.training.metrics_log import MetricsLog
+from logvggt_jax.training.optimizer import learning_rate_schedule, make_optimizer
+from logvggt_jax.training.progress import Speedometer, duration, progress_line
+from logvggt_jax.training.sharding import check_batch_size, put_batch, replicated
+from logvggt_jax.training.state import TrainState, initial_state
+from logvggt_jax.training.step import Batch, CompiledSteps, Metrics, make_loss, make_train_step
+from logvggt_jax.training.validation import Validation
+
+# Steps handed to the device before the oldest has to be finished: enough to hide the host's work.
+STEPS_IN_FLIGHT = 2
+
+
+class NonFiniteTraining(RuntimeError):
+    """Too many updates in a row had a non-finite loss or gradient."""
+
+
+def train(config: TrainConfig, workdir: Path, *, mesh: Mesh, resume_step: int | None = None) -> TrainState:
+    """Runs the stages of `config`, or what is left of them if `workdir` holds a checkpoint.
+
+    Leaves `checkpoints/`, `model/` (for `load_model`), `metrics.jsonl` and `tensorboard/` in `workdir`. SIGTERM,
+    Ctrl-C and `config.max_minutes` end the run after the current step with a checkpoint.
+
+    Args:
+      config: the run.
+      workdir: its folder.
+      mesh: devices to train on.
+      resume_step: checkpoint to go on from; None takes the latest.
+
+    Returns:
+      The state at the end.
+
+    Raises:
+      ValueError: Settings, data or a checkpoint that do not fit; one line.
+      NonFiniteTraining: `config.max_skipped_in_a_row` updates in a row were not finite.
+    """
+    for stage in config.stages:
+        check_batch_size(stage, mesh)
+    run = _Run(config, workdir, mesh)
+    with run.checkpoints, StopRequest() as stop:
+        first, position = run.restore(resume_step)
+        datasets = open_sources(config.data)
+        console = Console(quiet=jax.process_index() != 0)
+        with MetricsLog(workdir, first_step=first, console=console) as log:
+            log.say(f"{jax.device_count()} devices, {first}/{config.total_steps} steps done, results in {workdir}")
+            run.train(datasets, position, log, stop)
+    return run.state
+
+
+class _Run:
+    """The parts of one run and its current state."""
+
+    def __init__(self, config: TrainConfig, workdir: Path, mesh: Mesh) -> None:
+        self.config, self.mesh = config, mesh
+        self.deadline = None if config.max_minutes is None else time.monotonic() + 60 * config.max_minutes
+        model = LogVGGT(config.model)
+        params = initial_parameters(config.model, seed=config.seed, weights=config.initial_weights)
+        optimizer = make_optimizer(config.optimizer, params, frozen=_frozen_modules(config))
+        schedule = learning_rate_schedule(config.optimizer, config.stages)
+        self.state = jax.device_put(initial_state(params, optimizer), replicated(mesh))
+        self.steps = CompiledSteps(make_train_step(make_loss(model, config.loss), optimizer, schedule, mesh))
+        self.validation = None if config.validation is None else Validation(model, config.validation, mesh)
+        self.checkpoints = RunCheckpoints(workdir, config)
+        self.speed = Speedometer(config.stages)
+
+    def restore(self, resume_step: int | None) -> tuple[int, Position | None]:
+        """Takes up a checkpoint, if there is one; the number of steps done and where the data stand."""
+        if resume_step is None and not self.checkpoints.steps:
+            return 0, None
+        self.state, position = self.checkpoints.restore(self.state, step=resume_step)
+        return int(self.state.step), position
+
+    def train(
+        self, datasets: Mapping[str, Dataset], position: Position | None, log: MetricsLog, stop: StopRequest
+    ) -> None:
+        """All stages that are not finished."""
+        step, end = int(self.state.step), 0
+        for index, stage in enumerate(self.config.stages):
+            end += stage.steps
+            if step >= end:
+                continue
+            seed = self.config.seed * len(self.config.stages) + index
+            with stage_batches(datasets, self.config.data, stage, seed=seed) as batches:
+                if position is not None and position.stage == index:
+                    batches.set_state(position.data)
+                step = self._train_stage(index, stage, batches, step, end, log, stop)
+            if step < end:
+                break
+        log.say(f"{step}/{self.config.total_steps} steps done; model in {self.checkpoints.model_folder}")
+
+    def _train_stage(
+        self,
+        index: int,
+        stage: StageConfig,
+        batches: BatchesInTurn,
+        step: int,
+        end: int,
+        log: MetricsLog,
+        stop: StopRequest,
+    ) -> int:
+        """Steps up to `end`, or fewer if the run is to stop; the number of steps done."""
+        config = self.config
+        in_flight: deque[jax.Array] = deque()
+        self.speed.restart()
+        while step < end:
+            batch = put_batch(next(batches), self.mesh)
+            self._compile(stage, batch, log)
+            self.state, metrics = self.steps(self.state, batch)
+            step += 1
+            self.speed.count()
+            in_flight.append(metrics["loss/total"])
+            if len(in_flight) > STEPS_IN_FLIGHT:
+                in_flight.popleft().block_until_ready()
+
+            ending = self._reason_to_end(stop)
+            last = step == end or ending is not None
+            if step % config.log_every == 0 or step == 1 or last:
+                self._log(step, stage, metrics, log)
+            if config.validation is not None and (step % config.validation.every == 0 or step == config.total_steps):
+                self._validate(step, log)
+            # Before the next batch is drawn, so that the data stream's state is that of this step.
+            if step % config.save_every == 0 or last:
+                self.checkpoints.save(self.state, Position(index, batches.get_state()))
+                self.speed.restart()
+            if ending is not None:
+                log.say(f"stopping after step {step}: {ending}; run the same command to go on")
+                break
+        return step
+
+    def _compile(self, stage: StageConfig, batch: Batch, log: MetricsLog) -> None:
+        if self.steps.has(batch):
+            return
+        started = time.perf_counter()
+        self.steps.compile(self.state, batch)
+        log.say(f"{stage.name}: step compiled in {time.perf_counter() - started:.0f} s")
+        self.speed.restart()
+
+    def _log(self, step: int, stage: StageConfig, metrics: Metrics, log: MetricsLog) -> None:
+        values = {name: float(value) for name, value in jax.device_get(metrics).items()}
+        self.speed.read(stage)
+        if jax.process_index() == 0:
+            log.write(step, {**values, "frames_per_second": self.speed.frames_per_second})
+        log.say(progress_line(step, self.config.total_steps, stage.name, values, self.speed))
+        if values["longest_skip"] >= self.config.max_skipped_in_a_row:
+            raise NonFiniteTraining(
+                f"step {step}: {values['longest_skip']:.0f} updates in a row had a non-finite loss or gradient "
+                f"(max_skipped_in_a_row={self.config.max_skipped_in_a_row}); lower optimizer.learning_rate or "
+                "resume from an earlier checkpoint with --resume_step"
+            )
+
+    def _validate(self, step: int, log: MetricsLog) -> None:
+        if self.validation is None:
+            return
+        started = time.perf_counter()
+        values = self.validation(self.state.params)
+        if jax.process_index() == 0:
+            log.write(step, values)
+        log.say(
+            f"validation after step {step} ({duration(time.perf_counter() - started)}): "
+            f"abs_rel {values['validation/abs_rel']:.3f} (constant depth {values['validation/constant_abs_rel']:.3f}), "
+            f"delta<1.25 {values['validation/delta_1.25']:.3f}, "
+            f"rotation {values['validation/rotation']:.2f}° (identity {values['validation/identity_rotation']:.2f}°), "
+            f"direction {values['validation/translation_direction']:.1f}°"
+        )
+        self.speed.restart()
+
+    def _reason_to_end(self, stop: StopRequest) -> str | None:
+        if stop.reason is not None:
+            return f"received {stop.reason}"
+        if self.deadline is not None and time.monotonic() > self.deadline:
+            return f"max_minutes={self.config.max_minutes} are over"
+        return None
+
+
+def _frozen_modules(config: TrainConfig) -> tuple[str, ...]:
+    return ("encoder",) if config.model.encoder.frozen else ()

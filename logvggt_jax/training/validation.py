@@ -1,0 +1,83 @@
+"""Accuracy on a few fixed clips that training never sees."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import numpy as np
+from jax.sharding import Mesh
+from jax.sharding import PartitionSpec as P
+
+from logvggt_jax.data.transforms import fit
+from logvggt_jax.evaluation.depth import depth_metrics
+from logvggt_jax.evaluation.pose import pose_accuracy, relative_pose_errors
+from logvggt_jax.model.logvggt import LogVGGT
+from logvggt_jax.training.batches import open_source
+from logvggt_jax.training.config import ValidationConfig
+from logvggt_jax.training.sharding import DATA_AXIS, replicated, split
+from logvggt_jax.types import Frames, Predictions
+
+
+class Validation:
+    """Fixed clips, read once, and the jitted model that is tried on them.
+
+    Clip i shows frames 0, stride, 2 stride, … of the i-th sequence that is long enough.
+    """
+
+    def __init__(self, model: LogVGGT, config: ValidationConfig, mesh: Mesh) -> None:
+        if config.num_clips % mesh.size:
+            raise ValueError(
+                f"validation.num_clips={config.num_clips} does not split over {mesh.size} devices; "
+                f"use a multiple of {mesh.size}"
+            )
+        self._clips = _read_clips(config)
+        images = np.stack([clip.images for clip in self._clips])
+        self._images = jax.make_array_from_callback(images.shape, split(mesh), lambda index: images[index])
+
+        def predict(params: Any, images: jax.Array) -> Predictions:
+            return model.apply({"params": params}, images)
+
+        sharded = jax.shard_map(predict, mesh=mesh, in_specs=(P(), P(DATA_AXIS)), out_specs=P(DATA_AXIS))
+        self._predict = jax.jit(sharded, out_shardings=replicated(mesh))
+
+    def __call__(self, params: Any) -> dict[str, float]:
+        """Means over the clips: depth after median alignment, pose errors over all pairs in degrees.
+
+        `constant_abs_rel` and `identity_rotation` are what a constant depth and a motionless camera get.
+        """
+        predictions = self._predict(params, self._images)
+        depth, extrinsics = np.asarray(predictions.depth), np.asarray(predictions.extrinsics)
+        results = [_clip_metrics(*each) for each in zip(depth, extrinsics, self._clips, strict=True)]
+        means = {name: float(np.mean([result[name] for result in results])) for name in results[0]}
+        means["rotation_over_identity"] = means["rotation"] / max(means["identity_rotation"], 1e-6)
+        return {f"validation/{name}": value for name, value in means.items()}
+
+
+def _read_clips(config: ValidationConfig) -> list[Frames]:
+    dataset = open_source(config.source)
+    indices = [i * config.stride for i in range(config.clip_length)]
+    names = [name for name in dataset.sequences if dataset.num_frames(name) > indices[-1]]
+    if len(names) < config.num_clips:
+        raise ValueError(
+            f"validation: data set {config.source.name!r} has {len(names)} sequences of at least {indices[-1] + 1} "
+            f"frames, num_clips={config.num_clips} needs more; lower num_clips, clip_length or stride"
+        )
+    return [fit(dataset.read(name, indices), config.size) for name in names[: config.num_clips]]
+
+
+def _clip_metrics(depth: np.ndarray, extrinsics: np.ndarray, clip: Frames) -> dict[str, float]:
+    found = depth_metrics(depth, clip.depth, alignment="median")
+    constant = depth_metrics(np.ones_like(depth), clip.depth, alignment="median")
+    still = np.broadcast_to(np.eye(4), clip.extrinsics.shape)
+    identity, _ = relative_pose_errors(still, clip.extrinsics)
+    rotation, direction = relative_pose_errors(extrinsics, clip.extrinsics)
+    return {
+        "abs_rel": found["abs_rel"],
+        "delta_1.25": found["delta_1.25"],
+        "constant_abs_rel": constant["abs_rel"],
+        "rotation": float(rotation.mean()),
+        "identity_rotation": float(identity.mean()),
+        "translation_direction": float(direction.mean()),
+        "auc_30": pose_accuracy(rotation, direction)["auc"],
+    }

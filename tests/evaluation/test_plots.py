@@ -1,0 +1,56 @@
+"""Pictures of results: they show what they claim, read back from the file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from logvggt_jax.evaluation.plots import depth_panel, trajectory_plot
+
+
+def poses(count: int) -> np.ndarray:
+    result = np.tile(np.eye(4), (count, 1, 1))
+    angle = np.linspace(0, 4, count)
+    result[:, :3, 3] = np.stack([np.cos(angle), 0.1 * angle, np.sin(angle)], axis=-1)
+    return result
+
+
+def orange_pixels(path: Path) -> int:
+    picture = cv2.imread(str(path)).astype(int)
+    blue, green, red = picture[..., 0], picture[..., 1], picture[..., 2]
+    return int(((red > 200) & (green > 90) & (green < 180) & (blue < 90)).sum())
+
+
+def test_a_trajectory_is_drawn_beside_the_truth(tmp_path: Path) -> None:
+    wrong = poses(20)
+    wrong[:, :3, 3] += np.random.default_rng(0).normal(0, 0.2, (20, 3))
+    trajectory_plot(tmp_path / "new" / "wrong.png", wrong[:, :3], poses(20))
+    assert orange_pixels(tmp_path / "new" / "wrong.png") > 500
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["wrong.png"]
+
+
+def test_a_prediction_that_stands_still_is_left_out(tmp_path: Path) -> None:
+    trajectory_plot(tmp_path / "static.png", np.tile(np.eye(4), (20, 1, 1)), poses(20))
+    assert orange_pixels(tmp_path / "static.png") == 0
+
+
+def test_a_panel_shows_every_frame_and_only_real_errors(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    images = rng.integers(0, 255, (5, 28, 42, 3), np.uint8)
+    target = rng.uniform(1, 3, (5, 28, 42)).astype(np.float32)
+    target[0, :10] = 0.0
+    depth_panel(tmp_path / "right.png", images, target, 0.5 * target, max_frames=2)
+    depth_panel(tmp_path / "wrong.png", images, target, rng.uniform(1, 3, target.shape), max_frames=2)
+    right, wrong = (cv2.imread(str(tmp_path / f"{name}.png")) for name in ("right", "wrong"))
+    assert right.shape == wrong.shape
+    # The error is the last column of pictures: black where the depth is right up to its unit.
+    last = slice(int(0.76 * right.shape[1]), int(0.9 * right.shape[1]))
+    assert (right[:, last].max(-1) < 20).mean() > (wrong[:, last].max(-1) < 20).mean() + 0.3
+
+
+def test_a_clip_without_valid_depth_can_be_drawn(tmp_path: Path) -> None:
+    nothing = np.zeros((1, 14, 28), np.float32)
+    depth_panel(tmp_path / "none.png", np.zeros((1, 14, 28, 3), np.uint8), nothing, nothing + 1)
+    assert (tmp_path / "none.png").stat().st_size > 1000

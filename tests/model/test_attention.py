@@ -1,0 +1,98 @@
+"""Every form of attention on this device computes the textbook formula."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from logvggt_jax.model import attention as module
+from logvggt_jax.model.attention import attention
+
+
+def inputs(queries=37, keys=53, batch=2, heads=4, head_dim=8, dtype=np.float32):
+    generator = np.random.default_rng(0)
+
+    def tensor(count):
+        return jnp.asarray(generator.standard_normal((batch, count, heads, head_dim)), dtype)
+
+    return tensor(queries), tensor(keys), tensor(keys)
+
+
+def textbook(query, key, value, valid=None):
+    query, key, value = (np.asarray(x, np.float64) for x in (query, key, value))
+    scores = np.einsum("bqhd,bkhd->bhqk", query, key) / np.sqrt(query.shape[-1])
+    if valid is not None:
+        scores = np.where(np.asarray(valid)[:, None, None, :], scores, -np.inf)
+    weights = np.exp(scores - scores.max(-1, keepdims=True))
+    weights /= weights.sum(-1, keepdims=True)
+    return np.einsum("bhqk,bkhd->bqhd", weights, value)
+
+
+@pytest.fixture(params=["batched", "blockwise", "blockwise, several heads at once"])
+def form(request, monkeypatch):
+    if request.param != "batched":
+        monkeypatch.setattr(module, "_SMALL_SCORES", 0)
+        scores = 53 * 10 if request.param == "blockwise" else 53 * 37 * 2
+        monkeypatch.setattr(module, "_BLOCK_SCORES", {"cpu": scores})
+    return request.param
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_equals_the_textbook(form, masked):
+    query, key, value = inputs()
+    valid = np.random.default_rng(1).random((2, 53)) < 0.6 if masked else None
+    out = jax.jit(attention)(query, key, value, valid)
+    np.testing.assert_allclose(out, textbook(query, key, value, valid), atol=2e-6)
+
+
+def test_invalid_keys_have_no_influence_at_all(form):
+    query, key, value = inputs()
+    valid = np.arange(53)[None].repeat(2, 0) < 20
+    before = jax.jit(attention)(query, key, value, valid)
+    after = jax.jit(attention)(query, key.at[:, 20:].set(1e3), value.at[:, 20:].set(1e3), valid)
+    np.testing.assert_array_equal(before, after)
+
+
+def test_a_row_without_valid_keys_is_finite(form):
+    query, key, value = inputs()
+    valid = np.array([[True] * 53, [False] * 53])
+    out, gradient = jax.value_and_grad(lambda q: attention(q, key, value, valid).sum())(query)
+    assert np.isfinite(out)
+    assert np.isfinite(gradient).all()
+
+
+def test_gradients_agree_between_forms(monkeypatch):
+    arguments = inputs()
+
+    def gradients():
+        return jax.grad(lambda args: (attention(*args) ** 2).sum())(arguments)
+
+    batched = gradients()
+    monkeypatch.setattr(module, "_SMALL_SCORES", 0)
+    monkeypatch.setattr(module, "_BLOCK_SCORES", {"cpu": 53 * 10})
+    for a, b in zip(gradients(), batched, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-5)
+
+
+def test_long_sequences_do_not_materialise_scores():
+    shape = jax.ShapeDtypeStruct((1, 4096, 4, 16), jnp.float32)
+    compiled = jax.jit(attention).lower(shape, shape, shape).compile()
+    all_scores = 4 * 4096 * 4096 * 4
+    assert compiled.memory_analysis().temp_size_in_bytes < all_scores / 8
+
+
+def test_bfloat16_softmax_is_float32(form):
+    query, key, value = inputs(dtype=jnp.bfloat16)
+    out = attention(query, key, value)
+    assert out.dtype == jnp.bfloat16
+    np.testing.assert_allclose(np.asarray(out, np.float32), textbook(query, key, value), atol=2e-2)
+
+
+@pytest.mark.parametrize("implementation", ["cudnn", "tpu_flash"])
+def test_forms_that_do_not_fit_fall_back(implementation):
+    """Float32 has no cuDNN kernel, and the TPU's wants a block of keys: both take the XLA form."""
+    query, key, value = inputs()
+    out = attention(query, key, value, implementation=implementation)
+    np.testing.assert_allclose(out, textbook(query, key, value), atol=2e-6)

@@ -1,0 +1,138 @@
+"""The model as a whole: gradients, precision, heads, its place in other people's code."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from logvggt_jax import DPTConfig, LogVGGT, ModelConfig
+
+FRAMES = 6
+
+
+def video(num_frames: int = FRAMES, batch: int = 1) -> np.ndarray:
+    return np.random.default_rng(0).random((batch, num_frames, 28, 42, 3), dtype=np.float32)
+
+
+@functools.lru_cache
+def gradient(config: ModelConfig, remat: bool):
+    """Gradient of a loss that weighs every output, of the last window's frames only if asked by the weights."""
+    model = LogVGGT(config)
+
+    def loss(variables, images, frame_weights):
+        out = model.apply(variables, images, remat=remat)
+        terms = (jnp.sin(out.pose_encodings), jnp.log(out.depth), jnp.log(out.depth_confidence))
+        return sum((term * frame_weights.reshape(1, -1, *(1,) * (term.ndim - 2))).sum() for term in terms)
+
+    return jax.jit(jax.grad(loss, argnums=(0, 1)))
+
+
+def norms(tree) -> dict[str, float]:
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    return {jax.tree_util.keystr(path): float(jnp.linalg.norm(leaf)) for path, leaf in leaves}
+
+
+def test_gradients_reach_what_is_trained_and_nothing_else(small_config, small_variables):
+    grads, _ = gradient(small_config, False)(small_variables, video(), np.ones(FRAMES, np.float32))
+    for name, norm in norms(grads["params"]).items():
+        assert np.isfinite(norm)
+        assert (norm == 0) == name.startswith("['encoder']"), name
+
+
+def test_a_thawed_encoder_is_trained(small_config, small_variables):
+    config = dataclasses.replace(small_config, encoder=dataclasses.replace(small_config.encoder, frozen=False))
+    grads, _ = gradient(config, False)(small_variables, video(), np.ones(FRAMES, np.float32))
+    silent = {name for name, norm in norms(grads["params"]).items() if norm == 0}
+    assert silent == {"['encoder']['mask_token']"}
+
+
+def test_gradients_flow_through_the_cache(small_config, small_variables):
+    """A loss on the last two frames depends on frame 0, which only the cache connects with them."""
+    config = dataclasses.replace(
+        small_config,
+        encoder=dataclasses.replace(small_config.encoder, frozen=False),
+        refinement=dataclasses.replace(small_config.refinement, enabled=False, context=2),
+    )
+    weights = np.zeros(8, np.float32)
+    weights[-2:] = 1.0
+    _, images = gradient(config, True)(small_variables, video(8), weights)
+    assert np.linalg.norm(images[0, 1]) > 0
+    cut = dataclasses.replace(config, windows=dataclasses.replace(config.windows, cross_window=False))
+    _, images = gradient(cut, True)(small_variables, video(8), weights)
+    assert np.linalg.norm(images[0, 1]) == 0
+
+
+def test_rematerialisation_changes_no_gradient(small_config, small_variables):
+    arguments = small_variables, video(), np.ones(FRAMES, np.float32)
+    plain, again = gradient(small_config, False)(*arguments), gradient(small_config, True)(*arguments)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3), plain[0], again[0])
+
+
+def test_bfloat16_stays_close_to_float32(small_config):
+    """At initial values with a usual LayerScale; norm of the difference over norm of the reference."""
+    sizes = dataclasses.replace(small_config.aggregator, layer_scale=0.1)
+    model = LogVGGT(dataclasses.replace(small_config, aggregator=sizes))
+    variables = model.init(jax.random.key(0), video())
+    half = LogVGGT(dataclasses.replace(model.config, dtype="bfloat16"))
+    expected, actual = jax.jit(model.apply)(variables, video()), jax.jit(half.apply)(variables, video())
+    for name in ("camera_tokens", "register_tokens", "depth", "depth_confidence", "pose_encodings"):
+        a, b = np.asarray(getattr(actual, name)), np.asarray(getattr(expected, name))
+        assert a.dtype == np.float32
+        assert np.linalg.norm(a - b) <= 1e-2 * np.linalg.norm(b), name
+
+
+def test_parameters_are_float32_whatever_the_compute_type(small_config):
+    for dtype in ("float32", "bfloat16"):
+        model = LogVGGT(dataclasses.replace(small_config, dtype=dtype))
+        shapes = jax.eval_shape(model.init, jax.random.key(0), video())
+        assert {leaf.dtype for leaf in jax.tree.leaves(shapes)} == {jnp.dtype("float32")}
+
+
+def test_uint8_and_float_images_agree(small_config, small_variables):
+    pixels = (video() * 255).astype(np.uint8)
+    apply = jax.jit(LogVGGT(small_config).apply)
+    a, b = apply(small_variables, pixels), apply(small_variables, pixels.astype(np.float32) / 255)
+    np.testing.assert_allclose(a.depth, b.depth, rtol=1e-5)
+
+
+def test_point_head_is_optional(small_config):
+    head = DPTConfig(features=8, out_channels=(8, 8, 8, 8))
+    model = LogVGGT(dataclasses.replace(small_config, point_head=head))
+    variables = model.init(jax.random.key(0), video())
+    out = jax.jit(model.apply)(variables, video())
+    assert out.points.shape == (1, FRAMES, 28, 42, 3)
+    assert (np.asarray(out.points_confidence) >= 1).all()
+    del variables["params"]["point_head"]
+    assert jax.jit(LogVGGT(small_config).apply)(variables, video()).points is None
+
+
+def test_every_prediction_starts_with_the_batch(small_config, small_variables):
+    out = jax.eval_shape(LogVGGT(small_config).apply, small_variables, video(batch=3))
+    assert {leaf.shape[:2] for leaf in jax.tree.leaves(out)} == {(3, FRAMES)}
+
+
+def test_works_inside_other_peoples_transformations(small_config, small_variables):
+    """Under jit as a static argument, and sharded over devices by shard_map."""
+    model = LogVGGT(small_config)
+    images = video(5, batch=4)
+    static = jax.jit(lambda m, v, x: m.apply(v, x).depth, static_argnums=0)
+    depth = static(model, small_variables, images)
+    mesh = jax.make_mesh((4,), ("data",), axis_types=(jax.sharding.AxisType.Auto,))
+    data, replicated = jax.P("data"), jax.P()
+    sharded = jax.shard_map(model.apply, mesh=mesh, in_specs=(replicated, data), out_specs=data)
+    np.testing.assert_allclose(jax.jit(sharded)(small_variables, images).depth, depth, rtol=1e-4, atol=1e-5)
+
+
+def test_configuration_survives_json(small_config):
+    assert ModelConfig.from_dict(small_config.to_dict()) == small_config
+    listed = small_config.to_dict()
+    listed["aggregator"]["key_layers"] = list(listed["aggregator"]["key_layers"])
+    assert hash(ModelConfig.from_dict(listed)) == hash(small_config)
+    listed["aggregator"]["key_layer"] = 3
+    with pytest.raises(ValueError, match=r"unknown field model.aggregator.key_layer; .* key_layers"):
+        ModelConfig.from_dict(listed)

@@ -1,0 +1,311 @@
+"""The network is VGGT: outputs, intermediate stages and single layers against the original implementation.
+
+The reference is a small VGGT with random weights (float32, CPU), whose weights are made from their names. Bounds
+are on the norm of the difference over the norm of the reference, and tight enough to tell an approximate GELU, a
+LayerNorm epsilon or a resampling convention from rounding.
+"""
+
+import dataclasses
+import importlib.util
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from logvggt_jax.config import WindowConfig
+from logvggt_jax.geometry import (
+    decode_poses,
+    encode_poses,
+    matrix_to_quaternion,
+    quaternion_to_matrix,
+    unproject,
+)
+from logvggt_jax.model.aggregator import Aggregator
+from logvggt_jax.model.camera_head import CameraHead
+from logvggt_jax.model.dinov2 import DinoV2
+from logvggt_jax.model.dpt_head import DPTHead
+from logvggt_jax.model.logvggt import LogVGGT
+from logvggt_jax.model.rope import apply_rope, frame_positions, rope_table
+from logvggt_jax.weights import config_from_vggt, params_from_vggt
+
+TOKENS, DENSE, SIZE, GRID = 2e-6, 5e-6, (56, 70), (4, 5)
+
+
+def relative_error(found, expected):
+    found, expected = np.asarray(found, np.float64), np.asarray(expected, np.float64)
+    assert found.shape == expected.shape
+    return np.linalg.norm(found - expected) / np.linalg.norm(expected)
+
+
+@pytest.fixture(scope="module")
+def golden(golden_dir):
+    with np.load(golden_dir / "vggt_tiny.npz") as arrays:
+        return dict(arrays)
+
+
+@pytest.fixture(scope="module")
+def converted(golden_dir):
+    """Configuration (one window of all six frames, hence plain VGGT) and parameters."""
+    spec = importlib.util.spec_from_file_location("make_vggt_weights", golden_dir / "make_vggt_weights.py")
+    maker = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(maker)
+    state_dict = dict(maker.weights(maker.load_shapes(golden_dir / "vggt_tiny.json")))
+    config = dataclasses.replace(config_from_vggt(state_dict, point_head=True), windows=WindowConfig(size=6, stride=2))
+    return config, params_from_vggt(state_dict, config)[0]
+
+
+@pytest.fixture(scope="module")
+def predictions(golden, converted):
+    config, params = converted
+    images = golden["images_u8"][None]
+    return jax.device_get(jax.jit(LogVGGT(config).apply)({"params": params}, images))
+
+
+@pytest.fixture(scope="module")
+def modules(converted):
+    """Encoder, aggregator, depth head and camera head with example arguments."""
+    config, _ = converted
+    width, patches = config.encoder.embed_dim, GRID[0] * GRID[1]
+    mask, nothing = jnp.ones((1, 6), bool), jnp.zeros((1, 0), bool)
+    cached = jnp.zeros((1, 4, 0, patches + 5, width))
+    return {
+        "encoder": (DinoV2(config.encoder, "float32", "auto"), (jnp.zeros((6, *SIZE, 3)),), {}),
+        "aggregator": (
+            Aggregator(config),
+            (jnp.zeros((1, 6, patches, width)), mask, cached, nothing, mask[:, 0]),
+            {"grid": GRID},
+        ),
+        "depth_head": (
+            DPTHead(config.depth_head, 2, "float32"),
+            ([jnp.zeros((6, patches, 2 * width))] * 4,),
+            {"grid": GRID, "image_size": SIZE},
+        ),
+        "camera_head": (CameraHead(config.camera_head, "auto"), (jnp.zeros((1, 6, 2 * width)), mask), {}),
+    }
+
+
+@pytest.fixture(scope="module")
+def layers(modules, converted):
+    """Every layer of the model as the model builds it: "aggregator/frame_block_3/norm1" -> (module, parameters)."""
+    _, params = converted
+    found = {}
+    for part, (module, arguments, options) in modules.items():
+
+        def record(call, args, kwargs, context, part=part):
+            if context.method_name == "__call__" and context.module.path:
+                path = (part, *context.module.path)
+                own = params
+                for key in path:
+                    own = own.get(key, {})
+                found["/".join(path)] = context.module.clone(parent=None, name=None), own
+            return call(*args, **kwargs)
+
+        with nn.intercept_methods(record):
+            jax.eval_shape(lambda p, m=module, a=arguments, o=options: m.apply({"params": p}, *a, **o), params[part])
+    return found
+
+
+def _stages(module, params, *args, **kwargs):
+    """Outputs of all of a module's layers, by path, the module's own under ""."""
+
+    @jax.jit
+    def run(params):
+        out, state = module.apply(
+            {"params": params}, *args, capture_intermediates=True, mutable=["intermediates"], **kwargs
+        )
+        return out, state["intermediates"]
+
+    out, state = run(params)
+    stages = {"": out}
+    for path, leaf in jax.tree_util.tree_leaves_with_path(state):
+        names = [key.key for key in path if hasattr(key, "key")]
+        stages["/".join(names[:-1])] = leaf  # the last one is "__call__"
+    return jax.device_get(stages)
+
+
+@pytest.fixture(scope="module")
+def encoder_stages(golden, converted, modules):
+    images = golden["images_u8"].astype(np.float32) / 255
+    return _stages(modules["encoder"][0], converted[1]["encoder"], images)
+
+
+@pytest.fixture(scope="module")
+def aggregator_stages(golden, converted, modules):
+    module, (_, *rest), options = modules["aggregator"]
+    patch_tokens = golden["dino_patch_tokens"][None]
+    return _stages(module, converted[1]["aggregator"], patch_tokens, *rest, **options)
+
+
+@pytest.fixture(scope="module")
+def depth_stages(golden, converted, modules):
+    module, _, options = modules["depth_head"]
+    levels = [golden[f"agg_{layer:02d}"][:, 5:] for layer in (4, 11, 17, 23)]
+    return _stages(module, converted[1]["depth_head"], levels, **options)
+
+
+# -- the whole network ------------------------------------------------------------------------------------------
+
+
+def test_tokens(predictions, golden):
+    assert relative_error(predictions.camera_tokens[0], golden["agg_23"][:, 0]) <= TOKENS
+    assert relative_error(predictions.register_tokens[0], golden["agg_23"][:, 1:5]) <= TOKENS
+
+
+@pytest.mark.parametrize("iteration", range(4))
+def test_pose_of_every_round(predictions, golden, iteration):
+    expected = golden[f"pose_enc_iter{iteration}"]
+    assert relative_error(predictions.pose_encodings[0, :, iteration], expected) <= TOKENS
+    np.testing.assert_allclose(predictions.pose_encodings[0, :, iteration], expected, rtol=0, atol=5e-6)
+
+
+def test_depth_and_confidence(predictions, golden):
+    assert relative_error(predictions.depth[0], golden["depth"][..., 0]) <= DENSE
+    assert relative_error(predictions.depth_confidence[0], golden["depth_conf"]) <= DENSE
+
+
+def test_points(predictions, golden):
+    np.testing.assert_allclose(predictions.points[0], golden["world_points"], rtol=0, atol=1e-4)
+    assert relative_error(predictions.points[0], golden["world_points"]) <= DENSE
+    assert relative_error(predictions.points_confidence[0], golden["world_points_conf"]) <= DENSE
+
+
+def test_cameras(predictions, golden):
+    assert relative_error(predictions.extrinsics[0], golden["extrinsics"]) <= DENSE
+    assert relative_error(predictions.intrinsics[0], golden["intrinsics"]) <= DENSE
+
+
+def test_the_first_window_is_vggt_on_its_frames(golden, converted):
+    config, params = converted
+    model = LogVGGT(dataclasses.replace(config, point_head=None, windows=WindowConfig(size=4, stride=2)))
+    variables, images = {"params": params}, golden["images_u8"][None]
+
+    @jax.jit
+    def first_window(variables, images):
+        state, out = model.step(variables, model.start(variables, images[:, :2]), images[:, 2:4])
+        held = model.finish(variables, state)
+        camera = jnp.concatenate([out.camera_tokens, held.camera_tokens], axis=1)
+        register = jnp.concatenate([out.register_tokens, held.register_tokens], axis=1)
+        mask = jnp.ones((1, 4), bool)
+        return state, out, held, model.refine(variables, camera, register, mask, mask)
+
+    state, out, held, poses = jax.device_get(first_window(variables, images))
+    assert relative_error(np.concatenate([out.depth, held.depth], 1)[0], golden["win0_depth"][..., 0]) <= DENSE
+    confidence = np.concatenate([out.depth_confidence, held.depth_confidence], 1)[0]
+    assert relative_error(confidence, golden["win0_depth_conf"]) <= DENSE
+    assert relative_error(out.camera_tokens[0], golden["win0_agg_23"][:2, 0]) <= TOKENS
+    assert relative_error(poses[0, :, -1], golden["win0_pose_enc"]) <= TOKENS
+    for i, layer in enumerate((4, 11, 17, 23)):
+        assert relative_error(state.key_tokens[0, i], golden[f"win0_agg_{layer:02d}"][2:]) <= TOKENS
+
+
+# -- stages, each from the reference's input ----------------------------------------------------------------------
+
+
+def test_encoder_stages(encoder_stages, golden):
+    assert relative_error(encoder_stages["patch_embed"], golden["x_dino_patch_conv"]) <= TOKENS
+    for i in range(3):
+        assert relative_error(encoder_stages[f"block_{i}"], golden[f"x_dino_block{i}"]) <= TOKENS
+    assert relative_error(encoder_stages[""], golden["dino_patch_tokens"]) <= TOKENS
+
+
+@pytest.mark.parametrize("layer", range(24))
+def test_aggregator_layers(aggregator_stages, golden, layer):
+    expected = golden[f"agg_{layer:02d}"]
+    for kind, half in (("frame", expected[..., :64]), ("global", expected[..., 64:])):
+        found = aggregator_stages[f"{kind}_block_{layer}"].reshape(half.shape)
+        assert relative_error(found, half) <= TOKENS
+
+
+def test_first_attention_branches(aggregator_stages, golden):
+    for kind in ("frame", "global"):
+        for stage, path in (("attn", "/attention"), ("block", "")):
+            expected = golden[f"x_{kind}0_{stage}"]
+            found = aggregator_stages[f"{kind}_block_0{path}"]
+            assert relative_error(found.reshape(expected.shape), expected) <= TOKENS
+
+
+def test_depth_head_stages(depth_stages, golden):
+    names = {f"x_depth_project{i}": f"project_{i}" for i in range(4)}
+    names |= {f"x_depth_resize{i}": f"resize_{i}" for i in (0, 1, 3)}
+    names |= {f"x_depth_rn{i}": f"layer_{i}" for i in range(1, 5)}
+    names |= {f"x_depth_refine{i}": f"refine_{i}" for i in range(1, 5)}
+    names |= {"x_depth_outconv1": "output_1", "x_depth_logits": "output_2"}
+    for reference, path in names.items():
+        expected = np.moveaxis(golden[reference], 1, -1)
+        assert relative_error(depth_stages[path], expected) <= DENSE, reference
+
+
+# -- single layers, on inputs that magnify their constants ----------------------------------------------------------
+
+NORMS = {
+    "ln_dino_block0_norm1": ("ln_in64", "encoder/block_0/norm1"),
+    "ln_dino_norm": ("ln_in64", "encoder/norm"),
+    "ln_frame0_norm1": ("ln_in64", "aggregator/frame_block_0/norm1"),
+    "ln_global0_norm2": ("ln_in64", "aggregator/global_block_0/norm2"),
+    "ln_frame0_q_norm": ("ln_in16", "aggregator/frame_block_0/attention/query_norm"),
+    "ln_global0_k_norm": ("ln_in16", "aggregator/global_block_0/attention/key_norm"),
+    "ln_cam_token_norm": ("ln_in128", "camera_head/token_norm"),
+    "ln_cam_trunk_norm": ("ln_in128", "camera_head/trunk_norm"),
+    "ln_cam_trunk0_norm1": ("ln_in128", "camera_head/trunk_0/norm1"),
+    "ln_cam_adaln_norm": ("ln_in128", "camera_head/adaptive_norm"),
+    "ln_depth_norm": ("ln_in128", "depth_head/norm"),
+}
+
+
+@pytest.mark.parametrize("name", NORMS)
+def test_layer_norms(layers, golden, name):
+    source, path = NORMS[name]
+    module, params = layers[path]
+    found = module.apply({"params": params}, golden[source])
+    np.testing.assert_allclose(found, golden[name], rtol=0, atol=2e-6)
+    # The inputs are so small that the other epsilon would show.
+    other = module.clone(epsilon=1e-5 if module.epsilon == 1e-6 else 1e-6)
+    assert np.abs(other.apply({"params": params}, golden[source]) - golden[name]).max() > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("name", "source", "path"),
+    [
+        ("blk_dino1", "blk_in64", "encoder/block_1"),
+        ("blk_frame3", "blk_in64", "aggregator/frame_block_3"),
+        ("blk_cam_trunk1", "blk_in128", "camera_head/trunk_1"),
+    ],
+)
+def test_blocks(layers, golden, converted, name, source, path):
+    module, params = layers[path]
+    options = {}
+    if "frame" in path:
+        options["rope"] = rope_table(golden["rope_pos"], 16, converted[0].aggregator.rope_base)
+    found = module.apply({"params": params}, golden[source], **options)
+    np.testing.assert_allclose(found, golden[name], rtol=0, atol=2e-6)
+    assert relative_error(found, golden[name]) <= TOKENS
+
+
+def test_rotary_embedding(golden, converted):
+    table = rope_table(golden["rope_pos"], 16, converted[0].aggregator.rope_base)
+    found = apply_rope(jnp.swapaxes(golden["rope_in"], 1, 2), table)
+    np.testing.assert_allclose(np.swapaxes(found, 1, 2), golden["rope_out"], rtol=0, atol=2e-6)
+    np.testing.assert_array_equal(frame_positions(GRID, 5), golden["rope_pos"])
+
+
+# -- geometry ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("compiled", [False, True], ids=["numpy", "jax"])
+def test_geometry(golden, compiled):
+    def run(arrays):
+        extrinsics, intrinsics = decode_poses(arrays["pose_enc_iter3"], SIZE)
+        return {
+            "extrinsics": extrinsics,
+            "intrinsics": intrinsics,
+            "unprojected": unproject(arrays["depth"][..., 0], intrinsics, extrinsics),
+            "pose_reencoded": encode_poses(extrinsics, intrinsics, SIZE),
+            "quat_mat": quaternion_to_matrix(arrays["quat_in"]),
+            "quat_back": matrix_to_quaternion(arrays["quat_mat"]),
+        }
+
+    inputs = {name: golden[name] for name in ("pose_enc_iter3", "depth", "quat_in", "quat_mat")}
+    for name, found in (jax.jit(run) if compiled else run)(inputs).items():
+        assert relative_error(found, golden[name]) <= 1e-6, name

@@ -1,0 +1,187 @@
+"""GCCR: what it sees, when it runs, and that streams and whole sequences agree in every mode."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from logvggt_jax import LogVGGT, ModelConfig
+from logvggt_jax.model.refinement import num_triggers, trigger_range
+
+WIDTH = 64
+FRAMES = 11
+
+
+def with_refinement(config: ModelConfig, **options) -> LogVGGT:
+    settings = dataclasses.replace(config.refinement, **options)
+    return LogVGGT(dataclasses.replace(config, refinement=settings))
+
+
+def tokens(num_frames: int = FRAMES, batch: int = 1, seed: int = 0):
+    generator = np.random.default_rng(seed)
+    camera = generator.standard_normal((batch, num_frames, WIDTH)).astype(np.float32)
+    register = generator.standard_normal((batch, num_frames, 4, WIDTH)).astype(np.float32)
+    return camera, register
+
+
+@functools.lru_cache
+def sequence(model: LogVGGT):
+    return jax.jit(model.refine_sequence)
+
+
+@functools.lru_cache
+def refine(model: LogVGGT):
+    return jax.jit(model.refine)
+
+
+def full(num_frames: int = FRAMES, batch: int = 1) -> np.ndarray:
+    return np.ones((batch, num_frames), bool)
+
+
+def close(actual, expected):
+    np.testing.assert_allclose(actual, expected, rtol=2e-5, atol=2e-5)
+
+
+def test_zero_output_projection_is_the_identity(small_config, small_variables):
+    params = dict(small_variables["params"])
+    params["gccr"] = dict(params["gccr"], output=jax.tree.map(np.zeros_like, params["gccr"]["output"]))
+    camera, register = tokens()
+    refined = LogVGGT(small_config).refine_tokens({"params": params}, camera, register, full())
+    np.testing.assert_array_equal(refined, camera)
+
+
+def test_fresh_parameters_leave_camera_tokens_alone(small_config):
+    model = LogVGGT(small_config)
+    variables = model.init(jax.random.key(3), np.zeros((1, 1, 28, 42, 3), np.float32))
+    camera, register = tokens()
+    np.testing.assert_array_equal(model.refine_tokens(variables, camera, register, full()), camera)
+
+
+def test_disabled_is_the_camera_head_alone(small_config, small_variables):
+    model = with_refinement(small_config, enabled=False)
+    camera, register = tokens()
+    poses = sequence(model)(small_variables, camera, register, full())
+    close(poses, model.decode_cameras(small_variables, camera, full()))
+    with pytest.raises(AssertionError):
+        close(poses, sequence(LogVGGT(small_config))(small_variables, camera, register, full()))
+
+
+def test_one_register_token_moves_another_frames_pose(small_config, small_variables):
+    run = refine(with_refinement(small_config))
+    camera, register = tokens()
+    other = register.copy()
+    other[:, 7, 2] += 1.0
+    before = run(small_variables, camera, register, full(), full())
+    after = run(small_variables, camera, other, full(), full())
+    assert np.abs(np.asarray(after - before))[0, 0].max() > 1e-5
+
+
+def test_permuting_registers_changes_nothing(small_config, small_variables):
+    run = refine(with_refinement(small_config))
+    camera, register = tokens()
+    order = np.random.default_rng(1).permutation(4 * FRAMES)
+    permuted = register.reshape(1, -1, WIDTH)[:, order].reshape(register.shape)
+    close(
+        run(small_variables, camera, permuted, full(), full()),
+        run(small_variables, camera, register, full(), full()),
+    )
+
+
+def test_padding_changes_nothing(small_config, small_variables):
+    run = refine(with_refinement(small_config))
+    camera, register = tokens()
+    mask = np.arange(FRAMES)[None] < 8
+    rubbish_camera = np.where(mask[..., None], camera, np.float32(9))
+    rubbish_register = np.where(mask[..., None, None], register, np.float32(9))
+    a = run(small_variables, camera, register, mask, mask)
+    b = run(small_variables, rubbish_camera, rubbish_register, mask, mask)
+    np.testing.assert_array_equal(a[:, :8], b[:, :8])
+
+
+@pytest.mark.parametrize("period", [FRAMES, FRAMES + 5])
+def test_a_period_of_all_frames_is_the_full_refinement(small_config, small_variables, period):
+    camera, register = tokens()
+    periodic = sequence(with_refinement(small_config, period=period))(small_variables, camera, register, full())
+    once = sequence(with_refinement(small_config))(small_variables, camera, register, full())
+    close(periodic, once)
+
+
+@pytest.mark.parametrize("period", [2, 3, 4])
+def test_periodic_poses_know_the_past_only_and_stay(small_config, small_variables, period):
+    run = sequence(with_refinement(small_config, period=period))
+    camera, register = tokens()
+    for trigger in range(num_triggers(FRAMES, period) - 1):
+        _, stop = trigger_range(trigger, FRAMES, period)
+        other_camera, other_register = camera.copy(), register.copy()
+        other_camera[:, stop:] += 1.0
+        other_register[:, stop:] += 1.0
+        before = run(small_variables, camera, register, full())
+        after = run(small_variables, other_camera, other_register, full())
+        np.testing.assert_array_equal(before[:, :stop], after[:, :stop])
+        assert np.abs(np.asarray(after - before))[:, stop:].max() > 1e-5
+
+
+def by_hand(model: LogVGGT, variables, camera, register) -> np.ndarray:
+    """Design of the modes, trigger by trigger and group by group, without masks or fixed shapes."""
+    settings, group = model.config.refinement, model.config.windows.stride
+    num_frames = camera.shape[1]
+    refined = camera.copy()
+    poses = []
+    for trigger in range(num_triggers(num_frames, settings.period)):
+        start, stop = trigger_range(trigger, num_frames, settings.period)
+        past = register[:, :stop]
+        refined[:, start:stop] = model.refine_tokens(variables, camera[:, start:stop], past, full(stop))
+        if settings.context is None:
+            poses.append(model.decode_cameras(variables, refined[:, :stop], full(stop))[:, start:])
+            continue
+        for first in range(start, stop, group):
+            last = min(first + group, stop)
+            seen = sorted({0, *range(max(0, last - settings.context), last)})
+            decoded = model.decode_cameras(variables, refined[:, seen], full(len(seen)))
+            poses.append(decoded[:, [seen.index(f) for f in range(first, last)]])
+    return np.concatenate(poses, axis=1)
+
+
+@pytest.mark.parametrize(
+    ("period", "context"), [(None, None), (3, None), (2, None), (None, 4), (4, 3), (2, 2), (5, 20)]
+)
+def test_modes_equal_their_definition(small_config, small_variables, period, context):
+    model = with_refinement(small_config, period=period, context=context)
+    camera, register = tokens()
+    expected = by_hand(model, small_variables, camera, register)
+    close(sequence(model)(small_variables, camera, register, full()), expected)
+
+
+@pytest.mark.parametrize(("period", "context"), [(None, 4), (3, None), (3, 4), (2, 2)])
+def test_unequal_lengths_equal_items_one_by_one(small_config, small_variables, period, context):
+    model = with_refinement(small_config, period=period, context=context)
+    lengths = (FRAMES, 6, 1)
+    camera, register = tokens(batch=len(lengths))
+    mask = np.arange(FRAMES)[None] < np.array(lengths)[:, None]
+    batch = sequence(model)(small_variables, camera, register, mask)
+    for item, length in enumerate(lengths):
+        one = slice(item, item + 1)
+        close(batch[one, :length], by_hand(model, small_variables, camera[one, :length], register[one, :length]))
+
+
+def test_memory_grows_at_most_linearly(small_config, small_variables):
+    model = LogVGGT(small_config)
+
+    def temporaries(num_frames):
+        camera = jax.ShapeDtypeStruct((1, num_frames, WIDTH), jnp.float32)
+        register = jax.ShapeDtypeStruct((1, num_frames, 4, WIDTH), jnp.float32)
+        mask = jax.ShapeDtypeStruct((1, num_frames), bool)
+        compiled = jax.jit(model.refine).lower(small_variables, camera, register, mask, mask).compile()
+        return compiled.memory_analysis().temp_size_in_bytes
+
+    assert temporaries(4000) < 2.2 * temporaries(2000)
+
+
+def test_context_smaller_than_the_stride_is_refused(small_config):
+    with pytest.raises(ValueError, match="context=1 must be at least the window stride 2"):
+        with_refinement(small_config, context=1)

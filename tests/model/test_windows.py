@@ -1,0 +1,259 @@
+"""Windows: streaming equals batch, unequal lengths, who influences whom, and what the state weighs."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from logvggt_jax import LogVGGT, ModelConfig, WindowConfig
+from logvggt_jax.model.windows import first_window, kept_window, num_windows
+
+HEIGHT, WIDTH = 28, 42
+MAX_FRAMES = 13
+WINDOWS = [(4, 2), (4, 1), (4, 3), (2, 1), (5, 2)]
+
+
+def with_windows(config: ModelConfig, size: int, stride: int, **options) -> LogVGGT:
+    return LogVGGT(dataclasses.replace(config, windows=WindowConfig(size=size, stride=stride, **options)))
+
+
+def without_refinement(config: ModelConfig) -> ModelConfig:
+    return dataclasses.replace(config, refinement=dataclasses.replace(config.refinement, enabled=False))
+
+
+def video(num_frames: int, batch: int = 1, seed: int = 0) -> np.ndarray:
+    shape = (batch, num_frames, HEIGHT, WIDTH, 3)
+    return np.random.default_rng(seed).random(shape, dtype=np.float32)
+
+
+def padded_groups(images: np.ndarray, model: LogVGGT):
+    """The frames of a stream: the first K − s, then groups of s, with their masks; the tail holds rubbish."""
+    size, stride = model.config.windows.size, model.config.windows.stride
+    num_frames, overlap = images.shape[1], size - stride
+    total = num_windows(num_frames, size, stride) * stride + overlap
+    rubbish = video(total, images.shape[0], seed=99)
+    rubbish[:, :num_frames] = images
+    mask = np.broadcast_to(np.arange(total) < num_frames, (images.shape[0], total))
+    bounds = [0, *range(overlap, total + 1, stride)]
+    return [(rubbish[:, a:b], mask[:, a:b]) for a, b in zip(bounds, bounds[1:], strict=False)]
+
+
+@functools.lru_cache
+def jitted(model: LogVGGT):
+    """Compiled once for all lengths: start, step (its state donated), finish."""
+    return jax.jit(model.start), jax.jit(model.step, donate_argnums=1), jax.jit(model.finish)
+
+
+def stream(model: LogVGGT, variables, images: np.ndarray):
+    """Window outputs of all frames [B, T, …] and the refined poses, through start / step / finish / refine."""
+    start, step, finish = jitted(model)
+    first, *groups = padded_groups(images, model)
+    state = start(variables, *first)
+    outs = []
+    for frames, mask in groups:
+        state, out = step(variables, state, frames, mask)
+        outs.append(out)
+    outs.append(finish(variables, state))
+    joined = jax.tree.map(lambda *x: np.concatenate(x, axis=1), *outs)
+    num_frames = images.shape[1]
+    np.testing.assert_array_equal(joined.frame_mask[0], np.arange(joined.frame_mask.shape[1]) < num_frames)
+    # Padded to one length, so that all sequences share a compiled refinement.
+    padding = [(0, 0), (0, max(0, MAX_FRAMES - joined.frame_mask.shape[1]))]
+    camera, register, mask = (
+        np.pad(x, padding + [(0, 0)] * (x.ndim - 2))
+        for x in (joined.camera_tokens, joined.register_tokens, joined.frame_mask)
+    )
+    poses = refine(model)(variables, camera, register, mask, mask)[:, :num_frames]
+    return jax.tree.map(lambda x: x[:, :num_frames], joined), poses
+
+
+@functools.lru_cache
+def refine(model: LogVGGT):
+    return jax.jit(model.refine)
+
+
+def close(actual, expected, tolerance=2e-5):
+    np.testing.assert_allclose(actual, expected, rtol=tolerance, atol=tolerance)
+
+
+@pytest.mark.parametrize(("size", "stride"), [(2, 1), (4, 1), (4, 2), (4, 3), (7, 3)])
+def test_window_arithmetic(size, stride):
+    for num_frames in range(1, 40):
+        windows = num_windows(num_frames, size, stride)
+        starts = [i * stride for i in range(windows)]
+        covered = {f for a in starts for f in range(a, a + size)}
+        assert set(range(num_frames)) <= covered
+        assert windows == 1 or starts[-1] + size - stride < num_frames, "the last window brings a new frame"
+        for frame in range(num_frames):
+            holding = [i for i, a in enumerate(starts) if a <= frame < a + size]
+            assert kept_window(frame, num_frames, size, stride) == holding[-1]
+            assert first_window(frame, size, stride) == holding[0]
+
+
+@pytest.mark.parametrize(("size", "stride"), WINDOWS)
+def test_streaming_equals_batch(small_config, small_variables, size, stride):
+    """All lengths 1 … 13 in one padded batch, against each length as a stream of its own."""
+    model = with_windows(small_config, size, stride)
+    images = video(MAX_FRAMES, MAX_FRAMES)
+    lengths = np.arange(1, MAX_FRAMES + 1)
+    batch = jax.jit(model.apply)(small_variables, images, np.arange(MAX_FRAMES) < lengths[:, None])
+    for item, length in enumerate(lengths):
+        out, poses = stream(model, small_variables, images[item : item + 1, :length])
+        for name in ("depth", "depth_confidence", "camera_tokens", "register_tokens"):
+            close(getattr(out, name)[0], getattr(batch, name)[item, :length])
+        close(poses[0], batch.pose_encodings[item, :length])
+
+
+@pytest.mark.parametrize(("size", "stride", "lengths"), [(4, 2, (9, 1, 4, 6)), (5, 2, (8, 5)), (4, 3, (7, 2))])
+def test_unequal_lengths_equal_items_one_by_one(small_config, small_variables, size, stride, lengths):
+    model = with_windows(small_config, size, stride)
+    apply = jax.jit(model.apply)
+    images = video(max(lengths), len(lengths))
+    mask = np.arange(max(lengths)) < np.array(lengths)[:, None]
+    batch = apply(small_variables, images, mask)
+    rubbish = np.where(mask[:, :, None, None, None], images, np.float32(7.0))
+    assert_same_predictions(apply(small_variables, rubbish, mask), batch, lengths)
+    for item, length in enumerate(lengths):
+        single = apply(small_variables, images[item : item + 1, :length])
+        for name in ("depth", "depth_confidence", "camera_tokens", "register_tokens", "pose_encodings"):
+            close(getattr(batch, name)[item, :length], getattr(single, name)[0])
+
+
+def assert_same_predictions(actual, expected, lengths):
+    for item, length in enumerate(lengths):
+        for a, b in zip(jax.tree.leaves(actual), jax.tree.leaves(expected), strict=True):
+            np.testing.assert_array_equal(a[item, :length], b[item, :length])
+
+
+@functools.lru_cache
+def scan(model: LogVGGT):
+    return jax.jit(model.run_windows)
+
+
+def changed_frames(model, variables, images, frame, name="camera_tokens"):
+    """Which frames' outputs are not bit-identical once `frame` is another picture."""
+    other = images.copy()
+    other[:, frame] = video(1, seed=5)[:, 0]
+    run = scan(model)
+    before, after = (np.asarray(getattr(run(variables, x), name)) for x in (images, other))
+    return {i for i in range(images.shape[1]) if not np.array_equal(before[:, i], after[:, i])}
+
+
+@pytest.mark.parametrize("name", ["camera_tokens", "depth", "depth_confidence", "register_tokens"])
+def test_frames_after_the_last_window_change_nothing(small_config, small_variables, name):
+    model, images = with_windows(small_config, 4, 2), video(12)
+    for frame in (5, 8, 11):
+        changed = changed_frames(model, small_variables, images, frame, name)
+        first = first_window(frame, 4, 2)
+        expected = {f for f in range(12) if kept_window(f, 12, 4, 2) >= first}
+        assert changed == expected
+
+
+def test_without_cross_window_attention_windows_know_nothing_of_each_other(small_config, small_variables):
+    model, images = with_windows(small_config, 4, 2, cross_window=False), video(12)
+    for frame in (0, 3, 6):
+        windows = {i for i in range(num_windows(12, 4, 2)) if 2 * i <= frame < 2 * i + 4}
+        changed = changed_frames(model, small_variables, images, frame)
+        assert changed == {f for f in range(12) if kept_window(f, 12, 4, 2) in windows}
+
+
+def test_cache_of_outputs_reaches_every_later_window(small_config, small_variables):
+    model, images = with_windows(small_config, 4, 2, cache="output"), video(24)
+    assert changed_frames(model, small_variables, images, 0) == set(range(24))
+
+
+def test_cache_of_inputs_reaches_as_many_windows_as_there_are_key_layers(small_config, small_variables):
+    # Key layers that follow another global block: each hop climbs one of them.
+    sizes = dataclasses.replace(small_config.aggregator, depth=5, key_layers=(1, 2, 3, 4))
+    config = dataclasses.replace(small_config, aggregator=sizes)
+    variables = {"params": dict(small_variables["params"])}
+    aggregator = dict(variables["params"]["aggregator"])
+    aggregator["frame_block_4"], aggregator["global_block_4"] = (
+        jax.tree.map(lambda x: x * 1.1, aggregator[f"{kind}_block_0"]) for kind in ("frame", "global")
+    )
+    variables["params"]["aggregator"] = aggregator
+    model, images = with_windows(config, 4, 2, cache="input"), video(24)
+    # Frame 0 is in window 0 and reaches windows 1 … 4, the last of which keeps frames 8 and 9.
+    assert changed_frames(model, variables, images, 0) == set(range(10))
+
+
+def test_attention_mixes_patches_and_frames(small_config, small_variables):
+    model, images = with_windows(small_config, 4, 2), video(4)
+    other = images.copy()
+    other[:, 1, :14, :14] = 0.0
+    run = jax.jit(model.apply)
+    before, after = run(small_variables, images), run(small_variables, other)
+    moved = np.abs(np.asarray(before.depth) - np.asarray(after.depth))[0]
+    assert (moved[1, 14:, 28:] > 1e-6).mean() > 0.9, "other patches of the frame"
+    for frame in (0, 2, 3):
+        assert (moved[frame] > 1e-6).mean() > 0.9, "other frames of the window"
+
+
+def test_one_window_of_any_size_is_the_same(small_config, small_variables):
+    """T <= K: cache, stride and K play no part, so plain VGGT over the T frames is all that happens."""
+    config = without_refinement(small_config)
+    for num_frames in (1, 2, 3, 4):
+        images = video(num_frames)
+        reference = jax.jit(with_windows(config, max(num_frames, 2), 1, cross_window=False).apply)(
+            small_variables, images
+        )
+        windowed = jax.jit(with_windows(config, 4, 2).apply)(small_variables, images)
+        jax.tree.map(close, windowed, reference)
+
+
+@pytest.mark.parametrize("cache", ["output", "input"])
+def test_state_has_the_same_bytes_at_any_length(small_config, small_variables, cache):
+    model = with_windows(small_config, 4, 2, cache=cache)
+    step = jax.eval_shape(model.start, small_variables, video(2))
+    after = jax.eval_shape(model.step, small_variables, step, video(2))[0]
+    assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(lambda x: (x.shape, x.dtype), step)
+
+
+def test_scan_temporaries_do_not_grow_with_the_sequence(small_config, small_variables):
+    model = with_windows(small_config, 4, 2)
+
+    def temporaries(num_frames):
+        images = jax.ShapeDtypeStruct((1, num_frames, HEIGHT, WIDTH, 3), jnp.uint8)
+        compiled = jax.jit(model.run_windows).lower(small_variables, images).compile()
+        return compiled.memory_analysis().temp_size_in_bytes
+
+    assert temporaries(100) == temporaries(1000)
+
+
+def test_donated_state_holds_no_buffer_twice(small_config, small_variables):
+    model = with_windows(small_config, 4, 2)
+    state = jax.jit(model.start)(small_variables, video(2))
+    pointers = [leaf.unsafe_buffer_pointer() for leaf in jax.tree.leaves(state)]
+    assert len(set(pointers)) == len(pointers)
+    new_state, _ = jax.jit(model.step, donate_argnums=1)(small_variables, state, video(2))
+    assert all(leaf.is_deleted() for leaf in jax.tree.leaves(state))
+    assert not any(leaf.is_deleted() for leaf in jax.tree.leaves(new_state))
+
+
+@pytest.mark.parametrize(
+    ("images", "mask", "message"),
+    [
+        (np.zeros((1, 2, 28, 42)), None, "shape"),
+        (np.zeros((1, 2, 28, 40, 3), np.float32), None, "multiples of 14"),
+        (np.zeros((1, 2, 28, 42, 3), np.int32), None, "dtype int32"),
+        (np.zeros((1, 0, 28, 42, 3), np.float32), None, "T >= 1"),
+        (np.zeros((1, 2, 28, 42, 3), np.float32), np.ones((1, 3), bool), "frame_mask"),
+        (np.zeros((1, 2, 28, 42, 3), np.float32), np.ones((1, 2)), "frame_mask"),
+    ],
+)
+def test_wrong_input_is_named(small_config, small_variables, images, mask, message):
+    with pytest.raises(ValueError, match=message) as error:
+        LogVGGT(small_config).apply(small_variables, images, mask)
+    assert "\n" not in str(error.value)
+
+
+def test_step_names_the_number_of_frames_it_takes(small_config, small_variables):
+    model = LogVGGT(small_config)
+    state = jax.eval_shape(model.start, small_variables, video(2))
+    with pytest.raises(ValueError, match=r"step takes 2 frames.*got 3"):
+        jax.eval_shape(model.step, small_variables, state, video(3))

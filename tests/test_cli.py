@@ -1,0 +1,170 @@
+"""The command line: help, exit codes, one-line errors, and the whole way from a room to a point cloud."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from logvggt_jax import LogVGGT, ModelConfig
+from logvggt_jax.cli import main
+from logvggt_jax.inference.compilation_cache import default_cache_folder, enable_compilation_cache
+from logvggt_jax.weights.checkpoints import save_model
+
+COMMANDS = ("convert", "reconstruct", "render-room", "view", "info")
+
+
+@pytest.fixture(scope="module")
+def checkpoint(small_config: ModelConfig, small_variables: dict, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("checkpoint") / "model"
+    save_model(folder, small_config, small_variables["params"])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("room") / "room"
+    assert main(["render-room", "--output", str(folder), "--frames", "5", "--size", "56x84"]) == 0
+    return folder
+
+
+def assert_fails(capsys: pytest.CaptureFixture[str], arguments: list[str], *parts: str, code: int = 2) -> None:
+    """The command exits with `code` and one line that has all `parts`."""
+    assert main(arguments) == code
+    error = capsys.readouterr().err.strip()
+    assert error.startswith("logvggt: error: ")
+    assert "\n" not in error
+    for part in parts:
+        assert part in error
+
+
+def test_help_names_every_command_and_each_shows_an_example(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as exit_:
+        main(["--help"])
+    assert exit_.value.code == 0
+    text = capsys.readouterr().out
+    assert all(command in text for command in COMMANDS)
+    for command in COMMANDS:
+        with pytest.raises(SystemExit) as exit_:
+            main([command, "--help"])
+        assert exit_.value.code == 0
+        assert f"logvggt {command} " in capsys.readouterr().out.split("example:")[1]
+
+
+@pytest.mark.parametrize("arguments", [[], ["fly"], ["info"], ["info", "x", "--fast"], ["view", "x", "--port", "y"]])
+def test_wrong_usage_exits_with_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as exit_:
+        main(arguments)
+    assert exit_.value.code == 2
+    assert "usage: logvggt" in capsys.readouterr().err
+
+
+def test_module_runs_as_a_program() -> None:
+    command = [sys.executable, "-m", "logvggt_jax", "info", "nowhere"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert "nowhere" in done.stderr
+    assert done.stdout == ""
+
+
+@pytest.mark.filterwarnings("ignore:.*field of view")  # the model is not trained
+def test_from_a_room_to_a_point_cloud(
+    checkpoint: Path, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tmp_path / "out"
+    arguments = ["reconstruct", str(room), "--checkpoint", str(checkpoint), "--output", str(output)]
+    arguments += ["--longer_edge", "42", "--max_points=500", "--compilation-cache", "none", "--previews", "1"]
+    assert main(arguments) == 0
+    printed = capsys.readouterr().out.replace("\n", "")
+    for name in ("cameras.json", "trajectory.txt", "points.ply"):
+        assert (output / name).stat().st_size > 0
+        assert str(output / name) in printed
+    assert len(list((output / "depth").glob("*.npz"))) == 5
+    assert_fails(capsys, arguments, str(output), "--overwrite")
+
+
+def test_info_counts_parameters(
+    checkpoint: Path, small_config: ModelConfig, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["info", str(checkpoint)]) == 0
+    shapes = jax.eval_shape(LogVGGT(small_config).init, jax.random.key(0), np.zeros((1, 1, 28, 42, 3), np.float32))
+    total = sum(leaf.size for leaf in jax.tree.leaves(shapes))
+    text = capsys.readouterr().out
+    assert f"{total:,}" in text
+    for part in ("encoder", "aggregator", "camera_head", "depth_head", "gccr"):
+        assert part in text
+
+
+def test_bad_input_is_one_line_and_exit_code_2(
+    checkpoint: Path, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    output = tmp_path / "out"
+
+    def reconstruct(source: Path, model: Path = checkpoint, *options: str) -> list[str]:
+        command = ["reconstruct", str(source), "--checkpoint", str(model), "--output", str(output)]
+        return [*command, "--compilation-cache", "none", "--longer-edge", "42", *options]
+
+    assert_fails(capsys, reconstruct(empty), "no image in", str(empty))
+    assert_fails(capsys, reconstruct(tmp_path / "nothing"), "does not exist")
+    # The source is looked at before the model, which may take minutes to load.
+    assert_fails(capsys, reconstruct(empty, tmp_path / "no-model"), "no image in")
+    assert_fails(capsys, reconstruct(room, empty), str(empty))
+    assert_fails(capsys, reconstruct(room, checkpoint, "--longer-edge", "50"), "longer_edge", "14", "50")
+    assert_fails(capsys, reconstruct(room, checkpoint, "--confidence-percentile", "120"), "confidence_percentile")
+    assert_fails(capsys, reconstruct(room, checkpoint, "--stride", "0"), "stride")
+    truncated = tmp_path / "truncated"
+    truncated.mkdir()
+    for file in sorted(room.glob("*.color.png"))[:2]:
+        (truncated / file.name).write_bytes(file.read_bytes())
+    (truncated / file.name).write_bytes(file.read_bytes()[:300])
+    assert_fails(capsys, reconstruct(truncated), file.name)
+    assert_fails(capsys, ["convert", str(empty), "--output", str(output)], str(empty))
+    assert_fails(capsys, ["view", str(empty)], str(empty))
+    assert_fails(capsys, ["render-room", "--output", str(room)], str(room), "--overwrite")
+    assert_fails(capsys, ["render-room", "--output", str(output), "--frames", "0"], "num_frames")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["empty", "truncated"]
+
+
+def test_traceback_only_when_asked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["info", str(tmp_path / "x")]) == 2
+    assert "Traceback" not in capsys.readouterr().err
+    assert main(["info", str(tmp_path / "x"), "--traceback"]) == 2
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_failures_that_are_no_bad_input_exit_with_1(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise RuntimeError("out of\nmemory")
+
+    monkeypatch.setattr("logvggt_jax.weights.checkpoints.load_model", fail)
+    assert_fails(capsys, ["info", "x"], "RuntimeError: out of memory", "--traceback", code=1)
+
+
+def test_compilation_cache_follows_flag_environment_and_user_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = ("jax_compilation_cache_dir", "jax_enable_compilation_cache")
+    before = {name: getattr(jax.config, name) for name in settings}
+    try:
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+        monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
+        assert default_cache_folder() == tmp_path / "logvggt" / "xla"
+        assert enable_compilation_cache() == default_cache_folder()
+        assert jax.config.jax_compilation_cache_dir == str(default_cache_folder())
+        monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "jax"))
+        assert enable_compilation_cache() == tmp_path / "jax"
+        assert enable_compilation_cache(str(tmp_path / "flag")) == tmp_path / "flag"
+        assert enable_compilation_cache("none") is None
+        assert not jax.config.jax_enable_compilation_cache
+    finally:
+        for name, value in before.items():
+            jax.config.update(name, value)

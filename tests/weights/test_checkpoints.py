@@ -1,0 +1,261 @@
+"""Model folders: what is saved comes back, and what is damaged is named."""
+
+import dataclasses
+import gc
+import json
+import shutil
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import orbax.checkpoint as ocp
+import pytest
+from safetensors.numpy import save_file
+
+from logvggt_jax.model.logvggt import LogVGGT
+from logvggt_jax.weights import checkpoints
+from logvggt_jax.weights.checkpoints import (
+    convert,
+    digests,
+    from_pretrained,
+    load_model,
+    save_model,
+    verify_digests,
+)
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory, small_config, small_variables):
+    path = tmp_path_factory.mktemp("saved") / "model"
+    save_model(path, small_config, small_variables["params"])
+    return path
+
+
+@pytest.fixture
+def folder(saved, tmp_path):
+    """A copy of the saved model that a test may damage."""
+    return shutil.copytree(saved, tmp_path / "model")
+
+
+@pytest.fixture(scope="module")
+def vggt_file(tmp_path_factory, vggt_state_dict):
+    path = tmp_path_factory.mktemp("vggt") / "model.safetensors"
+    save_file(vggt_state_dict, path)
+    return path
+
+
+@pytest.fixture
+def abandoned_reads():
+    """When one read fails Orbax drops the others; their complaints belong to the test that made them."""
+    yield
+    gc.collect()
+
+
+def _edit(folder, change):
+    file = folder / "config.json"
+    description = json.loads(file.read_text())
+    change(description)
+    file.write_text(json.dumps(description))
+
+
+def _assert_same(tree, other):
+    assert jax.tree.structure(tree) == jax.tree.structure(other)
+    for leaf, expected in zip(jax.tree.leaves(tree), jax.tree.leaves(other), strict=True):
+        assert leaf.dtype == expected.dtype
+        np.testing.assert_array_equal(leaf, expected)
+
+
+def _hidden(path):
+    return [entry.name for entry in path.iterdir() if entry.name.startswith(".")]
+
+
+def test_a_model_comes_back_bit_for_bit(saved, small_config, small_variables):
+    model, variables = load_model(saved)
+    assert model == LogVGGT(small_config)
+    _assert_same(variables, small_variables)
+    device = jnp.zeros(()).devices()
+    assert all(isinstance(leaf, jax.Array) and leaf.devices() == device for leaf in jax.tree.leaves(variables))
+
+
+def test_parameters_saved_on_several_devices_load_on_one(tmp_path, small_config, small_variables):
+    devices = jax.devices()[:2]
+    if len(devices) < 2:
+        pytest.skip("needs two devices")
+    mesh = jax.make_mesh((2,), ("data",), axis_types=(jax.sharding.AxisType.Auto,), devices=devices)
+    everywhere = jax.device_put(small_variables["params"], jax.NamedSharding(mesh, jax.P()))
+    everywhere["encoder"]["norm"]["scale"] = jax.device_put(
+        small_variables["params"]["encoder"]["norm"]["scale"], jax.NamedSharding(mesh, jax.P("data"))
+    )
+    save_model(tmp_path / "model", small_config, everywhere)
+    _, variables = load_model(tmp_path / "model")
+    _assert_same(variables["params"], small_variables["params"])
+
+
+def test_a_relative_path_works(tmp_path, monkeypatch, saved, small_config, small_variables):
+    monkeypatch.chdir(tmp_path)
+    save_model("runs/model", small_config, small_variables["params"])
+    model, _ = load_model("runs/model")
+    assert model.config == small_config
+
+
+def test_saving_again_replaces_the_older_model(folder, small_config, small_variables):
+    params = jax.tree.map(lambda leaf: leaf + 1, small_variables["params"])
+    save_model(folder, small_config, params)
+    _assert_same(load_model(folder)[1]["params"], params)
+    assert _hidden(folder.parent) == []
+
+
+def test_a_failed_save_leaves_the_older_model_and_nothing_else(folder, small_config, small_variables, monkeypatch):
+    def fail(*args, **kwargs):
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(ocp.StandardCheckpointer, "save", fail)
+    for path in (folder, folder.parent / "fresh"):
+        with pytest.raises(OSError, match="no space left"):
+            save_model(path, small_config, small_variables["params"])
+    monkeypatch.undo()
+    assert [entry.name for entry in folder.parent.iterdir()] == ["model"]
+    _assert_same(load_model(folder)[1], small_variables)
+
+
+def test_a_folder_that_is_no_model_is_never_overwritten(tmp_path, small_config, small_variables):
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(FileExistsError, match="not a model folder"):
+        save_model(tmp_path, small_config, small_variables["params"])
+    assert [entry.name for entry in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_a_changed_leaf_is_named(folder, small_variables):
+    params = jax.tree.map(np.array, small_variables["params"])
+    params["gccr"]["key"]["kernel"].view(np.uint8)[3, 5] ^= 1
+    shutil.rmtree(folder / "params")
+    with ocp.StandardCheckpointer() as checkpointer:
+        checkpointer.save(folder / "params", params)
+    with pytest.raises(ValueError, match=r"model: leaf gccr/key/kernel differs from its digest.*copy or convert"):
+        load_model(folder)
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.usefixtures("abandoned_reads")
+def test_flipped_bytes_of_a_stored_array_are_noticed(folder):
+    data = max((file for file in folder.rglob("*") if file.parent.name == "d"), key=lambda file: file.stat().st_size)
+    flipped = bytearray(data.read_bytes())
+    middle = len(flipped) // 2
+    flipped[middle : middle + 64] = bytes(255 - byte for byte in flipped[middle : middle + 64])
+    data.write_bytes(flipped)
+    with pytest.raises(ValueError, match="damaged") as caught:
+        load_model(folder)
+    assert str(folder) in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.usefixtures("abandoned_reads")
+def test_a_truncated_or_missing_file_is_an_error(folder):
+    data = max((file for file in folder.rglob("*") if file.parent.name == "d"), key=lambda file: file.stat().st_size)
+    data.write_bytes(data.read_bytes()[: data.stat().st_size // 2])
+    with pytest.raises(ValueError, match=r"params: cannot be read .*damaged"):
+        load_model(folder)
+    shutil.rmtree(folder / "params")
+    with pytest.raises(FileNotFoundError, match=r"params: the parameters are missing"):
+        load_model(folder)
+
+
+def test_a_configuration_of_another_model_names_the_parameter(folder):
+    _edit(folder, lambda description: description["config"]["depth_head"].update(features=16))
+    with pytest.raises(
+        ValueError, match=r"params: depth_head/\S+ has shape .* the configuration .* asks for"
+    ) as caught:
+        load_model(folder)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda d: d["config"]["encoder"].update(widht=3), r"unknown field model\.encoder\.widht"),
+        (lambda d: d["config"]["windows"].update(stride=4), r"WindowConfig\.stride=4"),
+        (lambda d: d.update(version=99), r"format version 99"),
+        (lambda d: d.update(format="other"), r"not the description of a model of this package"),
+        (lambda d: d.pop("digests"), r"config or digests are missing"),
+        (lambda d: d["digests"].pop("encoder/cls_token"), r"leaf encoder/cls_token has no digest"),
+    ],
+)
+def test_a_wrong_description_is_named(folder, change, words):
+    _edit(folder, change)
+    with pytest.raises(ValueError, match=words) as caught:
+        load_model(folder)
+    assert str(folder) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_description_that_is_missing_or_cut_is_named(folder):
+    file = folder / "config.json"
+    file.write_text(file.read_text()[:100])
+    with pytest.raises(ValueError, match=r"config\.json: not valid JSON"):
+        load_model(folder)
+    file.unlink()
+    for load in (load_model, from_pretrained):
+        with pytest.raises(FileNotFoundError, match=r"config\.json: no such file"):
+            load(folder)
+
+
+def test_digests_tell_value_shape_and_type_apart():
+    tree = {"a": np.zeros((2, 3), np.float32), "key": jax.random.key(1), "step": np.int32(4)}
+    same = digests(tree)
+    verify_digests(tree, same, "somewhere")
+    others = [
+        {"a": np.zeros((3, 2), np.float32)},
+        {"a": np.zeros((2, 3), np.int32)},
+        {"a": -np.zeros((2, 3), np.float32)},
+        {"key": jax.random.key(2)},
+        {"step": np.int32(5)},
+    ]
+    for other in others:
+        (name,) = other
+        with pytest.raises(ValueError, match=f"somewhere: leaf {name} differs"):
+            verify_digests({**tree, **other}, same, "somewhere")
+    with pytest.raises(ValueError, match="leaf a is not in the checkpoint"):
+        verify_digests({"key": tree["key"], "step": tree["step"]}, same, "somewhere")
+
+
+def test_a_converted_vggt_equals_the_one_converted_in_memory(tmp_path, vggt_file, vggt_config, vggt_state_dict, capsys):
+    report = convert(vggt_file, tmp_path / "model", point_head=True)
+    assert len(report.used) == len(vggt_state_dict) - 2
+    assert f"{len(report.used)} tensors used, 2 skipped, 12 parameters initialised" in capsys.readouterr().out
+    assert [entry.name for entry in tmp_path.iterdir()] == ["model"]
+    model, variables = load_model(tmp_path / "model")
+    direct, direct_variables = from_pretrained(vggt_file, point_head=True)
+    assert model == direct == LogVGGT(vggt_config)
+    _assert_same(variables, direct_variables)
+
+
+def test_a_refused_conversion_leaves_nothing(tmp_path, vggt_state_dict):
+    bad = dict(vggt_state_dict)
+    bad["camera_head.embed_pose.weight"] = np.zeros((32, 8), np.float32)
+    save_file(bad, tmp_path / "model.safetensors")
+    with pytest.raises(
+        ValueError, match=r"^\S+model\.safetensors: camera_head\.embed_pose\.weight has shape \(32, 8\)"
+    ):
+        convert(tmp_path / "model.safetensors", tmp_path / "model")
+    assert [entry.name for entry in tmp_path.iterdir()] == ["model.safetensors"]
+
+
+def test_conversion_checks_the_destination_before_it_reads(tmp_path, vggt_file, monkeypatch):
+    monkeypatch.setattr(checkpoints, "open_state_dict", lambda path: pytest.fail("read before the check"))
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(FileExistsError, match="not a model folder"):
+        convert(vggt_file, tmp_path)
+
+
+def test_the_compute_type_can_be_chosen(saved, small_config, small_variables):
+    model, variables = from_pretrained(saved, dtype="bfloat16")
+    assert model.config == dataclasses.replace(small_config, dtype="bfloat16")
+    _assert_same(variables, small_variables)
+    with pytest.raises(ValueError, match="no point head"):
+        from_pretrained(saved, point_head=True)
+
+
+def test_a_path_that_does_not_exist_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"nothing/here/at/all: no such file or folder"):
+        from_pretrained(tmp_path / "nothing" / "here" / "at" / "all")
+    with pytest.raises(FileNotFoundError, match=r"nothing/config\.json"):
+        load_model(tmp_path / "nothing")

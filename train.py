@@ -1,0 +1,60 @@
+"""Trains LoG-VGGT.
+
+    python train.py --config=configs/tiny.py --workdir=runs/tiny
+
+Run the same command again to go on after an interruption. Any field of the configuration can be changed on the
+command line: --config.optimizer.learning_rate=5e-4.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax
+from absl import app, flags, logging
+from ml_collections import config_flags
+
+from logvggt_jax.training.config import TrainConfig
+from logvggt_jax.training.loop import NonFiniteTraining, train
+from logvggt_jax.training.sharding import data_mesh
+
+_CONFIG = config_flags.DEFINE_config_file("config", None, "File with the run's settings.", lock_config=True)
+_WORKDIR = flags.DEFINE_string("workdir", None, "Folder for checkpoints, the model and logs.")
+_RESUME_STEP = flags.DEFINE_integer("resume_step", None, "Checkpoint to go on from; the latest by default.")
+_CACHE = flags.DEFINE_string(
+    "compilation_cache", "~/.cache/logvggt-jax/xla", "Folder that keeps compiled programs; empty for none."
+)
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Settings, devices, training."""
+    if len(arguments) > 1:
+        raise app.UsageError(f"unknown argument {arguments[1]!r}; settings are given as --config.NAME=VALUE")
+    if flags.FLAGS["verbosity"].using_default_value:
+        # Orbax reports every file at absl's default level.
+        logging.set_verbosity(logging.WARNING)
+    if _CACHE.value:
+        jax.config.update("jax_compilation_cache_dir", str(Path(_CACHE.value).expanduser()))
+    try:
+        config = TrainConfig.from_dict(_CONFIG.value.to_dict())
+        train(config, Path(_WORKDIR.value), mesh=data_mesh(), resume_step=_RESUME_STEP.value)
+    except (ValueError, OSError, NonFiniteTraining) as error:
+        # Errors of settings, data and checkpoints say in one line what to mend; -v 1 shows where they arose.
+        if flags.FLAGS.verbosity > 0:
+            raise
+        sys.exit(f"train.py: {error}")
+
+
+def parse_flags(arguments: list[str]) -> list[str]:
+    """Flags as absl reads them, with an unknown configuration field as one line."""
+    try:
+        return app.parse_flags_with_usage(arguments)
+    except (AttributeError, KeyError, OSError) as error:
+        sys.exit(f"train.py: {' '.join(str(error).split())}")
+
+
+if __name__ == "__main__":
+    flags.mark_flags_as_required(["config", "workdir"])
+    app.run(main, flags_parser=parse_flags)
