@@ -18,11 +18,13 @@ from ml_collections import config_flags
 
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.loop import NonFiniteTraining, train
-from logvggt_jax.training.sharding import data_mesh
+from logvggt_jax.training.sharding import data_mesh, use_cpu_cores
 
 _CONFIG = config_flags.DEFINE_config_file("config", None, "File with the run's settings.", lock_config=True)
 _WORKDIR = flags.DEFINE_string("workdir", None, "Folder for checkpoints, the model and logs.")
-_RESUME_STEP = flags.DEFINE_integer("resume_step", None, "Checkpoint to go on from; the latest by default.")
+_RESUME_STEP = flags.DEFINE_integer(
+    "resume_step", None, "Checkpoint to go on from, dropping later ones; by default the latest."
+)
 _CACHE = flags.DEFINE_string(
     "compilation_cache", "~/.cache/logvggt-jax/xla", "Folder that keeps compiled programs; empty for none."
 )
@@ -32,13 +34,11 @@ def main(arguments: Sequence[str]) -> None:
     """Settings, devices, training."""
     if len(arguments) > 1:
         raise app.UsageError(f"unknown argument {arguments[1]!r}; settings are given as --config.NAME=VALUE")
-    if flags.FLAGS["verbosity"].using_default_value:
-        # Orbax reports every file at absl's default level.
-        logging.set_verbosity(logging.WARNING)
     if _CACHE.value:
         jax.config.update("jax_compilation_cache_dir", str(Path(_CACHE.value).expanduser()))
     try:
         config = TrainConfig.from_dict(_CONFIG.value.to_dict())
+        use_cpu_cores(config)
         train(config, Path(_WORKDIR.value), mesh=data_mesh(), resume_step=_RESUME_STEP.value)
     except (ValueError, OSError, NonFiniteTraining) as error:
         # Errors of settings, data and checkpoints say in one line what to mend; -v 1 shows where they arose.
@@ -50,9 +50,13 @@ def main(arguments: Sequence[str]) -> None:
 def parse_flags(arguments: list[str]) -> list[str]:
     """Flags as absl reads them, with an unknown configuration field as one line."""
     try:
-        return app.parse_flags_with_usage(arguments)
+        rest = app.parse_flags_with_usage(arguments)
     except (AttributeError, KeyError, OSError) as error:
         sys.exit(f"train.py: {' '.join(str(error).split())}")
+    if flags.FLAGS["verbosity"].using_default_value:
+        # Orbax reports every file at the level that absl's app would choose.
+        flags.FLAGS.verbosity = logging.WARNING
+    return rest
 
 
 if __name__ == "__main__":

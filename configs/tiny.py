@@ -26,7 +26,13 @@ def get_config() -> ConfigDict:
     config.model = {
         # 4 x 5 patches: the position embedding needs no more than a grid of 5.
         "encoder": {"embed_dim": 64, "depth": 2, "num_heads": 4, "position_grid": 5, "frozen": False},
-        "aggregator": {"depth": 4, "num_heads": 4, "key_layers": (0, 1, 2, 3), "layer_scale": 1.0},
+        "aggregator": {
+            "depth": 4,
+            "num_heads": 4,
+            "key_layers": (0, 1, 2, 3),
+            "layer_scale": 1.0,
+            "token_scale": 1.0,
+        },
         "camera_head": {
             "depth": 1,
             "num_heads": 4,
@@ -41,7 +47,7 @@ def get_config() -> ConfigDict:
     }
     config.loss = {
         "name": "log_vggt",
-        "camera_weight": 5.0,
+        "camera_weight": 10.0,
         "depth_weight": 1.0,
         "translation_weight": 1.0,
         "rotation_weight": 1.0,
@@ -50,14 +56,14 @@ def get_config() -> ConfigDict:
         "alpha": 0.2,
     }
     config.stages = {
-        "stage_1": _stage(steps=6000, clip_length=4, batch_size=8, strides=(1, 5)),
-        "stage_2": _stage(steps=1200, clip_length=12, batch_size=4, strides=(1, 2)),
+        "stage_1": _stage(steps=4600, clip_length=4, batch_size=8, strides=(1, 6)),
+        "stage_2": _stage(steps=950, clip_length=12, batch_size=4, strides=(1, 3)),
     }
     config.optimizer = {
         "learning_rate": 1e-3,
         "final_learning_rate": 0.0,
         "schedule": "linear_tail",
-        "warmup_fraction": 0.014,
+        "warmup_fraction": 0.02,
         "restart_each_stage": False,
         "b1": 0.9,
         "b2": 0.99,
@@ -65,9 +71,9 @@ def get_config() -> ConfigDict:
         "decay_all": False,
         "clip_norm": 1.0,
     }
-    rooms = {"height": HEIGHT, "width": WIDTH, "num_frames": 24, "style": "compass", "speed": (0.7, 1.3)}
+    rooms = {"height": HEIGHT, "width": WIDTH, "num_frames": 48, "style": "compass", "speed": (0.7, 1.3)}
     config.data = {
-        "sources": {"rooms": {"root": None, "split": "train", "options": {**rooms, "num_rooms": 1500}}},
+        "sources": {"rooms": {"root": None, "split": "train", "options": {**rooms, "num_rooms": 1200}}},
         "reverse": 0.5,
         "worker_count": 0,
         "num_threads": 1,
@@ -80,17 +86,17 @@ def get_config() -> ConfigDict:
             "split": "val",
             "options": {**rooms, "num_rooms": 16, "speed": 1.0},
         },
-        "every": 600,
+        "every": 500,
         "num_clips": 16,
         "clip_length": 12,
         "stride": 2,
         "size": (HEIGHT, WIDTH),
     }
     config.log_every = 50
-    config.save_every = 600
+    config.save_every = 500
     config.keep_checkpoints = 2
     config.max_skipped_in_a_row = 20
-    config.max_minutes = 30.0
+    config.max_minutes = None
     return config
 
 

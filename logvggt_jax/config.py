@@ -58,7 +58,9 @@ class AggregatorConfig:
     """Alternating frame and global attention; its width is the encoder's.
 
     The `key_layers` (0-based) are both the layers of cross-window attention and the depth head's taps.
-    `layer_scale` is the initial value of the residual branches' gains.
+    `layer_scale` is the initial value of the residual branches' gains, `token_scale` the standard deviation of the
+    initial camera and register tokens. VGGT's 1e-6 suits pre-trained weights; from nothing, a LayerNorm turns it
+    into gradients thousands of times too large.
     """
 
     depth: int = 24
@@ -68,6 +70,7 @@ class AggregatorConfig:
     rope_base: float = 100.0
     key_layers: tuple[int, ...] = (4, 11, 17, 23)
     layer_scale: float = 0.01
+    token_scale: float = 1e-6
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "key_layers", tuple(self.key_layers))

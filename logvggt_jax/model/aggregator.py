@@ -94,7 +94,7 @@ class Aggregator(nn.Module):
 
     def _special_tokens(self, starts_sequence: jax.Array, batch: int, frames: int, width: int) -> jax.Array:
         """Camera and register tokens [B, K, 5, C]: copy 0 for the sequence's first frame, copy 1 for others."""
-        initial = normal(1e-6)
+        initial = normal(self.config.aggregator.token_scale)
         camera = self.param("camera_token", initial, (1, 2, 1, width))
         shape = (1, 2, self.config.aggregator.num_registers, width)
         register = self.param("register_token", initial, shape)

@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from logvggt_jax.config import DPTConfig
+from logvggt_jax.model.convolution import Convolution
 from logvggt_jax.model.initializers import constant, normal
-from logvggt_jax.model.layers import Convolution, layer_norm
+from logvggt_jax.model.layers import layer_norm
 
 
 class DPTHead(nn.Module):

@@ -30,7 +30,7 @@ class GCCR(nn.Module):
         context = layer_norm(1e-5, "register_norm")(registers)
 
         def heads(tokens: jax.Array, name: str) -> jax.Array:
-            projected = dense(width, name, self.dtype)(tokens)
+            projected = dense(width, name, self.dtype)(tokens).astype(self.dtype)
             return projected.reshape(*tokens.shape[:2], self.num_heads, width // self.num_heads)
 
         out = attention(

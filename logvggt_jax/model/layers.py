@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import flax.linen as nn
@@ -12,61 +13,17 @@ from logvggt_jax.model.attention import attention
 from logvggt_jax.model.initializers import constant, fan_in_normal
 from logvggt_jax.model.rope import RopeTable, apply_rope
 
-# Neighbourhoods of more channels than this would cost more memory than they save time.
-_GATHERED_CHANNELS = 1024
-
 
 def dense(features: int, name: str, dtype: str = "float32", *, kernel_init: Any = fan_in_normal) -> nn.Dense:
-    """Linear layer with a float32 kernel and products in `dtype`."""
-    return nn.Dense(features, dtype=dtype, kernel_init=kernel_init, bias_init=constant(0.0), name=name)
-
-
-class Convolution(nn.Module):
-    """Square convolution [N, H, W, C] -> [N, H / strides, W / strides, features], padded so that stride 1 keeps
-    the size ("SAME" would pad strided ones on one side only).
-
-    XLA's CPU compiler turns the gradient of a convolution into matrix products only outside of loops; within the
-    scan over windows it falls back to scalar code, 12 times slower. On CPUs, convolutions of few channels are
-    therefore products over gathered neighbourhoods from the start.
-    """
-
-    features: int
-    size: int
-    dtype: str
-    strides: int = 1
-    use_bias: bool = True
-
-    @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
-        size, channels, dtype = self.size, x.shape[-1], jnp.dtype(self.dtype)
-        kernel = self.param("kernel", fan_in_normal, (size, size, channels, self.features)).astype(dtype)
-        x = x.astype(dtype)
-        if size == 1:
-            y = x @ kernel[0, 0]
-        elif jax.default_backend() == "cpu" and size * size * channels <= _GATHERED_CHANNELS:
-            y = self._gathered(x, kernel)
-        else:
-            margin = (size - 1) // 2
-            y = jax.lax.conv_general_dilated(
-                x,
-                kernel,
-                (self.strides, self.strides),
-                ((margin, margin), (margin, margin)),
-                dimension_numbers=("NHWC", "HWIO", "NHWC"),
-            )
-        if self.use_bias:
-            y = y + self.param("bias", constant(0.0), (self.features,)).astype(dtype)
-        return y
-
-    def _gathered(self, x: jax.Array, kernel: jax.Array) -> jax.Array:
-        """A matrix product for each row of the kernel, over columns gathered side by side."""
-        size, strides, margin = self.size, self.strides, (self.size - 1) // 2
-        height, width = x.shape[1], x.shape[2]
-        padded = jnp.pad(x, ((0, 0), (margin, margin), (margin, margin), (0, 0)))
-        columns = [padded[:, :, j : j + width : strides] for j in range(size)]
-        gathered = jnp.concatenate(columns, axis=-1)
-        rows = kernel.reshape(size, -1, self.features)
-        return sum(gathered[:, i : i + height : strides] @ rows[i] for i in range(size))
+    """Linear layer with a float32 kernel, products in `dtype` and sums in float32, unrounded."""
+    return nn.Dense(
+        features,
+        dtype=dtype,
+        dot_general=functools.partial(jax.lax.dot_general, preferred_element_type=jnp.float32),
+        kernel_init=kernel_init,
+        bias_init=constant(0.0),
+        name=name,
+    )
 
 
 def layer_norm(epsilon: float, name: str, *, affine: bool = True) -> nn.LayerNorm:
@@ -137,7 +94,7 @@ class Attention(nn.Module):
         out = attention(
             query.astype(self.dtype),
             key.astype(self.dtype),
-            value,
+            value.astype(self.dtype),
             key_valid,
             implementation=self.implementation,
         )

@@ -120,15 +120,16 @@ class LogVGGT:
         remat: bool = False,
     ) -> WindowOutput:
         """All windows of sequences [B, T, H, W, 3] as one scan; the outputs of `apply` short of the poses."""
-        frame_mask = self._mask(images, frame_mask)
+        self._mask(images, frame_mask)
         num_frames, stride, overlap = images.shape[1], self.config.windows.stride, self._overlap
 
         def frames_from(first: jax.Array | int, count: int) -> tuple[jax.Array, jax.Array]:
             # A short tail repeats the last frame, masked, instead of padding a copy of all images.
             index = first + jnp.arange(count)
             clipped = jnp.minimum(index, num_frames - 1)
-            inside = index < num_frames
-            return jnp.take(images, clipped, axis=1), jnp.take(frame_mask, clipped, axis=1) & inside
+            frames = jnp.take(images, clipped, axis=1)
+            mask = jnp.broadcast_to(index < num_frames, frames.shape[:2])
+            return frames, mask if frame_mask is None else mask & jnp.take(frame_mask, clipped, axis=1)
 
         def advance(state: WindowState, window: jax.Array) -> tuple[WindowState, WindowOutput]:
             frames, mask = frames_from(window * stride + overlap, stride)

@@ -78,6 +78,8 @@ class RunCheckpoints:
     def restore(self, like: TrainState, *, step: int | None = None) -> tuple[TrainState, Position]:
         """The state at `step` (None: the latest), with the shapes and placement of `like`.
 
+        Checkpoints of later steps are removed: the run that goes on from here will write its own.
+
         Raises:
           ValueError: No such checkpoint, one of another configuration, or a damaged one; names the step, the
             path and the other steps there are.
@@ -107,6 +109,9 @@ class RunCheckpoints:
                 verify_digests(restored[part], meta["digests"][part], where)
         except ValueError as error:
             raise ValueError(f"{error}; {mend}") from error
+        for later in steps:
+            if later > chosen:
+                self._manager.delete(later)
         return TrainState(params=restored["params"], **restored["state"]), Position(meta["stage"], restored["data"])
 
     def _read(self, step: int, args: Any, where: str, mend: str) -> Mapping[str, Any]:

@@ -61,7 +61,7 @@ def train(config: TrainConfig, workdir: Path, *, mesh: Mesh, resume_step: int | 
         datasets = open_sources(config.data)
         console = Console(quiet=jax.process_index() != 0)
         with MetricsLog(workdir, first_step=first, console=console) as log:
-            log.say(f"{jax.device_count()} devices, {first}/{config.total_steps} steps done, results in {workdir}")
+            log.say(f"{mesh.size} devices, {first}/{config.total_steps} steps done, results in {workdir}")
             run.train(datasets, position, log, stop)
     return run.state
 

@@ -41,7 +41,7 @@ def apply_updates(params: Any, directions: Any, learning_rate: jax.Array) -> Any
 
 def module_norms(gradients: Any) -> dict[str, jax.Array]:
     """l2 norm of each module's gradient."""
-    return {module: optax.global_norm(tree) for module, tree in gradients.items()}
+    return {module: optax.tree.norm(tree) for module, tree in gradients.items()}
 
 
 def _schedule(config: OptimizerConfig, steps: int) -> optax.Schedule:

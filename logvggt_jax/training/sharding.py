@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import os
 from collections.abc import Mapping
 
 import jax
@@ -9,7 +11,7 @@ import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
-from logvggt_jax.training.config import StageConfig
+from logvggt_jax.training.config import StageConfig, TrainConfig
 
 DATA_AXIS = "data"
 
@@ -18,6 +20,17 @@ def data_mesh(num_devices: int | None = None) -> Mesh:
     """A one-dimensional mesh over the first `num_devices` devices, all by default."""
     devices = jax.devices()[:num_devices]
     return jax.make_mesh((len(devices),), (DATA_AXIS,), axis_types=(AxisType.Auto,), devices=devices)
+
+
+def use_cpu_cores(config: TrainConfig) -> None:
+    """Makes devices of a CPU's cores, as many as the batches of all stages split over; before JAX's first use.
+
+    One core computes a step of a small model; data parallelism puts the others to work. Accelerators are not
+    affected.
+    """
+    common = math.gcd(*(stage.batch_size for stage in config.stages))
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    jax.config.update("jax_num_cpu_devices", max(n for n in range(1, cores + 1) if common % n == 0))
 
 
 def replicated(mesh: Mesh) -> NamedSharding:

@@ -29,7 +29,7 @@ def gradient(config: ModelConfig, remat: bool):
         terms = (jnp.sin(out.pose_encodings), jnp.log(out.depth), jnp.log(out.depth_confidence))
         return sum((term * frame_weights.reshape(1, -1, *(1,) * (term.ndim - 2))).sum() for term in terms)
 
-    return jax.jit(jax.grad(loss, argnums=(0, 1)))
+    return jax.jit(jax.grad(loss))
 
 
 def norms(tree) -> dict[str, float]:
@@ -38,48 +38,47 @@ def norms(tree) -> dict[str, float]:
 
 
 def test_gradients_reach_what_is_trained_and_nothing_else(small_config, small_variables):
-    grads, _ = gradient(small_config, False)(small_variables, video(), np.ones(FRAMES, np.float32))
+    grads = gradient(small_config, False)(small_variables, video(), np.ones(FRAMES, np.float32))
     for name, norm in norms(grads["params"]).items():
         assert np.isfinite(norm)
         assert (norm == 0) == name.startswith("['encoder']"), name
 
 
-def test_a_thawed_encoder_is_trained(small_config, small_variables):
-    config = dataclasses.replace(small_config, encoder=dataclasses.replace(small_config.encoder, frozen=False))
-    grads, _ = gradient(config, False)(small_variables, video(), np.ones(FRAMES, np.float32))
-    silent = {name for name, norm in norms(grads["params"]).items() if norm == 0}
+def thawed(config: ModelConfig) -> ModelConfig:
+    return dataclasses.replace(config, encoder=dataclasses.replace(config.encoder, frozen=False))
+
+
+def test_a_thawed_encoder_is_trained_and_rematerialisation_changes_no_gradient(small_config, small_variables):
+    arguments = small_variables, video(), np.ones(FRAMES, np.float32)
+    plain = gradient(small_config, False)(*arguments)["params"]
+    again = gradient(thawed(small_config), True)(*arguments)["params"]
+    silent = {name for name, norm in norms(again).items() if norm == 0}
     assert silent == {"['encoder']['mask_token']"}
+    for part in set(plain) - {"encoder"}:
+        jax.tree.map(
+            lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3 * np.abs(a).max()),
+            plain[part],
+            again[part],
+        )
 
 
 def test_gradients_flow_through_the_cache(small_config, small_variables):
-    """A loss on the last two frames depends on frame 0, which only the cache connects with them."""
-    config = dataclasses.replace(
-        small_config,
-        encoder=dataclasses.replace(small_config.encoder, frozen=False),
-        refinement=dataclasses.replace(small_config.refinement, enabled=False, context=2),
-    )
-    weights = np.zeros(8, np.float32)
-    weights[-2:] = 1.0
-    _, images = gradient(config, True)(small_variables, video(8), weights)
+    """A loss on the depth of the last frames depends on frame 1, which only the cache connects with them."""
+    model = LogVGGT(thawed(small_config))
+
+    def loss(images):
+        return jnp.log(model.run_windows(small_variables, images, remat=True).depth)[:, -2:].sum()
+
+    images = jax.jit(jax.grad(loss))(video(8))
     assert np.linalg.norm(images[0, 1]) > 0
-    cut = dataclasses.replace(config, windows=dataclasses.replace(config.windows, cross_window=False))
-    _, images = gradient(cut, True)(small_variables, video(8), weights)
-    assert np.linalg.norm(images[0, 1]) == 0
 
 
-def test_rematerialisation_changes_no_gradient(small_config, small_variables):
-    arguments = small_variables, video(), np.ones(FRAMES, np.float32)
-    plain, again = gradient(small_config, False)(*arguments), gradient(small_config, True)(*arguments)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3), plain[0], again[0])
-
-
-def test_bfloat16_stays_close_to_float32(small_config):
-    """At initial values with a usual LayerScale; norm of the difference over norm of the reference."""
-    sizes = dataclasses.replace(small_config.aggregator, layer_scale=0.1)
-    model = LogVGGT(dataclasses.replace(small_config, aggregator=sizes))
-    variables = model.init(jax.random.key(0), video())
-    half = LogVGGT(dataclasses.replace(model.config, dtype="bfloat16"))
-    expected, actual = jax.jit(model.apply)(variables, video()), jax.jit(half.apply)(variables, video())
+def test_bfloat16_stays_close_to_float32(small_config, small_variables):
+    """Norm of the difference over norm of the reference."""
+    model = LogVGGT(small_config)
+    half = LogVGGT(dataclasses.replace(small_config, dtype="bfloat16"))
+    expected = jax.jit(model.apply)(small_variables, video())
+    actual = jax.jit(half.apply)(small_variables, video())
     for name in ("camera_tokens", "register_tokens", "depth", "depth_confidence", "pose_encodings"):
         a, b = np.asarray(getattr(actual, name)), np.asarray(getattr(expected, name))
         assert a.dtype == np.float32

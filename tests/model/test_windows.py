@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ from logvggt_jax.model.windows import first_window, kept_window, num_windows
 
 HEIGHT, WIDTH = 28, 42
 MAX_FRAMES = 13
-WINDOWS = [(4, 2), (4, 1), (4, 3), (2, 1), (5, 2)]
+WINDOWS = [(4, 2), (4, 1), (5, 3)]
 
 
 def with_windows(config: ModelConfig, size: int, stride: int, **options) -> LogVGGT:
@@ -40,7 +41,7 @@ def padded_groups(images: np.ndarray, model: LogVGGT):
     rubbish[:, :num_frames] = images
     mask = np.broadcast_to(np.arange(total) < num_frames, (images.shape[0], total))
     bounds = [0, *range(overlap, total + 1, stride)]
-    return [(rubbish[:, a:b], mask[:, a:b]) for a, b in zip(bounds, bounds[1:], strict=False)]
+    return [(rubbish[:, a:b], mask[:, a:b]) for a, b in itertools.pairwise(bounds)]
 
 
 @functools.lru_cache
@@ -109,7 +110,7 @@ def test_streaming_equals_batch(small_config, small_variables, size, stride):
         close(poses[0], batch.pose_encodings[item, :length])
 
 
-@pytest.mark.parametrize(("size", "stride", "lengths"), [(4, 2, (9, 1, 4, 6)), (5, 2, (8, 5)), (4, 3, (7, 2))])
+@pytest.mark.parametrize(("size", "stride", "lengths"), [(4, 2, (9, 4)), (4, 3, (7, 2))])
 def test_unequal_lengths_equal_items_one_by_one(small_config, small_variables, size, stride, lengths):
     model = with_windows(small_config, size, stride)
     apply = jax.jit(model.apply)
@@ -197,7 +198,7 @@ def test_attention_mixes_patches_and_frames(small_config, small_variables):
 def test_one_window_of_any_size_is_the_same(small_config, small_variables):
     """T <= K: cache, stride and K play no part, so plain VGGT over the T frames is all that happens."""
     config = without_refinement(small_config)
-    for num_frames in (1, 2, 3, 4):
+    for num_frames in (1, 3):
         images = video(num_frames)
         reference = jax.jit(with_windows(config, max(num_frames, 2), 1, cross_window=False).apply)(
             small_variables, images

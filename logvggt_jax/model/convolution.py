@@ -1,0 +1,79 @@
+"""Square convolutions whose gradients stay fast inside loops on CPUs.
+
+XLA's CPU compiler brings convolutions into the one form that it has a fast kernel for, but only outside of loops:
+within the scan over windows a kernel's gradient falls back to scalar code, more than ten times slower. There the
+gradients are written in forms that need no rewriting.
+"""
+
+from __future__ import annotations
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from logvggt_jax.model.initializers import constant, fan_in_normal
+
+
+class Convolution(nn.Module):
+    """[N, H, W, C] -> [N, ⌈H / strides⌉, ⌈W / strides⌉, features], `size` odd.
+
+    Padding is explicit: "SAME" pads strided convolutions on one side only.
+    """
+
+    features: int
+    size: int
+    dtype: str
+    strides: int = 1
+    use_bias: bool = True
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        size, channels, dtype = self.size, x.shape[-1], jnp.dtype(self.dtype)
+        kernel = self.param("kernel", fan_in_normal, (size, size, channels, self.features)).astype(dtype)
+        x = x.astype(dtype)
+        if size == 1:
+            y = x @ kernel[0, 0]
+        elif self.strides == 1 and jax.default_backend() == "cpu":
+            # The sum makes the kernel vary over devices as x does, for shard_map's sake.
+            y = _looped_convolution(x, kernel + jnp.zeros_like(x, shape=kernel.shape))
+        else:
+            y = _convolve(x, kernel, self.strides)
+        if self.use_bias:
+            y = y + self.param("bias", constant(0.0), (self.features,)).astype(dtype)
+        return y
+
+
+def _convolve(x: jax.Array, kernel: jax.Array, strides: int) -> jax.Array:
+    margin = (kernel.shape[0] - 1) // 2
+    return jax.lax.conv_general_dilated(
+        x,
+        kernel,
+        (strides, strides),
+        ((margin, margin), (margin, margin)),
+        dimension_numbers=("NHWC", "HWIO", "NHWC"),
+    )
+
+
+@jax.custom_vjp
+def _looped_convolution(x: jax.Array, kernel: jax.Array) -> jax.Array:
+    """Convolution of stride 1: [N, H, W, C], [k, k, C, F] -> [N, H, W, F]."""
+    return _convolve(x, kernel, 1)
+
+
+def _forward(x: jax.Array, kernel: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+    return _looped_convolution(x, kernel), (x, kernel)
+
+
+def _backward(saved: tuple[jax.Array, jax.Array], gradient: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """To the input: a convolution with the mirrored kernel. To the kernel: a product for each of its places."""
+    x, kernel = saved
+    size, (height, width) = kernel.shape[0], x.shape[1:3]
+    x_gradient = _convolve(gradient, jnp.swapaxes(kernel[::-1, ::-1], 2, 3), 1)
+    margin = (size - 1) // 2
+    padded = jnp.pad(x, ((0, 0), (margin, margin), (margin, margin), (0, 0)))
+    shifted = [padded[:, i : i + height, j : j + width] for i in range(size) for j in range(size)]
+    kernel_gradient = jnp.einsum("nhwc,nhwf->cf", jnp.concatenate(shifted, axis=-1), gradient)
+    return x_gradient, kernel_gradient.reshape(kernel.shape)
+
+
+_looped_convolution.defvjp(_forward, _backward)

@@ -1,0 +1,218 @@
+"""Runs: interrupted ones end like uninterrupted ones; damaged or foreign checkpoints are refused by name."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import shutil
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from logvggt_jax.training import loop
+from logvggt_jax.training.checkpoints import Position, RunCheckpoints
+from logvggt_jax.training.config import SourceConfig, TrainConfig, ValidationConfig
+from logvggt_jax.training.interruption import StopRequest
+from logvggt_jax.training.loop import NonFiniteTraining, train
+from logvggt_jax.training.metrics_log import MetricsLog, read_metrics
+from logvggt_jax.training.sharding import data_mesh
+from logvggt_jax.training.state import TrainState
+from logvggt_jax.weights.checkpoints import digests, load_model
+
+UNTIMED = ("time", "frames_per_second")
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch, pixel_model: Any, pixel_params: Any) -> None:
+    """Runs use the model that compiles at once."""
+    _use(monkeypatch, pixel_model, pixel_params)
+
+
+@pytest.fixture(scope="module")
+def straight(
+    run_config: TrainConfig, pixel_model: Any, pixel_params: Any, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[TrainState, Path]:
+    """A run that nothing interrupts, on two devices: its last state and its folder."""
+    workdir = tmp_path_factory.mktemp("straight")
+    with pytest.MonkeyPatch.context() as patch:
+        _use(patch, pixel_model, pixel_params)
+        return train(run_config, workdir, mesh=data_mesh(2)), workdir
+
+
+@pytest.fixture
+def finished(straight: tuple[TrainState, Path], tmp_path: Path) -> Path:
+    """A copy of the uninterrupted run's folder."""
+    return Path(shutil.copytree(straight[1], tmp_path / "finished"))
+
+
+def _use(patch: pytest.MonkeyPatch, model: Any, params: Any) -> None:
+    patch.setattr(loop, "LogVGGT", lambda _: model)
+    patch.setattr(loop, "initial_parameters", lambda *_, **__: jax.tree.map(jnp.array, params))
+
+
+def _at_step(monkeypatch: pytest.MonkeyPatch, step: int, action: Callable[[], None]) -> None:
+    """Does `action` when the metrics of `step` are written."""
+    write = MetricsLog.write
+
+    def intercept(log: MetricsLog, at: int, values: dict[str, float]) -> None:
+        write(log, at, values)
+        if at == step:
+            action()
+
+    monkeypatch.setattr(MetricsLog, "write", intercept)
+
+
+def _crash() -> None:
+    raise KeyError("crash")
+
+
+def _numbers(workdir: Path) -> list[dict[str, Any]]:
+    entries = read_metrics(workdir / "metrics.jsonl")
+    return [{name: value for name, value in entry.items() if name not in UNTIMED} for entry in entries]
+
+
+def _same(a: TrainState, b: TrainState) -> None:
+    jax.tree.map(np.testing.assert_array_equal, jax.device_get(a), jax.device_get(b))
+
+
+# In the middle of a stage, and just after the next one has begun.
+@pytest.mark.parametrize("kill_at", [4, 5])
+@pytest.mark.usefixtures("quick")
+def test_killed_run_goes_on_to_the_same_numbers(
+    run_config: TrainConfig, straight: tuple[TrainState, Path], tmp_path: Path, kill_at: int
+) -> None:
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyError, match="crash"):
+        _at_step(patch, kill_at, _crash)
+        train(run_config, tmp_path, mesh=data_mesh(2))
+    _same(train(run_config, tmp_path, mesh=data_mesh(2)), straight[0])
+    assert _numbers(tmp_path) == _numbers(straight[1])
+    assert [entry["step"] for entry in _numbers(tmp_path)] == [1, 2, 3, 4, 5, 6]
+
+
+@pytest.mark.usefixtures("quick")
+def test_sigterm_saves_ends_cleanly_and_can_be_resumed(
+    run_config: TrainConfig, straight: tuple[TrainState, Path], tmp_path: Path
+) -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.MonkeyPatch.context() as patch:
+        _at_step(patch, 1, lambda: os.kill(os.getpid(), signal.SIGTERM))
+        stopped = train(run_config, tmp_path, mesh=data_mesh(2))
+    assert 1 <= int(stopped.step) <= 2
+    assert signal.getsignal(signal.SIGTERM) == before
+    with RunCheckpoints(tmp_path, run_config) as checkpoints:
+        assert checkpoints.steps == [int(stopped.step)]
+    _same(train(run_config, tmp_path, mesh=data_mesh(2)), straight[0])
+
+
+def test_second_ctrl_c_is_not_held_back() -> None:
+    with StopRequest() as stop:
+        os.kill(os.getpid(), signal.SIGINT)
+        assert stop.reason == "SIGINT"
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+
+
+@pytest.mark.usefixtures("quick")
+def test_number_of_devices_may_change(
+    run_config: TrainConfig, straight: tuple[TrainState, Path], finished: Path
+) -> None:
+    state = train(run_config, finished, mesh=data_mesh(1), resume_step=4)
+    assert int(state.step) == 6
+    assert len(state.step.devices()) == 1
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4), state.params, straight[0].params)
+
+
+@pytest.mark.usefixtures("quick")
+def test_time_limit_ends_the_run_with_a_checkpoint(run_config: TrainConfig, tmp_path: Path) -> None:
+    limited = dataclasses.replace(run_config, max_minutes=1e-9)
+    # The limit belongs to a session, not to the run: each one gets a step further.
+    assert int(train(limited, tmp_path, mesh=data_mesh(1)).step) == 1
+    assert int(train(limited, tmp_path, mesh=data_mesh(1)).step) == 2
+
+
+@pytest.mark.usefixtures("quick")
+def test_finished_run_is_left_alone(run_config: TrainConfig, straight: tuple[TrainState, Path], finished: Path) -> None:
+    _same(train(run_config, finished, mesh=data_mesh(2)), straight[0])
+    assert _numbers(finished) == _numbers(straight[1])
+
+
+@pytest.mark.usefixtures("quick")
+def test_damaged_checkpoint_is_named_with_the_way_out(
+    run_config: TrainConfig, straight: tuple[TrainState, Path], finished: Path
+) -> None:
+    files = [path for path in (finished / "checkpoints" / "6" / "params").rglob("*") if path.is_file()]
+    largest = max(files, key=lambda path: path.stat().st_size)
+    largest.write_bytes(largest.read_bytes()[: largest.stat().st_size // 2])
+    with pytest.raises(ValueError, match=r"step 6 in .*checkpoints/6.*--resume_step \(there are \[4\]\)") as error:
+        train(run_config, finished, mesh=data_mesh(2))
+    assert "\n" not in str(error.value)
+    _same(train(run_config, finished, mesh=data_mesh(2), resume_step=4), straight[0])
+
+
+@pytest.mark.usefixtures("quick")
+def test_changed_leaf_is_refused_by_its_digest(
+    run_config: TrainConfig, straight: tuple[TrainState, Path], tmp_path: Path
+) -> None:
+    state = straight[0]
+    true = digests(state.params)
+    with RunCheckpoints(tmp_path, run_config) as checkpoints, pytest.MonkeyPatch.context() as patch:
+        # What Orbax stores differs from what was digested, as after a flipped byte.
+        patch.setattr("logvggt_jax.training.checkpoints.digests", lambda tree: true)
+        wrong = {**state.params, "camera_head": jax.tree.map(lambda x: x + 1, state.params["camera_head"])}
+        checkpoints.save(state._replace(params=wrong), Position(1, {}))
+        with pytest.raises(ValueError, match=r"step 6 .*leaf camera_head/bias differs from its digest"):
+            checkpoints.restore(state)
+
+
+@pytest.mark.usefixtures("quick")
+def test_checkpoint_of_another_configuration_is_refused(run_config: TrainConfig, finished: Path) -> None:
+    other = dataclasses.replace(run_config, loss=dataclasses.replace(run_config.loss, alpha=0.5))
+    with pytest.raises(ValueError, match=r"was written with loss\.alpha=0\.2, the configuration says 0\.5"):
+        train(other, finished, mesh=data_mesh(1))
+
+
+@pytest.mark.usefixtures("quick")
+def test_resume_step_that_does_not_exist_is_refused(run_config: TrainConfig, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="no checkpoint of step 5; there are none"):
+        train(run_config, tmp_path, mesh=data_mesh(1), resume_step=5)
+
+
+@pytest.mark.usefixtures("quick")
+def test_endless_non_finite_updates_stop_the_run(
+    run_config: TrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pixel_params: Any
+) -> None:
+    broken = {**pixel_params, "depth_head": jax.tree.map(lambda x: x * np.nan, pixel_params["depth_head"])}
+    monkeypatch.setattr(loop, "initial_parameters", lambda *_, **__: jax.tree.map(jnp.array, broken))
+    with pytest.raises(NonFiniteTraining, match="step 2: 2 updates in a row had a non-finite loss or gradient"):
+        train(run_config, tmp_path, mesh=data_mesh(1))
+
+
+@pytest.mark.usefixtures("quick")
+def test_validation_reports_held_out_clips(run_config: TrainConfig, tmp_path: Path) -> None:
+    source = SourceConfig(name="rooms", root=None, split="val", options=run_config.data.sources[0].options)
+    validation = ValidationConfig(source=source, every=4, num_clips=4, clip_length=3, stride=2, size=(28, 42))
+    train(dataclasses.replace(run_config, validation=validation), tmp_path, mesh=data_mesh(2))
+    entries = [entry for entry in _numbers(tmp_path) if "validation/abs_rel" in entry]
+    assert [entry["step"] for entry in entries] == [4, 6]
+    for entry in entries:
+        assert 0 < entry["validation/abs_rel"] < 2
+        assert entry["validation/rotation_over_identity"] == pytest.approx(
+            entry["validation/rotation"] / entry["validation/identity_rotation"]
+        )
+
+
+@pytest.mark.slow
+def test_real_model_trains_and_leaves_a_model_folder(run_config: TrainConfig, tmp_path: Path) -> None:
+    state = train(run_config, tmp_path, mesh=data_mesh(1))
+    model, variables = load_model(tmp_path / "model")
+    assert model.config == run_config.model
+    jax.tree.map(np.testing.assert_array_equal, variables["params"], jax.device_get(state.params))
+    losses = [entry["loss/total"] for entry in _numbers(tmp_path)]
+    assert all(np.isfinite(losses))
+    assert losses[-1] < losses[0]

@@ -1,0 +1,36 @@
+"""The metrics file: one line a step, readable after a crash, continued without duplicates."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.console import Console
+
+from logvggt_jax.training.metrics_log import FILE_NAME, MetricsLog, read_metrics
+
+
+def _log(workdir: Path, first_step: int) -> MetricsLog:
+    return MetricsLog(workdir, first_step=first_step, console=Console(quiet=True))
+
+
+def test_lines_hold_what_was_written(tmp_path: Path) -> None:
+    with _log(tmp_path, 0) as log:
+        log.write(1, {"loss": 0.5, "bad": float("nan")})
+    (entry,) = read_metrics(tmp_path / FILE_NAME)
+    assert entry["step"] == 1
+    assert entry["loss"] == 0.5
+    assert entry["bad"] is None
+    assert list((tmp_path / "tensorboard").iterdir())
+
+
+def test_resumed_run_replaces_later_lines_and_an_unfinished_one(tmp_path: Path) -> None:
+    with _log(tmp_path, 0) as log:
+        for step in range(1, 6):
+            log.write(step, {"loss": float(step)})
+    with (tmp_path / FILE_NAME).open("a") as file:
+        file.write('{"step": 6, "lo')
+    with _log(tmp_path, 3) as log:
+        log.write(4, {"loss": 40.0})
+    entries = read_metrics(tmp_path / FILE_NAME)
+    assert [(entry["step"], entry["loss"]) for entry in entries] == [(1, 1.0), (2, 2.0), (3, 3.0), (4, 40.0)]
+    assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []

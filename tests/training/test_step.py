@@ -1,0 +1,190 @@
+"""The training step: the same on one device and on many, safe against non-finite numbers, traced once."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.sharding import Mesh
+from jax.sharding import PartitionSpec as P
+
+from logvggt_jax import LogVGGT, ModelConfig
+from logvggt_jax.training.config import LossConfig, OptimizerConfig, StageConfig
+from logvggt_jax.training.optimizer import learning_rate_schedule, make_optimizer
+from logvggt_jax.training.sharding import check_batch_size, data_mesh, put_batch, replicated
+from logvggt_jax.training.state import initial_state
+from logvggt_jax.training.step import CompiledSteps, make_loss, make_train_step
+
+Clips = dict[str, np.ndarray]
+STAGES = (StageConfig("only", 8, 5, 8, 1, 1, ((28, 42),)),)
+
+
+def _gradients(model: Any, config: LossConfig, mesh: Mesh, params: Any, clips: Clips) -> tuple[Any, Any]:
+    loss = make_loss(model, config)
+
+    def value_and_gradients(params: Any, batch: Any) -> Any:
+        return jax.value_and_grad(loss, has_aux=True)(params, batch)
+
+    sharded = jax.shard_map(value_and_gradients, mesh=mesh, in_specs=(P(), P("data")), out_specs=(P(), P()))
+    (_, metrics), gradients = jax.jit(sharded)(jax.device_put(params, replicated(mesh)), put_batch(clips, mesh))
+    return jax.device_get(metrics), jax.device_get(gradients)
+
+
+def _start(model: Any, config: LossConfig, optimizer_config: OptimizerConfig, mesh: Mesh, params: Any) -> Any:
+    optimizer = make_optimizer(optimizer_config, params, frozen=("encoder",))
+    schedule = learning_rate_schedule(optimizer_config, STAGES)
+    step = make_train_step(make_loss(model, config), optimizer, schedule, mesh)
+    # A copy: the state is donated.
+    state = initial_state(jax.tree.map(jnp.array, params), optimizer)
+    return step, jax.device_put(state, replicated(mesh))
+
+
+def test_gradient_on_many_devices_is_that_on_one(
+    pixel_model: Any, loss_config: LossConfig, pixel_params: Any, clips: Clips
+) -> None:
+    one = _gradients(pixel_model, loss_config, data_mesh(1), pixel_params, clips)
+    for devices in (2, 8):
+        many = _gradients(pixel_model, loss_config, data_mesh(devices), pixel_params, clips)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-5, atol=1e-6), many, one)
+    assert all(np.abs(leaf).max() > 1e-3 for leaf in jax.tree.leaves(one[1]["camera_head"]))
+
+
+def test_loss_is_the_mean_over_all_valid_pixels(
+    pixel_model: Any, loss_config: LossConfig, pixel_params: Any, clips: Clips
+) -> None:
+    # The mean of the devices' own means would be another number: their shares of valid pixels differ.
+    whole, _ = _gradients(pixel_model, loss_config, data_mesh(8), pixel_params, clips)
+    alone = [
+        _gradients(pixel_model, loss_config, data_mesh(1), pixel_params, {k: v[i : i + 1] for k, v in clips.items()})[0]
+        for i in (0, 7)
+    ]
+    pair = {key: np.concatenate([value[:1], value[7:]]) for key, value in clips.items()}
+    both, _ = _gradients(pixel_model, loss_config, data_mesh(2), pixel_params, pair)
+    mean = np.mean([metrics["loss/depth_error"] for metrics in alone])
+    assert abs(both["loss/depth_error"] - mean) > 1e-2 * mean
+    assert np.isfinite(whole["loss/total"])
+
+
+def test_total_is_the_weighted_sum_of_its_terms(
+    pixel_model: Any, loss_config: LossConfig, pixel_params: Any, clips: Clips
+) -> None:
+    config = dataclasses.replace(loss_config, camera_weight=5.0, depth_weight=2.0)
+    metrics, _ = _gradients(pixel_model, config, data_mesh(1), pixel_params, clips)
+    depth = metrics["loss/depth_error"] + metrics["loss/depth_gradient"] + metrics["loss/depth_confidence"]
+    assert metrics["loss/total"] == pytest.approx(5.0 * metrics["loss/camera"] + 2.0 * depth, rel=1e-5)
+
+
+def test_released_trainers_losses_are_an_option(
+    pixel_model: Any, loss_config: LossConfig, pixel_params: Any, clips: Clips
+) -> None:
+    config = dataclasses.replace(loss_config, name="vggt", quantile=0.98, camera_weight=5.0)
+    metrics, gradients = _gradients(pixel_model, config, data_mesh(2), pixel_params, clips)
+    terms = {name for name in metrics if name.startswith("loss/")}
+    assert {"loss/camera_rotation", "loss/depth_regression"} <= terms
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
+
+
+def test_steps_learn_and_are_traced_once(
+    pixel_model: Any, loss_config: LossConfig, optimizer_config: OptimizerConfig, pixel_params: Any, clips: Clips
+) -> None:
+    mesh = data_mesh(4)
+    traces = 0
+    loss = make_loss(pixel_model, loss_config)
+
+    def counted(params: Any, batch: Any) -> Any:
+        nonlocal traces
+        traces += 1
+        return loss(params, batch)
+
+    optimizer = make_optimizer(optimizer_config, pixel_params, frozen=("encoder",))
+    step = make_train_step(counted, optimizer, learning_rate_schedule(optimizer_config, STAGES), mesh)
+    state = jax.device_put(initial_state(jax.tree.map(jnp.array, pixel_params), optimizer), replicated(mesh))
+    losses, kinds = [], jax.tree.map(lambda x: (x.shape, x.dtype, x.weak_type), state)
+    for _ in range(6):
+        state, metrics = step(state, put_batch(clips, mesh))
+        losses.append(float(metrics["loss/total"]))
+    assert traces == 1
+    assert jax.tree.map(lambda x: (x.shape, x.dtype, x.weak_type), state) == kinds
+    assert losses[-1] < losses[0]
+    assert int(state.step) == 6
+    np.testing.assert_array_equal(state.params["encoder"]["kernel"], pixel_params["encoder"]["kernel"])
+
+
+def test_compiled_steps_refuse_another_state(
+    pixel_model: Any, loss_config: LossConfig, optimizer_config: OptimizerConfig, pixel_params: Any, clips: Clips
+) -> None:
+    mesh = data_mesh(1)
+    step, state = _start(pixel_model, loss_config, optimizer_config, mesh, pixel_params)
+    steps, batch = CompiledSteps(step), put_batch(clips, mesh)
+    assert not steps.has(batch)
+    steps.compile(state, batch)
+    assert steps.has(batch)
+    assert not steps.has(put_batch({key: value[:4] for key, value in clips.items()}, mesh))
+    with pytest.raises(TypeError):
+        steps(state._replace(step=jnp.zeros((), jnp.float32)), batch)
+
+
+@pytest.mark.parametrize("broken", ["loss", "gradient"])
+def test_non_finite_updates_are_skipped_and_counted(
+    pixel_model: Any,
+    loss_config: LossConfig,
+    optimizer_config: OptimizerConfig,
+    pixel_params: Any,
+    clips: Clips,
+    broken: str,
+) -> None:
+    mesh = data_mesh(2)
+    loss = make_loss(pixel_model, loss_config)
+
+    def breakable(params: Any, batch: Any) -> Any:
+        """Black pictures make the loss NaN, or leave it finite and make its gradient NaN."""
+        value, metrics = loss(params, batch)
+        light = jnp.where(jax.lax.psum(batch["images"].astype(jnp.float32).sum(), "data") > 0, 1.0, 0.0)
+        if broken == "loss":
+            return value + jnp.where(light > 0, 0.0, jnp.nan), metrics
+        return value + jnp.sqrt(light * params["camera_head"]["bias"].sum() ** 2), metrics
+
+    optimizer = make_optimizer(optimizer_config, pixel_params, frozen=())
+    step = make_train_step(breakable, optimizer, learning_rate_schedule(optimizer_config, STAGES), mesh)
+    state = jax.device_put(initial_state(jax.tree.map(jnp.array, pixel_params), optimizer), replicated(mesh))
+    good = put_batch(clips, mesh)
+    bad = put_batch({**clips, "images": np.zeros_like(clips["images"])}, mesh)
+    for _ in range(2):
+        state, _ = step(state, good)
+    before = jax.device_get(state)
+    for _ in range(3):
+        state, metrics = step(state, bad)
+    after = jax.device_get(state)
+    jax.tree.map(np.testing.assert_array_equal, (after.params, after.opt_state), (before.params, before.opt_state))
+    assert float(metrics["skipped"]) == 3
+    assert int(after.skipped_in_a_row) == 3
+    state, metrics = step(state, good)
+    assert int(state.skipped_in_a_row) == 0
+    assert float(metrics["longest_skip"]) == 3
+    bias = np.asarray(state.params["camera_head"]["bias"])
+    assert np.isfinite(bias).all()
+    assert not np.array_equal(bias, before.params["camera_head"]["bias"])
+
+
+def test_batches_have_to_split_over_the_devices() -> None:
+    with pytest.raises(ValueError, match="stage 'only': batch_size=8 does not split over 3 devices"):
+        check_batch_size(STAGES[0], data_mesh(3))
+
+
+@pytest.mark.slow
+def test_real_model_gives_one_gradient_on_any_number_of_devices(
+    small_config: ModelConfig, small_variables: Any, loss_config: LossConfig, clips: Clips
+) -> None:
+    config = dataclasses.replace(small_config, encoder=dataclasses.replace(small_config.encoder, frozen=False))
+    model, params = LogVGGT(config), small_variables["params"]
+    one = _gradients(model, loss_config, data_mesh(1), params, clips)
+    four = _gradients(model, loss_config, data_mesh(4), params, clips)
+    assert four[0]["loss/total"] == pytest.approx(one[0]["loss/total"], rel=1e-5)
+    for module, gradients in one[1].items():
+        difference = jax.tree.map(np.subtract, four[1][module], gradients)
+        norms = [np.sqrt(sum((leaf**2).sum() for leaf in jax.tree.leaves(tree))) for tree in (difference, gradients)]
+        assert norms[0] < 1e-3 * norms[1], module
