@@ -3,7 +3,9 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 DEMO := runs/demo
-# Tests and the demo run on the CPU: they are small, and results are then the same on every machine.
+# Test processes; tests of one file stay together, since they share what they compile.
+JOBS ?= 2
+# The demo is small: it runs on the CPU wherever it is started.
 CPU := JAX_PLATFORMS=cpu
 
 .PHONY: help install demo test test-all lint clean
@@ -18,6 +20,7 @@ help:
 install: $(VENV)/.installed
 
 $(VENV)/.installed: pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed, for example: make PYTHON=python3.12")'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet --editable ".[eval,hub,viewer,dev]"
@@ -26,13 +29,19 @@ $(VENV)/.installed: pyproject.toml
 demo: install
 	rm -rf $(DEMO)
 	$(CPU) $(BIN)/python train.py --config=configs/demo.py --workdir=$(DEMO)/training
-	$(CPU) $(BIN)/python eval.py --config=configs/eval/demo.py --checkpoint=$(DEMO)/training/model --output=$(DEMO)/evaluation
-	$(CPU) $(BIN)/logvggt render-room --output $(DEMO)/room --frames 48 --size 56x70 --seed 0 --split test
-	$(CPU) $(BIN)/logvggt reconstruct $(DEMO)/room --checkpoint $(DEMO)/training/model --output $(DEMO)/reconstruction --longer-edge 70
+	$(CPU) $(BIN)/logvggt render-room --output $(DEMO)/room --frames 48 --size 56x70 --split test
+	$(CPU) $(BIN)/logvggt reconstruct $(DEMO)/room --checkpoint $(DEMO)/training/model \
+	  --output $(DEMO)/reconstruction --longer-edge 70
+	$(CPU) $(BIN)/python eval.py --config=configs/eval/rooms.py --config.rooms.num_rooms=8 \
+	  --checkpoint=$(DEMO)/training/model --output=$(DEMO)/evaluation
 	@echo
-	@cat $(DEMO)/evaluation/results.md
-	@echo "Results in $(DEMO):"
-	@find $(DEMO) -maxdepth 2 -not -name '*.jsonl' | sort
+	@echo "Results in $(DEMO)/:"
+	@echo "  evaluation/report.md           the tables above; results.json has the same numbers"
+	@echo "  evaluation/figures/            trajectories and depth beside the truth"
+	@echo "  reconstruction/points.ply      coloured point cloud of a room that training never saw"
+	@echo "  reconstruction/trajectory.txt  its camera path (TUM format); cameras.json has the intrinsics as well"
+	@echo "  reconstruction/previews/       its depth as pictures; depth/ has the values"
+	@echo "  training/model/                the trained model; checkpoints/, metrics.jsonl and tensorboard/ beside it"
 
 lint: install
 	$(BIN)/ruff check .
@@ -40,7 +49,7 @@ lint: install
 	$(BIN)/mypy
 
 test: lint
-	$(BIN)/python -m pytest --durations=10 --junitxml=runs/test/report.xml
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --durations=10 --junitxml=runs/test/report.xml
 	@echo "Test report: runs/test/report.xml"
 
 test-all: lint

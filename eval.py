@@ -1,6 +1,8 @@
 """Evaluates a checkpoint: metrics of depth, poses and points beside honest baselines, as tables and JSON.
 
-python eval.py --config=configs/eval/rooms.py --checkpoint=runs/tiny/model --output=runs/eval-rooms
+    python eval.py --config=configs/eval/rooms.py --checkpoint=runs/tiny/model --output=runs/eval-rooms
+
+Any field of the configuration can be changed on the command line: --config.rooms.num_rooms=8.
 """
 
 from __future__ import annotations
@@ -17,42 +19,62 @@ from logvggt_jax.evaluation.baselines import all_baselines
 from logvggt_jax.evaluation.datasets import open_evaluation_set
 from logvggt_jax.evaluation.methods import network
 from logvggt_jax.evaluation.report import print_report, write_report
-from logvggt_jax.evaluation.runner import EvaluationConfig, evaluate
+from logvggt_jax.evaluation.runner import EvaluationRun, evaluate
+from logvggt_jax.inference.compilation_cache import enable_compilation_cache
 from logvggt_jax.weights import load_model
 
 _CONFIG = config_flags.DEFINE_config_file("config", None, "what to evaluate: a file of configs/eval", lock_config=True)
 _CHECKPOINT = flags.DEFINE_string("checkpoint", None, "model folder, as training and `logvggt convert` write it")
 _OUTPUT = flags.DEFINE_string("output", None, "folder of the results; those of an earlier run are replaced")
 _DATA_ROOT = flags.DEFINE_string("data_root", None, "folder of the data set, where it is read from disk")
-flags.mark_flags_as_required(["config", "checkpoint", "output"])
+_CACHE = flags.DEFINE_string("compilation_cache", None, "folder of compiled programs, `none` for none")
 
 
-def main(argv: Sequence[str]) -> None:
-    if len(argv) > 1:
-        raise app.UsageError(f"unexpected arguments: {' '.join(argv[1:])}")
-    logging.set_verbosity(logging.WARNING)
-    config, output = _CONFIG.value, Path(_OUTPUT.value)
+def main(arguments: Sequence[str]) -> None:
+    """Settings, data, model, tables."""
+    if len(arguments) > 1:
+        raise app.UsageError(f"unknown argument {arguments[1]!r}; settings are given as --config.NAME=VALUE")
+    output = Path(_OUTPUT.value)
     try:
-        settings = EvaluationConfig.from_dict(config.evaluation)
+        run = EvaluationRun.from_dict(_CONFIG.value.to_dict())
+        image_size, seed = run.evaluation.image_size, run.evaluation.seed
         dataset, known_set, known = open_evaluation_set(
-            config.dataset,
-            _DATA_ROOT.value,
-            split=config.split,
-            image_size=settings.image_size,
-            rooms=config.get("rooms"),
+            run.dataset, _DATA_ROOT.value, split=run.split, image_size=image_size, rooms=run.rooms
         )
+        enable_compilation_cache(_CACHE.value)
         model, variables = load_model(_CHECKPOINT.value)
         methods = [network(model, variables)]
-        if config.baselines:
-            methods += all_baselines(model, known_set, settings.image_size, source=known, seed=settings.seed)
+        if run.baselines:
+            methods += all_baselines(model, known_set, image_size, source=known, seed=seed)
         command = shlex.join(["python", *sys.argv])
-        results = evaluate(dataset, methods, settings, output, title=config.title, command=command)
+        results = evaluate(dataset, methods, run.evaluation, output, title=run.title, command=command)
         write_report(results, output / "report.md")
     except (ValueError, OSError, ImportError) as error:
-        raise SystemExit(f"eval.py: {error}") from error
+        # Errors of settings, data and checkpoints say in one line what to mend; -v 1 shows where they arose.
+        if flags.FLAGS.verbosity > 0:
+            raise
+        sys.exit(f"eval.py: {' '.join(str(error).split())}")
     print_report(results)
     print(f"\nTables, JSON and figures are in {output}/")
 
 
+def parse_flags(arguments: list[str]) -> list[str]:
+    """Flags as absl reads them, with an unknown configuration field as one line."""
+    try:
+        rest = app.parse_flags_with_usage(arguments)
+    except (AttributeError, KeyError) as error:
+        # The library wraps one error in the other, with quotes around quotes.
+        reason = error.args[0] if error.args else error
+        reason = reason.args[0] if isinstance(reason, KeyError) else reason
+        sys.exit(f"eval.py: --config has no such field: {' '.join(str(reason).split())}")
+    except OSError as error:
+        sys.exit(f"eval.py: {' '.join(str(error).split())}")
+    if flags.FLAGS["verbosity"].using_default_value:
+        # Orbax reports every file at the level that absl's app would choose.
+        flags.FLAGS.verbosity = logging.WARNING
+    return rest
+
+
 if __name__ == "__main__":
-    app.run(main)
+    flags.mark_flags_as_required(["config", "checkpoint", "output"])
+    app.run(main, flags_parser=parse_flags)

@@ -12,10 +12,10 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import jax
 from absl import app, flags, logging
 from ml_collections import config_flags
 
+from logvggt_jax.inference.compilation_cache import enable_compilation_cache
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.loop import NonFiniteTraining, train
 from logvggt_jax.training.sharding import data_mesh, use_cpu_cores
@@ -26,7 +26,7 @@ _RESUME_STEP = flags.DEFINE_integer(
     "resume_step", None, "Checkpoint to go on from, dropping later ones; by default the latest."
 )
 _CACHE = flags.DEFINE_string(
-    "compilation_cache", "~/.cache/logvggt-jax/xla", "Folder that keeps compiled programs; empty for none."
+    "compilation_cache", None, "Folder that keeps compiled programs, `none` for none; by default the user's cache."
 )
 
 
@@ -34,24 +34,28 @@ def main(arguments: Sequence[str]) -> None:
     """Settings, devices, training."""
     if len(arguments) > 1:
         raise app.UsageError(f"unknown argument {arguments[1]!r}; settings are given as --config.NAME=VALUE")
-    if _CACHE.value:
-        jax.config.update("jax_compilation_cache_dir", str(Path(_CACHE.value).expanduser()))
+    enable_compilation_cache(_CACHE.value)
     try:
         config = TrainConfig.from_dict(_CONFIG.value.to_dict())
         use_cpu_cores(config)
         train(config, Path(_WORKDIR.value), mesh=data_mesh(), resume_step=_RESUME_STEP.value)
-    except (ValueError, OSError, NonFiniteTraining) as error:
+    except (ValueError, OSError, ImportError, NonFiniteTraining) as error:
         # Errors of settings, data and checkpoints say in one line what to mend; -v 1 shows where they arose.
         if flags.FLAGS.verbosity > 0:
             raise
-        sys.exit(f"train.py: {error}")
+        sys.exit(f"train.py: {' '.join(str(error).split())}")
 
 
 def parse_flags(arguments: list[str]) -> list[str]:
-    """Flags as absl reads them, with an unknown configuration field as one line."""
+    """Flags as absl reads them, with mistakes as one line."""
     try:
-        rest = app.parse_flags_with_usage(arguments)
-    except (AttributeError, KeyError, OSError) as error:
+        rest = flags.FLAGS(arguments)
+    except (AttributeError, KeyError) as error:
+        # The library wraps one error in the other, with quotes around quotes.
+        reason = error.args[0] if error.args else error
+        reason = reason.args[0] if isinstance(reason, KeyError) else reason
+        sys.exit(f"train.py: the configuration has no such field: {' '.join(str(reason).split())}")
+    except (flags.Error, OSError) as error:
         sys.exit(f"train.py: {' '.join(str(error).split())}")
     if flags.FLAGS["verbosity"].using_default_value:
         # Orbax reports every file at the level that absl's app would choose.

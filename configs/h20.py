@@ -9,6 +9,7 @@ sizes and the length of an epoch are choices of this project.
 """
 
 from ml_collections import ConfigDict
+from ml_collections.config_dict import placeholder
 
 STEPS_PER_EPOCH = 800
 NUM_DEVICES = 16
@@ -32,11 +33,15 @@ MIXTURE = {
 
 
 def get_config(data_root: str = "data") -> ConfigDict:
-    """The run; the model's sizes are the defaults of `ModelConfig`, VGGT-1B with windows of 4, stride 2."""
+    """The run; the model's sizes are the defaults of `ModelConfig`, VGGT-1B."""
     config = ConfigDict()
     config.seed = 0
     config.initial_weights = "facebook/VGGT-1B"
-    config.model = {"dtype": "bfloat16"}
+    config.model = {
+        "windows": {"size": 4, "stride": 2, "cross_window": True, "cache": "output"},
+        "refinement": {"enabled": True, "period": placeholder(int), "context": placeholder(int)},
+        "dtype": "bfloat16",
+    }
     config.loss = {
         "name": "log_vggt",
         "camera_weight": 1.0,
@@ -72,7 +77,7 @@ def get_config(data_root: str = "data") -> ConfigDict:
         "reverse": 0.5,
         "worker_count": 16,
         "num_threads": 2,
-        "cache_dir": None,
+        "cache_dir": placeholder(str),
     }
     config.validation = {
         "source": {"name": "scannet", "root": f"{data_root}/scannet", "split": "val"},
@@ -86,7 +91,7 @@ def get_config(data_root: str = "data") -> ConfigDict:
     config.save_every = STEPS_PER_EPOCH
     config.keep_checkpoints = 3
     config.max_skipped_in_a_row = 20
-    config.max_minutes = None
+    config.max_minutes = placeholder(float)
     return config
 
 

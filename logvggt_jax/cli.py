@@ -22,9 +22,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     parser = _parser()
     options = parser.parse_args(_with_dashes(sys.argv[1:] if arguments is None else arguments))
-    warnings.showwarning = _show_warning
     try:
-        options.run(options)
+        with warnings.catch_warnings():
+            warnings.showwarning = _show_warning
+            options.run(options)
     except KeyboardInterrupt:
         print("logvggt: interrupted; nothing half-written is left", file=sys.stderr)
         return INTERRUPTED

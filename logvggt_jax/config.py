@@ -5,6 +5,7 @@ Defaults are VGGT-1B and the LoG-VGGT paper.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import types
 import typing
@@ -186,7 +187,8 @@ class ModelConfig:
     attention: str = "auto"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "dtype", jnp.dtype(self.dtype).name)
+        with contextlib.suppress(TypeError):  # what names no type is refused below
+            object.__setattr__(self, "dtype", jnp.dtype(self.dtype).name)
         if self.dtype not in ("float32", "bfloat16", "float16"):
             raise ValueError(f"ModelConfig.dtype must be float32, bfloat16 or float16, got {self.dtype!r}")
         if self.attention not in ATTENTION_IMPLEMENTATIONS:
@@ -223,8 +225,9 @@ def _from_dict(cls: Any, values: Any, path: str) -> Any:
         raise ValueError(f"unknown field {path}.{unknown[0]}; {cls.__name__} knows {', '.join(hints)}")
     arguments = {}
     for name, value in values.items():
-        nested = [t for t in _alternatives(hints[name]) if dataclasses.is_dataclass(t)]
-        if nested and value is not None:
+        alternatives = _alternatives(hints[name])
+        nested = [t for t in alternatives if dataclasses.is_dataclass(t)]
+        if nested and not (value is None and types.NoneType in alternatives):
             value = _from_dict(nested[0], value, f"{path}.{name}")
         arguments[name] = value
     return cls(**arguments)

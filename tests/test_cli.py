@@ -55,6 +55,24 @@ def test_help_names_every_command_and_each_shows_an_example(capsys: pytest.Captu
         assert f"logvggt {command} " in capsys.readouterr().out.split("example:")[1]
 
 
+def test_help_does_not_wait_for_jax() -> None:
+    """JAX takes seconds to load; and what the package offers is there once it is asked for."""
+    program = """
+import contextlib, sys
+from logvggt_jax.cli import main
+with contextlib.suppress(SystemExit):
+    main(["reconstruct", "--help"])
+assert "jax" not in sys.modules
+import logvggt_jax
+assert all(getattr(logvggt_jax, name) is not None for name in logvggt_jax.__all__)
+assert set(logvggt_jax.__all__) <= set(dir(logvggt_jax))
+assert logvggt_jax.geometry.decode_poses
+assert not hasattr(logvggt_jax, "LogVGTT")
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 0, done.stderr
+
+
 @pytest.mark.parametrize("arguments", [[], ["fly"], ["info"], ["info", "x", "--fast"], ["view", "x", "--port", "y"]])
 def test_wrong_usage_exits_with_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as exit_:

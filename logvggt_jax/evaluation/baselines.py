@@ -56,12 +56,13 @@ def depth_statistics(
     sequences = list(dataset.sequences)
     chosen = _evenly(len(sequences), max_sequences)
     for s in chosen:
-        indices = _evenly(dataset.num_frames(sequences[s]), max(1, max_frames // len(chosen)))
-        frames = fit(dataset.read(sequences[s], indices), image_size)
-        valid = frames.depth > 0
-        depth_sum += np.where(valid, frames.depth, 0.0).sum(0)
-        valid_count += valid.sum(0)
-        intrinsics.extend(frames.intrinsics)
+        # One frame at a time: hundreds at a data set's own size are gigabytes.
+        for index in _evenly(dataset.num_frames(sequences[s]), max(1, max_frames // len(chosen))):
+            frames = fit(dataset.read(sequences[s], [index]), image_size)
+            valid = frames.depth[0] > 0
+            depth_sum += np.where(valid, frames.depth[0], 0.0)
+            valid_count += valid
+            intrinsics.append(frames.intrinsics[0])
     if not valid_count.any():
         raise ValueError(f"depth_statistics: {source} have no valid depth; baselines need some")
     mean_depth = float(depth_sum.sum() / valid_count.sum())

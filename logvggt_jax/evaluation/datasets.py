@@ -33,6 +33,7 @@ def open_evaluation_set(
 
     Raises:
       ValueError: `root` is missing, or given for `rooms`; an unknown option of rooms.
+      FileNotFoundError: `root` does not hold the data set.
     """
     if name != "rooms":
         if root is None:

@@ -90,7 +90,7 @@ def align_depth(prediction: np.ndarray, target: np.ndarray, alignment: str) -> t
     if alignment == "scale":
         return _least_absolute_scale(prediction, target), 0.0
     if alignment == "median":
-        return lower_median(target) / lower_median(prediction), 0.0
+        return _median_scale(prediction, target), 0.0
     if alignment == "lstsq":
         return _least_squares(prediction, target)
     return _adam_scale_shift(prediction, target)
@@ -136,6 +136,11 @@ def _least_absolute_scale(prediction: np.ndarray, target: np.ndarray, iterations
     return float(np.maximum(scale, _SMALLEST_SCALE))
 
 
+def _median_scale(prediction: np.ndarray, target: np.ndarray) -> float:
+    # Python's own division raises for a prediction of zeros; the reference's gives infinity.
+    return float(np.divide(lower_median(target), lower_median(prediction)))
+
+
 def _least_squares(prediction: np.ndarray, target: np.ndarray) -> tuple[float, float]:
     if not np.isfinite(prediction).all():
         return float("nan"), float("nan")
@@ -147,7 +152,7 @@ def _least_squares(prediction: np.ndarray, target: np.ndarray) -> tuple[float, f
 def _adam_scale_shift(prediction: np.ndarray, target: np.ndarray) -> tuple[float, float]:
     """Follows the reference step by step, since it stops far from the optimum."""
     rate, beta1, beta2, epsilon = 1e-4, 0.9, 0.999, 1e-8
-    start = lower_median(target) / lower_median(prediction)
+    start = _median_scale(prediction, target)
     # Float32 as the reference: the start puts one residual at round-off, and its sign decides the first steps.
     prediction, target = prediction.astype(np.float32), target.astype(np.float32)
     parameters: np.ndarray = np.array([start, 0.0], np.float32)

@@ -204,4 +204,7 @@ def _open3d() -> Any:
             ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
             return importlib.import_module("open3d")
     except ImportError as error:
-        raise ImportError(f'ICP and normals need Open3D ({error}): pip install "logvggt-jax[eval]"') from error
+        mend = 'pip install "logvggt-jax[eval]"'
+        if ".so" in str(error):
+            mend = "install that library (Debian, Ubuntu: apt install libx11-6 libgl1 libegl1 libudev1 libidn2-0)"
+        raise ImportError(f"ICP and normals need Open3D ({error}): {mend}") from error

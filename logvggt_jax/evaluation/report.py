@@ -18,12 +18,12 @@ _MARK = "†"
 
 
 class Column(NamedTuple):
-    """Heading, key in a summary entry, decimals, and whether more is better (None: neither)."""
+    """Heading, key in a summary entry, decimals, and whether more is better."""
 
     heading: str
     key: str
     decimals: int
-    more_is_better: bool | None
+    more_is_better: bool
 
 
 class Section(NamedTuple):

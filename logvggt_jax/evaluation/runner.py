@@ -10,7 +10,7 @@ import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO, TypeVar
 
 import jax
 import numpy as np
@@ -22,6 +22,8 @@ from logvggt_jax.data.transforms import fit
 from logvggt_jax.evaluation.methods import ClipPrediction, Method
 from logvggt_jax.evaluation.protocols import ClipScore, ClipTruth, clip_score, data_set_score, prepare_truth
 from logvggt_jax.types import Frames
+
+Settings = TypeVar("Settings")
 
 _VERSIONED = ("logvggt-jax", "jax", "jaxlib", "flax", "numpy", "scipy", "evo", "open3d")
 
@@ -61,6 +63,8 @@ class EvaluationConfig:
             raise ValueError(f"clip_lengths must be at least one number of 2 or more frames, got {self.clip_lengths}")
         for name in ("stride", "clips_per_sequence", "max_sequences", "max_points"):
             value = getattr(self, name)
+            if value is not None and not isinstance(value, int):
+                raise ValueError(f"{name} must be a whole number, got {value!r}")
             if value is not None and value < 1:
                 raise ValueError(f"{name} must be at least 1, got {value}")
         if self.icp_threshold is not None and not self.icp_threshold > 0:
@@ -68,12 +72,47 @@ class EvaluationConfig:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> EvaluationConfig:
-        """From a configuration file's mapping; ValueError for an unknown field, naming it and the known ones."""
-        known = [field.name for field in dataclasses.fields(cls)]
-        for name in values:
-            if name not in known:
-                raise ValueError(f"unknown field evaluation.{name}; known are {', '.join(known)}")
-        return cls(**values)
+        """From a configuration file's mapping; ValueError for an unknown or missing field, naming it."""
+        return _from_mapping(cls, values, "evaluation.")
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluationRun:
+    """What a file of `configs/eval` says.
+
+    Attributes:
+      title: of the report.
+      dataset: one of `logvggt_jax.data.DATASETS`.
+      split: `train`, `val`, `test` or `all`.
+      baselines: whether the baselines are evaluated beside the network.
+      evaluation: clips and metrics.
+      rooms: options of procedural rooms, for `dataset` = `rooms` alone.
+    """
+
+    title: str
+    dataset: str
+    split: str
+    baselines: bool
+    evaluation: EvaluationConfig
+    rooms: Mapping[str, Any] | None = None
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> EvaluationRun:
+        """From a configuration file's mapping; ValueError for an unknown or missing field, naming it."""
+        run = _from_mapping(cls, values, "")
+        return dataclasses.replace(run, evaluation=EvaluationConfig.from_dict(values["evaluation"]))
+
+
+def _from_mapping(cls: type[Settings], values: Mapping[str, Any], prefix: str) -> Settings:
+    fields = dataclasses.fields(cls)  # type: ignore[arg-type]
+    known = [field.name for field in fields]
+    for name in values:
+        if name not in known:
+            raise ValueError(f"unknown field {prefix}{name}; known are {', '.join(known)}")
+    for field in fields:
+        if field.name not in values and field.default is dataclasses.MISSING:
+            raise ValueError(f"field {prefix}{field.name} is missing from the configuration")
+    return cls(**values)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,8 +136,9 @@ def evaluate(
     """Evaluates all methods on the same clips.
 
     Every clip's metrics are appended to `output`/clips.jsonl as soon as they are known; results.json follows at the
-    end. Clips that are too short or cannot be read, and metrics that a clip does not admit, are listed with their
-    reason in the results; means are over the others and carry their number.
+    end. After an error clips.jsonl is gone, after an interruption it holds the clips that were done. Clips that are
+    too short or cannot be read, and metrics that a clip does not admit, are listed with their reason in the results;
+    means are over the others and carry their number.
 
     Args:
       dataset: a `logvggt_jax.data` data set.
@@ -118,12 +158,12 @@ def evaluate(
     """
     plan, skipped = plan_clips(dataset, config)
     output.mkdir(parents=True, exist_ok=True)
-    for stale in ("results.json", "report.md"):
-        (output / stale).unlink(missing_ok=True)
+    for stale in (output / "results.json", output / "report.md", *(output / "figures").glob("*_frames_*.png")):
+        stale.unlink(missing_ok=True)
     scores: dict[tuple[int, str], list[ClipScore]] = {}
     failures: list[dict[str, Any]] = []
     drawn: dict[int, int] = {}
-    with (output / "clips.jsonl").open("w") as lines, _progress(console) as progress:
+    with _line_file(output / "clips.jsonl") as lines, _progress(console) as progress:
         task = progress.add_task("evaluating", total=len(plan))
         for clip in plan:
             length = len(clip.indices)
@@ -153,9 +193,9 @@ def evaluate(
                     drawn[length] = drawn.get(length, 0) + 1
                     _draw(output / "figures", clip, method, prediction, truth)
             progress.advance(task)
-    if not scores:
-        reasons = "; ".join(f"{entry['sequence']}: {entry['reason']}" for entry in skipped[:3])
-        raise ValueError(f"no clip could be evaluated ({len(skipped)} skipped; {reasons})")
+        if not scores:
+            reasons = "; ".join(f"{entry['sequence']}: {entry['reason']}" for entry in skipped[:3])
+            raise ValueError(f"no clip could be evaluated ({len(skipped)} skipped; {reasons})")
     results: dict[str, Any] = {
         "title": title,
         "command": command,
@@ -200,6 +240,19 @@ def write_text(path: Path, text: str) -> None:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _line_file(path: Path) -> Iterator[TextIO]:
+    """A file of whole lines; an error takes it away again, and its folder if nothing else is there."""
+    try:
+        with path.open("w") as lines:
+            yield lines
+    except Exception:
+        path.unlink(missing_ok=True)
+        if not any(path.parent.iterdir()):
+            path.parent.rmdir()
+        raise
 
 
 @contextlib.contextmanager

@@ -34,12 +34,14 @@ def umeyama(source: np.ndarray, target: np.ndarray, weights: np.ndarray | None =
     w = w / w.sum()
     mean_source, mean_target = w @ source, w @ target
     centred_source, centred_target = source - mean_source, target - mean_target
-    covariance = (centred_target * w[:, None]).T @ centred_source
-    u, singular, vt = np.linalg.svd(covariance)
     variance = float(w @ (centred_source**2).sum(1))
     spread = np.sqrt(variance * float(w @ (centred_target**2).sum(1)))
-    if not np.isfinite(spread) or singular[1] <= 1e-12 * max(spread, np.finfo(np.float64).tiny):
-        raise ValueError("no unique similarity: the points coincide, lie on one line or are not finite")
+    if not np.isfinite(spread):
+        raise ValueError("no similarity: a point or weight is not finite")
+    covariance = (centred_target * w[:, None]).T @ centred_source
+    u, singular, vt = np.linalg.svd(covariance)
+    if singular[1] <= 1e-12 * max(spread, np.finfo(np.float64).tiny):
+        raise ValueError("no unique similarity: the points coincide or lie on one line")
     sign = np.ones(3)
     sign[2] = np.sign(np.linalg.det(u) * np.linalg.det(vt))
     rotation = (u * sign) @ vt

@@ -81,5 +81,9 @@ def _replace_folder(source: Path, target: Path) -> None:
     # A folder cannot replace a full one in one call: the old one steps aside and goes last.
     aside = target.with_name(f".{target.name}.{os.getpid()}.old")
     target.rename(aside)
-    source.rename(target)
+    try:
+        source.rename(target)
+    except OSError:
+        aside.rename(target)
+        raise
     shutil.rmtree(aside)

@@ -15,7 +15,8 @@ import jax.numpy as jnp
 _BLOCK_SCORES = {"cpu": 2**20, "gpu": 2**26, "tpu": 2**24}
 # Below this many scores in all, one batched product beats any loop.
 _SMALL_SCORES = 2**21
-_TPU_BLOCK = 512
+# Blocks of the TPU's kernel: large ones keep its matrix unit busy.
+_TPU_BLOCKS = (512, 384, 256)
 # Every score a masked key gets: finite, so that a row without any valid key stays finite.
 _MASKED = -1e30
 
@@ -36,17 +37,17 @@ def attention(
       value: [B, keys, heads, head_dim].
       key_valid: bool [B, keys], False for keys that nothing may attend to; None for all. A row of B without any
         valid key gets finite values without meaning.
-      implementation: `auto` (by the default device), `xla`, `cudnn` (16-bit inputs only; others take `xla`) or
-        `tpu_flash` (the Pallas kernel; few keys take `xla`).
+      implementation: `auto` (by the default device), `xla`, `cudnn` or `tpu_flash` (the Pallas kernel). What the
+        last two cannot do takes `xla`: see `_fits_cudnn` and `_fits_tpu_flash`.
 
     Returns:
       [B, queries, heads, head_dim] in the query's dtype; softmax in float32.
     """
     if implementation == "auto":
         implementation = {"gpu": "cudnn", "tpu": "tpu_flash"}.get(jax.default_backend(), "xla")
-    if implementation == "cudnn" and query.dtype in (jnp.bfloat16, jnp.float16):
+    if implementation == "cudnn" and _fits_cudnn(query):
         return _cudnn(query, key, value, key_valid)
-    if implementation == "tpu_flash" and key.shape[1] >= _TPU_BLOCK:
+    if implementation == "tpu_flash" and _fits_tpu_flash(query, key):
         return _tpu_flash(query, key, value, key_valid)
     batch, queries, heads, _ = query.shape
     if batch * heads * queries * key.shape[1] <= _SMALL_SCORES:
@@ -109,6 +110,18 @@ def _blockwise(query: jax.Array, key: jax.Array, value: jax.Array, key_valid: ja
     return out[:, :queries]
 
 
+def _fits_cudnn(query: jax.Array) -> bool:
+    """16-bit inputs, and a head size that the kernel of every GPU since Ampere takes."""
+    return query.dtype in (jnp.bfloat16, jnp.float16) and query.shape[-1] % 8 == 0 and query.shape[-1] <= 128
+
+
+def _fits_tpu_flash(query: jax.Array, key: jax.Array) -> bool:
+    """bfloat16 inputs (float32 products would be rounded to it) and at least a block of keys, outside of a
+    `shard_map` that checks what varies over devices: the kernel does not say so of its result."""
+    varying = jax.typeof(query).mat.varying
+    return query.dtype == jnp.bfloat16 and key.shape[1] >= max(_TPU_BLOCKS) and not varying
+
+
 def _cudnn(query: jax.Array, key: jax.Array, value: jax.Array, key_valid: jax.Array | None) -> jax.Array:
     """cuDNN flash attention. Validity becomes a length: attention does not care about the order of keys, so
     valid ones go first; a dense mask would cost a bias of queries x keys."""
@@ -128,29 +141,29 @@ def _tpu_flash(query: jax.Array, key: jax.Array, value: jax.Array, key_valid: ja
 
     batch, queries, _, head_dim = query.shape
     keys = key.shape[1]
+    q_block, k_block = _least_padding(queries), _least_padding(keys)
     if key_valid is None:
         key_valid = jnp.ones((batch, keys), bool)
 
-    def pad(x: jax.Array) -> jax.Array:
-        missing = -x.shape[1] % _TPU_BLOCK
-        return jnp.pad(x, ((0, 0), (0, missing)) + ((0, 0),) * (x.ndim - 2))
+    def pad(x: jax.Array, block: int) -> jax.Array:
+        return jnp.pad(x, ((0, 0), (0, -x.shape[1] % block)) + ((0, 0),) * (x.ndim - 2))
 
-    query, key, value, key_valid = pad(query), pad(key), pad(value), pad(key_valid)
+    query, key, value, key_valid = pad(query, q_block), *(pad(x, k_block) for x in (key, value, key_valid))
     segments = pallas.SegmentIds(
         q=jnp.ones(query.shape[:2], jnp.int32), kv=jnp.where(key_valid, 1, 0).astype(jnp.int32)
     )
     sizes = pallas.BlockSizes(
-        block_q=_TPU_BLOCK,
-        block_k_major=_TPU_BLOCK,
-        block_k=_TPU_BLOCK,
+        block_q=q_block,
+        block_k_major=k_block,
+        block_k=k_block,
         block_b=1,
-        block_q_major_dkv=_TPU_BLOCK,
-        block_k_major_dkv=_TPU_BLOCK,
-        block_k_dkv=_TPU_BLOCK,
-        block_q_dkv=_TPU_BLOCK,
-        block_k_major_dq=_TPU_BLOCK,
-        block_k_dq=_TPU_BLOCK,
-        block_q_dq=_TPU_BLOCK,
+        block_q_major_dkv=q_block,
+        block_k_major_dkv=k_block,
+        block_k_dkv=k_block,
+        block_q_dkv=q_block,
+        block_k_major_dq=k_block,
+        block_k_dq=k_block,
+        block_q_dq=q_block,
     )
     out = pallas.flash_attention(
         *(jnp.swapaxes(x, 1, 2) for x in (query, key, value)),
@@ -159,3 +172,8 @@ def _tpu_flash(query: jax.Array, key: jax.Array, value: jax.Array, key_valid: ja
         block_sizes=sizes,
     )
     return jnp.swapaxes(out, 1, 2)[:, :queries].astype(value.dtype)
+
+
+def _least_padding(length: int) -> int:
+    """The block that `length` fills up best, the largest of equals."""
+    return min(_TPU_BLOCKS, key=lambda block: -length % block)

@@ -9,6 +9,7 @@ from typing import Any
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from jax.ad_checkpoint import checkpoint_name
 
 from logvggt_jax.config import ModelConfig
 from logvggt_jax.geometry.pose_encoding import decode_poses
@@ -22,6 +23,8 @@ from logvggt_jax.model.windows import WindowState, num_windows
 from logvggt_jax.types import Predictions, WindowOutput
 
 Variables = dict[str, Any]
+
+_PATCH_TOKENS = "patch_tokens"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,7 +94,8 @@ class LogVGGT:
           images: [B, T, H, W, 3].
           frame_mask: bool [B, T], True … True False … False for sequences of unequal length; None for full ones.
             Entries of padded frames mean nothing.
-          remat: recompute each window in the backward pass instead of storing its activations.
+          remat: recompute each window in the backward pass instead of storing its activations; a frame's patch
+            tokens are stored.
         """
         frame_mask = self._mask(images, frame_mask)
         out = self.run_windows(variables, images, frame_mask, remat=remat)
@@ -136,7 +140,9 @@ class LogVGGT:
             return self.step(variables, state, frames, mask)
 
         if remat:
-            advance = jax.checkpoint(advance, prevent_cse=False)
+            # All but the encoder's result, without which a frozen encoder would run twice.
+            keep = jax.checkpoint_policies.save_only_these_names(_PATCH_TOKENS)
+            advance = jax.checkpoint(advance, prevent_cse=False, policy=keep)
 
         windows = num_windows(num_frames, self.config.windows.size, stride)
         state = self.start(variables, *frames_from(0, overlap))
@@ -215,6 +221,11 @@ class LogVGGT:
         stride = self.config.windows.stride
         frame_mask = self._mask(frames, frame_mask, count=stride, name="step")
         image_size = _image_size(frames)
+        if (len(state.step), *state.image_size) != (len(frames), *image_size):
+            raise ValueError(
+                f"step continues a stream of {len(state.step)} x {state.image_size} images (batch, height and width), "
+                f"got {len(frames)} x {image_size}; start a new stream for other shapes"
+            )
         grid = self._grid(image_size)
         fresh = self._encode(variables, frames)
         patch_tokens = jnp.concatenate([state.patch_tokens, fresh], axis=1)
@@ -289,6 +300,10 @@ class LogVGGT:
         register_mask: jax.Array,
     ) -> jax.Array:
         """GCCR alone: [B, N, 2C], [B, M, 4, 2C], bool [B, M] -> [B, N, 2C]; the identity when disabled."""
+        width, registers = 2 * self.config.encoder.embed_dim, self.config.aggregator.num_registers
+        _check("camera_tokens", camera_tokens, (None, None, width), jnp.floating)
+        _check("register_tokens", register_tokens, (len(camera_tokens), None, registers, width), jnp.floating)
+        _check("register_mask", register_mask, register_tokens.shape[:2], jnp.bool_)
         if not self.config.refinement.enabled:
             return camera_tokens
         params = variables["params"]["gccr"]
@@ -296,6 +311,8 @@ class LogVGGT:
 
     def decode_cameras(self, variables: Variables, camera_tokens: jax.Array, camera_mask: jax.Array) -> jax.Array:
         """Camera head alone: refined tokens [B, N, 2C], bool [B, N] -> pose encodings [B, N, R, 9]."""
+        _check("camera_tokens", camera_tokens, (None, None, 2 * self.config.encoder.embed_dim), jnp.floating)
+        _check("camera_mask", camera_mask, camera_tokens.shape[:2], jnp.bool_)
         return _run(self._camera_head, variables["params"]["camera_head"], camera_tokens, camera_mask)
 
     def decode_group(
@@ -385,7 +402,7 @@ class LogVGGT:
             params = jax.lax.stop_gradient(params)
         pixels = jnp.asarray(images, jnp.float32) / (255.0 if images.dtype == jnp.uint8 else 1.0)
         tokens = _run(self._encoder, params, pixels.reshape(-1, *images.shape[2:]))
-        return tokens.reshape(*images.shape[:2], *tokens.shape[1:])
+        return checkpoint_name(tokens.reshape(*images.shape[:2], *tokens.shape[1:]), _PATCH_TOKENS)
 
     def _output(
         self,
@@ -442,16 +459,27 @@ class LogVGGT:
                 f"{name} takes {count} frames [B, {count}, H, W, 3], got {images.shape[1]}; pad them and pass "
                 "frame_mask"
             )
+        # "Like" the images, so that under shard_map any mask varies over devices as they do.
+        everything = jnp.ones_like(images, shape=images.shape[:2], dtype=bool)
         if mask is None:
-            return jnp.ones_like(images, shape=images.shape[:2], dtype=bool)
-        if tuple(mask.shape) != tuple(images.shape[:2]) or mask.dtype != jnp.bool_:
-            raise ValueError(f"frame_mask must be bool {tuple(images.shape[:2])}, got {mask.dtype} {tuple(mask.shape)}")
-        return jnp.asarray(mask)
+            return everything
+        _check("frame_mask", mask, images.shape[:2], jnp.bool_)
+        return everything & mask
 
 
 def _run(module: nn.Module, params: Any, *inputs: Any, **options: Any) -> Any:
     """A linen module as a pure function of its own parameters."""
     return module.apply({"params": params}, *inputs, **options)
+
+
+def _check(name: str, array: jax.Array, shape: tuple[int | None, ...], kind: Any) -> None:
+    """Raises ValueError unless an array has this shape (None: any size) and its dtype is of this kind."""
+    found = tuple(array.shape)
+    fits = len(found) == len(shape) and all(a in (b, None) for a, b in zip(shape, found, strict=True))
+    if not fits or not jnp.issubdtype(array.dtype, kind):
+        wanted = ", ".join("any" if size is None else str(size) for size in shape)
+        kind_name = "bool" if kind is jnp.bool_ else "floating point"
+        raise ValueError(f"{name} must be {kind_name} [{wanted}], got {array.dtype} {list(found)}")
 
 
 def _image_size(images: jax.Array) -> tuple[int, int]:

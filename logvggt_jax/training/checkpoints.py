@@ -12,7 +12,7 @@ import orbax.checkpoint as ocp
 
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.state import TrainState
-from logvggt_jax.weights.checkpoints import digests, save_model, verify_digests
+from logvggt_jax.weights.checkpoints import check_destination, digests, save_model, verify_digests
 
 LIBRARIES = ("logvggt-jax", "jax", "flax", "optax", "orbax-checkpoint", "grain")
 
@@ -35,6 +35,8 @@ class RunCheckpoints:
         self.config = config
         self.folder = workdir.expanduser().absolute() / "checkpoints"
         self.model_folder = self.folder.parent / "model"
+        # Now rather than after the steps before the first save.
+        check_destination(self.model_folder)
         # Saving is synchronous: the next step is given the state's buffers to overwrite.
         options = ocp.CheckpointManagerOptions(
             max_to_keep=config.keep_checkpoints, create=True, enable_async_checkpointing=False
@@ -53,9 +55,11 @@ class RunCheckpoints:
         return sorted(self._manager.all_steps())
 
     def save(self, state: TrainState, position: Position) -> None:
-        """Writes the checkpoint of `state.step` and replaces the model folder."""
+        """Replaces the model folder and writes the checkpoint of `state.step`."""
         step = int(state.step)
         params, rest = _parts(state)
+        # First, so that a run that is killed in between goes on from an older checkpoint and writes both again.
+        save_model(self.model_folder, self.config.model, params)
         meta = {
             "step": step,
             "stage": position.stage,
@@ -73,7 +77,6 @@ class RunCheckpoints:
             ),
             force=True,
         )
-        save_model(self.model_folder, self.config.model, params)
 
     def restore(self, like: TrainState, *, step: int | None = None) -> tuple[TrainState, Position]:
         """The state at `step` (None: the latest), with the shapes and placement of `like`.

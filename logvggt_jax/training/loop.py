@@ -163,8 +163,8 @@ class _Run:
         if values["longest_skip"] >= self.config.max_skipped_in_a_row:
             raise NonFiniteTraining(
                 f"step {step}: {values['longest_skip']:.0f} updates in a row had a non-finite loss or gradient "
-                f"(max_skipped_in_a_row={self.config.max_skipped_in_a_row}); lower optimizer.learning_rate or "
-                "resume from an earlier checkpoint with --resume_step"
+                f"(max_skipped_in_a_row={self.config.max_skipped_in_a_row}); start a new --workdir with a lower "
+                "optimizer.learning_rate, or resume from an earlier checkpoint with --resume_step"
             )
 
     def _validate(self, step: int, log: MetricsLog) -> None:

@@ -109,7 +109,7 @@ def save_model(path: str | Path, config: ModelConfig, params: Any) -> None:
             path.replace(old)
         try:
             fresh.replace(path)
-        except OSError:
+        except BaseException:  # Ctrl-C too: leaving the block removes what is in `old`
             if old.exists():
                 old.replace(path)
             raise

@@ -23,18 +23,46 @@ def run_eval(*arguments: str) -> subprocess.CompletedProcess[str]:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--output=nowhere"], "Flag --checkpoint must have a value"),
-        (["--checkpoint=c", "--output=o", "--config.evaluation.strides=3"], "strides"),
-        (["--checkpoint=c", "--output=o", "--data_root=d"], "leave --data_root=d out"),
-        (["--checkpoint=does-not-exist", "--output=o"], "does-not-exist"),
-        (["--checkpoint=c", "--output=o", "--config.evaluation.stride=0"], "stride must be at least 1"),
+        (["--config.evaluation.strides=3"], "no such field: 'strides' Did you mean \"stride\""),
+        (["--config.room.num_rooms=3"], "no such field: 'room'"),
+        (["--config=configs/eval/none.py"], "configs/eval/none.py"),
+        (["--data_root=d"], "leave --data_root=d out"),
+        (["--checkpoint=does-not-exist"], "does-not-exist"),
+        (["--config.evaluation.stride=0"], "stride must be at least 1"),
+        (["--config=configs/eval/seven_scenes.py", "--data_root=no-data"], "no-data: no such folder"),
     ],
 )
-def test_wrong_arguments_end_in_a_message(arguments: list[str], message: str) -> None:
-    result = run_eval("--config=configs/eval/rooms.py", *arguments)
+def test_wrong_arguments_are_one_line(arguments: list[str], message: str, tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    result = run_eval("--config=configs/eval/rooms.py", "--checkpoint=c", f"--output={output}", *arguments)
+    assert result.returncode == 1
+    assert result.stderr.startswith("eval.py: ")
+    assert result.stderr.count("\n") == 1
+    assert message in result.stderr
+    assert not output.exists()
+
+
+def test_missing_flags_are_named() -> None:
+    result = run_eval("--config=configs/eval/rooms.py", "--output=nowhere")
     assert result.returncode != 0
-    assert message in result.stderr + result.stdout
-    assert not (ROOT / "o").exists()
+    assert "Flag --checkpoint must have a value" in result.stderr + result.stdout
+    assert not (ROOT / "nowhere").exists()
+
+
+def test_parameters_of_another_configuration_are_named(
+    small_config: ModelConfig, small_variables: dict, tmp_path: Path
+) -> None:
+    model = tmp_path / "model"
+    save_model(model, small_config, small_variables["params"])
+    description = json.loads((model / "config.json").read_text())
+    description["config"]["depth_head"]["features"] = 16
+    (model / "config.json").write_text(json.dumps(description))
+    result = run_eval("--config=configs/eval/rooms.py", f"--checkpoint={model}", f"--output={tmp_path / 'out'}")
+    assert result.returncode == 1
+    assert result.stderr.count("\n") == 1
+    assert "depth_head" in result.stderr
+    assert "different models" in result.stderr
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow
@@ -44,7 +72,7 @@ def test_an_evaluation_leaves_tables_json_and_figures(
 ) -> None:
     save_model(tmp_path / "model", small_config, small_variables["params"])
     size = ["--config.evaluation.image_size=(28, 42)", "--config.evaluation.clip_lengths=(4, 6)"]
-    options = [*size, f"--checkpoint={tmp_path / 'model'}", f"--output={tmp_path / 'out'}"]
+    options = [*size, "--compilation_cache=none", f"--checkpoint={tmp_path / 'model'}", f"--output={tmp_path / 'out'}"]
     if name == "rooms":
         options.append("--config.rooms.num_rooms=2")
     else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import json
 from collections.abc import Callable, Sequence
@@ -17,7 +18,7 @@ from logvggt_jax.evaluation.baselines import all_baselines, depth_statistics, st
 from logvggt_jax.evaluation.methods import ClipPrediction, Method, network
 from logvggt_jax.evaluation.protocols import ClipScore, clip_score, data_set_score, points_at, prepare_truth
 from logvggt_jax.evaluation.report import print_report, tables, write_report
-from logvggt_jax.evaluation.runner import Clip, EvaluationConfig, evaluate, plan_clips, write_text
+from logvggt_jax.evaluation.runner import Clip, EvaluationConfig, EvaluationRun, evaluate, plan_clips, write_text
 from logvggt_jax.geometry import compose, unproject
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.types import Frames
@@ -162,8 +163,35 @@ def test_clips_that_cannot_be_read_are_listed(rooms: Rooms, tmp_path: Path) -> N
 def test_an_evaluation_of_nothing_is_an_error(rooms: Rooms, tmp_path: Path) -> None:
     config = EvaluationConfig(image_size=SIZE, clip_lengths=(50,))
     with pytest.raises(ValueError, match="no clip could be evaluated"):
-        run(rooms, [static_camera()], tmp_path, config)
-    assert not (tmp_path / "results.json").exists()
+        run(rooms, [static_camera()], tmp_path / "out", config)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_error_on_the_way_leaves_nothing_half_written(rooms: Rooms, tmp_path: Path) -> None:
+    calls: list[int] = []
+
+    def fail_at_the_third(images: np.ndarray) -> ClipPrediction:
+        calls.append(len(images))
+        if len(calls) == 3:
+            raise RuntimeError("out of memory")
+        return static_camera().predict(images)
+
+    method = dataclasses.replace(static_camera(), predict=fail_at_the_third)
+    with pytest.raises(RuntimeError, match="out of memory"):
+        run(rooms, [method], tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_results_of_an_earlier_run_are_replaced_and_other_files_are_not(rooms: Rooms, tmp_path: Path) -> None:
+    (tmp_path / "figures").mkdir()
+    stale = [tmp_path / name for name in ("report.md", "results.json", "figures/room-00001_from_0_9_frames_depth.png")]
+    for path in (*stale, tmp_path / "notes.txt"):
+        path.write_text("old")
+    run(rooms, [static_camera()], tmp_path)
+    assert not stale[0].exists()
+    assert stale[1].read_text() != "old"
+    assert not stale[2].exists()
+    assert (tmp_path / "notes.txt").read_text() == "old"
 
 
 def test_clips_are_evenly_spaced(rooms: Rooms) -> None:
@@ -256,12 +284,26 @@ def test_the_network_and_all_baselines_make_a_table(
         ({"stride": 0}, "stride must be at least 1"),
         ({"max_points": 0}, "max_points must be at least 1"),
         ({"icp_threshold": -1.0}, "icp_threshold must be positive"),
+        ({"stride": 1.5}, "stride must be a whole number"),
         ({"length": 4}, "unknown field evaluation.length"),
     ],
 )
 def test_wrong_settings_are_named(values: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         EvaluationConfig.from_dict({"image_size": SIZE, "clip_lengths": (4,), **values})
+
+
+def test_a_configuration_states_all_fields_and_no_other() -> None:
+    fields = {"title": "t", "dataset": "rooms", "split": "test", "baselines": False}
+    evaluation = {"image_size": SIZE, "clip_lengths": [4]}
+    run = EvaluationRun.from_dict({**fields, "evaluation": evaluation})
+    assert run.evaluation == EvaluationConfig(image_size=SIZE, clip_lengths=(4,))
+    with pytest.raises(ValueError, match="unknown field data_set; known are title, dataset"):
+        EvaluationRun.from_dict({**fields, "evaluation": evaluation, "data_set": "rooms"})
+    with pytest.raises(ValueError, match="field evaluation is missing"):
+        EvaluationRun.from_dict(fields)
+    with pytest.raises(ValueError, match=r"field evaluation\.clip_lengths is missing"):
+        EvaluationRun.from_dict({**fields, "evaluation": {"image_size": SIZE}})
 
 
 def test_a_file_is_written_whole_or_not_at_all(tmp_path: Path) -> None:

@@ -156,6 +156,24 @@ def test_only_results_are_overwritten_and_only_when_asked(tmp_path: Path) -> Non
     assert list(tmp_path.iterdir()) == [target]
 
 
+def test_a_folder_that_cannot_be_replaced_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    target = tmp_path / "out"
+    target.mkdir()
+    (target / "done").write_text("old")
+    original = Path.rename
+
+    def refuse(self: Path, new: Path) -> Path:
+        if self.name == "out.partial":
+            raise PermissionError(f"{self} is in use")
+        return original(self, new)
+
+    monkeypatch.setattr(Path, "rename", refuse)
+    with pytest.raises(PermissionError), output_folder(target, overwrite=True, marker="done") as folder:
+        (folder / "done").write_text("new")
+    assert (target / "done").read_text() == "old"
+    assert list(tmp_path.iterdir()) == [target]
+
+
 def test_two_runs_do_not_write_into_one_folder(tmp_path: Path) -> None:
     with (
         output_folder(tmp_path / "out", overwrite=False, marker="done"),

@@ -132,6 +132,37 @@ def test_points_are_the_depth_maps_unprojected(result: Reconstruction, expected:
     np.testing.assert_array_equal(colours, expected["images"][valid])
 
 
+def test_a_video_gives_the_same_results_as_a_folder_of_its_frames(
+    model: LogVGGT, variables: dict, room: Path, tmp_path: Path
+) -> None:
+    video, folder = tmp_path / "walk.mp4", tmp_path / "frames"
+    writer = cv2.VideoWriter(str(video), cv2.VideoWriter_fourcc(*"mp4v"), 10.0, (84, 56))
+    for file in sorted(room.glob("*.color.png")):
+        writer.write(cv2.imread(str(file)))
+    writer.release()
+    folder.mkdir()
+    for frame in open_source(video):
+        cv2.imwrite(str(folder / f"{frame.name}.png"), frame.image[..., ::-1])
+    results = [
+        reconstruct(
+            source,
+            tmp_path / f"from-{source.name}",
+            model=model,
+            variables=variables,
+            longer_edge=LONGER_EDGE,
+            progress=False,
+        )
+        for source in (video, folder)
+    ]
+    for name in ("points.ply", "depth/frame-000006.npz", "previews/frame-000000.png"):
+        first, second = ((result.folder / name).read_bytes() for result in results)
+        assert first == second, name
+    (times, poses), (positions, same) = (read_trajectory(result.folder / "trajectory.txt") for result in results)
+    np.testing.assert_array_equal(poses, same)
+    np.testing.assert_array_equal(positions, np.arange(COUNT))
+    np.testing.assert_allclose(times, np.arange(COUNT) / 10, atol=1e-6)
+
+
 def test_a_limit_on_points_holds(model: LogVGGT, variables: dict, room: Path, tmp_path: Path) -> None:
     limited = reconstruct(
         room,

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.experimental.pallas import tpu as pallas_tpu
 
 from logvggt_jax.model import attention as module
 from logvggt_jax.model.attention import attention
@@ -91,8 +92,59 @@ def test_bfloat16_softmax_is_float32(form):
 
 
 @pytest.mark.parametrize("implementation", ["cudnn", "tpu_flash"])
-def test_forms_that_do_not_fit_fall_back(implementation):
-    """Float32 has no cuDNN kernel, and the TPU's wants a block of keys: both take the XLA form."""
-    query, key, value = inputs()
+def test_float32_never_takes_a_kernel_that_rounds(implementation):
+    query, key, value = inputs(keys=520)
     out = attention(query, key, value, implementation=implementation)
     np.testing.assert_allclose(out, textbook(query, key, value), atol=2e-6)
+
+
+@pytest.mark.parametrize(
+    ("implementation", "sizes"), [("cudnn", {"head_dim": 12}), ("cudnn", {"head_dim": 136}), ("tpu_flash", {})]
+)
+def test_sizes_without_a_kernel_take_the_general_form(implementation, sizes):
+    """Head sizes that cuDNN refuses; fewer keys than a block of the TPU's kernel."""
+    query, key, value = inputs(dtype=jnp.bfloat16, **sizes)
+    out = attention(query, key, value, implementation=implementation)
+    np.testing.assert_array_equal(out, attention(query, key, value, implementation="xla"))
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_validity_as_a_length_equals_validity_as_a_mask(monkeypatch, masked):
+    """The call of cuDNN, answered by the general implementation: keys are reordered, valid ones first."""
+    general = jax.nn.dot_product_attention
+
+    def answer(*arguments, implementation, **options):
+        assert implementation == "cudnn"
+        return general(*arguments, implementation="xla", **options)
+
+    monkeypatch.setattr(jax.nn, "dot_product_attention", answer)
+    query, key, value = inputs(dtype=jnp.bfloat16)
+    valid = jnp.asarray(np.random.default_rng(1).random((2, 53)) < 0.6) if masked else None
+    out = attention(query, key, value, valid, implementation="cudnn")
+    assert out.dtype == jnp.bfloat16
+    np.testing.assert_allclose(np.asarray(out, np.float32), textbook(query, key, value, valid), atol=2e-2)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_the_tpu_kernel_computes_the_textbook(masked):
+    """Interpreted on this device; neither queries nor keys are whole blocks."""
+    query, key, value = inputs(queries=530, keys=600, heads=1, dtype=jnp.bfloat16)
+    valid = jnp.asarray(np.random.default_rng(1).random((2, 600)) < 0.6) if masked else None
+    with pallas_tpu.force_tpu_interpret_mode():
+        out = attention(query, key, value, valid, implementation="tpu_flash")
+    assert out.shape == query.shape
+    assert out.dtype == jnp.bfloat16
+    np.testing.assert_allclose(np.asarray(out, np.float32), textbook(query, key, value, valid), atol=2e-2)
+
+
+def test_a_checked_shard_map_takes_a_form_that_it_can_check():
+    """The TPU's kernel does not say over which devices its result varies."""
+    shape = jax.ShapeDtypeStruct((2, 520, 2, 64), jnp.bfloat16)
+    mesh = jax.make_mesh((2,), ("data",), axis_types=(jax.sharding.AxisType.Auto,))
+    data = jax.P("data")
+
+    def gradient(*arguments):
+        return jax.grad(lambda args: attention(*args, implementation="tpu_flash").astype(jnp.float32).sum())(arguments)
+
+    sharded = jax.shard_map(gradient, mesh=mesh, in_specs=(data, data, data), out_specs=data)
+    assert jax.eval_shape(sharded, shape, shape, shape)[0].shape == shape.shape

@@ -35,9 +35,7 @@ def test_values_and_gradients(size, strides, height, width):
 
     weights = generator.standard_normal(expected.shape).astype(np.float32)
     ours = jax.grad(lambda p, x: (layer.apply({"params": p}, x) * weights).sum(), argnums=(0, 1))
-    theirs = jax.grad(
-        lambda p, x: (reference(x, p["kernel"], p["bias"], strides) * weights).sum(), argnums=(0, 1)
-    )
+    theirs = jax.grad(lambda p, x: (reference(x, p["kernel"], p["bias"], strides) * weights).sum(), argnums=(0, 1))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4), ours(params, x), theirs(params, x))
 
 

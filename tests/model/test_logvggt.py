@@ -62,6 +62,25 @@ def test_a_thawed_encoder_is_trained_and_rematerialisation_changes_no_gradient(s
         )
 
 
+def test_training_runs_a_frozen_encoder_once_a_frame(small_config):
+    """A deeper encoder makes the gradient dearer by its forward pass alone, rematerialisation or not."""
+
+    def operations(depth: int, differentiate: bool) -> float:
+        encoder = dataclasses.replace(small_config.encoder, depth=depth)
+        model = LogVGGT(dataclasses.replace(small_config, encoder=encoder))
+        variables = jax.eval_shape(model.init, jax.random.key(0), video())
+
+        def loss(variables, images):
+            return jnp.log(model.run_windows(variables, images, remat=True).depth).sum()
+
+        function = jax.grad(loss) if differentiate else loss
+        return jax.jit(function).lower(variables, video()).cost_analysis()["flops"]
+
+    forward, gradient = (operations(2, each) - operations(1, each) for each in (False, True))
+    assert forward > 0
+    assert gradient == pytest.approx(forward, rel=1e-3)
+
+
 def test_gradients_flow_through_the_cache(small_config, small_variables):
     """A loss on the depth of the last frames depends on frame 1, which only the cache connects with them."""
     model = LogVGGT(thawed(small_config))
@@ -125,6 +144,21 @@ def test_works_inside_other_peoples_transformations(small_config, small_variable
     data, replicated = jax.P("data"), jax.P()
     sharded = jax.shard_map(model.apply, mesh=mesh, in_specs=(replicated, data), out_specs=data)
     np.testing.assert_allclose(jax.jit(sharded)(small_variables, images).depth, depth, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("mask", [None, np.ones((1, 5), bool)], ids=["no mask", "one mask for all devices"])
+def test_windows_may_be_sharded_without_a_mask_of_their_own(small_config, small_variables, mask):
+    """What varies over devices is tracked by type: the scan's state has to vary from the start as it does later."""
+    model = LogVGGT(small_config)
+    mesh = jax.make_mesh((4,), ("data",), axis_types=(jax.sharding.AxisType.Auto,))
+    for function in (model.run_windows, model.apply):
+        sharded = jax.shard_map(
+            functools.partial(function, frame_mask=mask),
+            mesh=mesh,
+            in_specs=(jax.P(), jax.P("data")),
+            out_specs=jax.P("data"),
+        )
+        assert jax.eval_shape(sharded, small_variables, video(5, batch=4)).depth.shape == (4, 5, 28, 42)
 
 
 def test_configuration_survives_json(small_config):

@@ -181,6 +181,24 @@ def test_memory_grows_at_most_linearly(small_config, small_variables):
     assert temporaries(4000) < 2.2 * temporaries(2000)
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({0: np.zeros((1, FRAMES, 32), np.float32)}, r"camera_tokens must be floating point \[any, any, 64\].*32"),
+        ({0: np.zeros((1, FRAMES, WIDTH), np.int32)}, r"camera_tokens must be floating point .*got int32"),
+        ({1: np.zeros((1, FRAMES, WIDTH), np.float32)}, r"register_tokens must be floating point \[1, any, 4, 64\]"),
+        ({1: np.zeros((2, FRAMES, 4, WIDTH), np.float32)}, r"register_tokens must be .*got float32 \[2, 11, 4, 64\]"),
+        ({2: full(FRAMES - 1)}, r"camera_mask must be bool \[1, 11\], got bool \[1, 10\]"),
+        ({3: full().astype(np.float32)}, r"register_mask must be bool \[1, 11\], got float32"),
+    ],
+)
+def test_wrong_input_is_named(small_config, small_variables, changes, message):
+    arguments = dict(enumerate((*tokens(), full(), full()))) | changes
+    with pytest.raises(ValueError, match=message) as error:
+        LogVGGT(small_config).refine(small_variables, *arguments.values())
+    assert "\n" not in str(error.value)
+
+
 def test_context_smaller_than_the_stride_is_refused(small_config):
     with pytest.raises(ValueError, match="context=1 must be at least the window stride 2"):
         with_refinement(small_config, context=1)

@@ -253,8 +253,17 @@ def test_wrong_input_is_named(small_config, small_variables, images, mask, messa
     assert "\n" not in str(error.value)
 
 
-def test_step_names_the_number_of_frames_it_takes(small_config, small_variables):
+@pytest.mark.parametrize(
+    ("frames", "message"),
+    [
+        (video(3), r"step takes 2 frames.*got 3"),
+        (video(2)[..., :14, :], r"continues a stream of 1 x \(28, 42\) images.*got 1 x \(28, 14\)"),
+        (video(2, batch=3), r"continues a stream of 1 x \(28, 42\) images.*got 3 x \(28, 42\)"),
+    ],
+)
+def test_step_names_what_it_takes(small_config, small_variables, frames, message):
     model = LogVGGT(small_config)
     state = jax.eval_shape(model.start, small_variables, video(2))
-    with pytest.raises(ValueError, match=r"step takes 2 frames.*got 3"):
-        jax.eval_shape(model.step, small_variables, state, video(3))
+    with pytest.raises(ValueError, match=message) as error:
+        jax.eval_shape(model.step, small_variables, state, frames)
+    assert "\n" not in str(error.value)

@@ -1,0 +1,69 @@
+"""Similarity transforms: exact where the points fit, robust where some do not, refused where none exists."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from logvggt_jax.geometry import Similarity, quaternion_to_matrix, robust_similarity, umeyama
+
+TRUTH = Similarity(2.5, quaternion_to_matrix(np.array([0.3, -0.5, 0.2, 0.8])), np.array([1.0, -2.0, 3.0]))
+
+
+def points(count: int = 50) -> np.ndarray:
+    return np.random.default_rng(0).normal(size=(count, 3))
+
+
+def assert_same(found: Similarity, expected: Similarity, tolerance: float = 1e-10) -> None:
+    assert found.scale == pytest.approx(expected.scale, rel=tolerance)
+    np.testing.assert_allclose(found.rotation, expected.rotation, atol=tolerance)
+    np.testing.assert_allclose(found.translation, expected.translation, atol=10 * tolerance)
+
+
+@pytest.mark.parametrize("count", [3, 50])
+@pytest.mark.parametrize("size", [1.0, 1e-6])
+def test_exact_correspondences_give_the_transform(count: int, size: float) -> None:
+    source = size * points(count)
+    found = umeyama(source, TRUTH.apply(source))
+    assert_same(found, TRUTH, 1e-8)
+    assert np.linalg.det(found.rotation) == pytest.approx(1.0)
+
+
+def test_a_mirrored_cloud_still_gives_a_rotation() -> None:
+    found = umeyama(points(), points() * [1.0, 1.0, -1.0])
+    assert np.linalg.det(found.rotation) == pytest.approx(1.0)
+    assert found.scale > 0
+
+
+def test_points_without_weight_have_no_influence() -> None:
+    target = TRUTH.apply(points())
+    target[:10] += 100.0
+    assert_same(umeyama(points(), target, np.arange(50) >= 10), TRUTH)
+
+
+def test_outliers_move_the_robust_transform_less() -> None:
+    target = TRUTH.apply(points())
+    target[:5] += 3.0
+    robust, plain = robust_similarity(points(), target, threshold=0.05, iterations=20), umeyama(points(), target)
+    inliers = slice(5, None)
+
+    def error(similarity: Similarity) -> float:
+        return float(np.abs(similarity.apply(points()[inliers]) - target[inliers]).max())
+
+    assert error(robust) < 0.1 * error(plain)
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        (points(2), "at least 3 corresponding points, got 2"),
+        (np.ones((5, 3)), "no unique similarity"),
+        (np.arange(5.0)[:, None] * [1.0, 2.0, 3.0], "no unique similarity"),
+        (points(5) * np.nan, "no similarity: a point or weight is not finite"),
+        (points(5)[:, :2], "two .* arrays"),
+    ],
+)
+def test_degenerate_points_are_refused(source: np.ndarray, message: str) -> None:
+    with pytest.raises(ValueError, match=message) as error:
+        umeyama(source, source)
+    assert "\n" not in str(error.value)

@@ -1,0 +1,69 @@
+"""The full-size inference step as a program for accelerators, compiled or lowered without having them.
+
+The compilers run in processes of their own: JAX in this one is tied to the CPU, at a low level of optimisation.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+SCRIPT = Path(__file__).parents[2] / "benchmarks" / "compile_step.py"
+# Encoder, frame and global blocks of VGGT-1B: one attention each.
+ATTENTIONS = 3 * 24
+GIB = 2**30
+
+
+def described(target: str) -> str:
+    """What the script prints of one target; shown with the test's report."""
+    own = ("XLA_FLAGS", "JAX_PLATFORMS", "JAX_NUM_CPU_DEVICES")
+    environment = {name: value for name, value in os.environ.items() if name not in own}
+    finished = subprocess.run(
+        [sys.executable, str(SCRIPT), "--target", target],
+        capture_output=True,
+        text=True,
+        timeout=1200,
+        check=False,
+        env=environment,
+    )
+    assert finished.returncode == 0, finished.stderr[-3000:]
+    print(finished.stdout)
+    (line,) = [line for line in finished.stdout.splitlines() if line.startswith(f"{target}:")]
+    return line
+
+
+def figure(pattern: str, line: str) -> float:
+    found = re.search(pattern, line)
+    assert found is not None, line
+    return float(found[1])
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(importlib.util.find_spec("libtpu") is None, reason='needs the TPU compiler: pip install "libtpu"')
+@pytest.mark.parametrize(("topology", "memory"), [("v5e:2x2x1", 16e9), ("v5p:2x2x1", 95e9)])
+def test_compiles_for_a_described_tpu_with_the_flash_kernel(topology: str, memory: float) -> None:
+    line = described(topology)
+    assert figure(r"(\d+) calls of the flash kernel", line) >= ATTENTIONS
+    arguments = figure(r"arguments ([\d.]+) GiB", line) * GIB
+    temporaries = figure(r"temporaries ([\d.]+) GiB", line) * GIB
+    assert arguments > 4e9, "a billion parameters of four bytes"
+    assert temporaries > 0
+    assert arguments + temporaries < memory
+
+
+@pytest.mark.slow
+def test_lowers_for_cuda_with_cudnn_attention() -> None:
+    line = described("cuda")
+    assert figure(r"(\d+) calls of cuDNN attention", line) >= ATTENTIONS
+
+
+@pytest.mark.slow
+def test_lowers_and_compiles_for_a_cpu_within_a_minute() -> None:
+    line = described("cpu")
+    assert figure(r"lowered in ([\d.]+) s", line) + figure(r"compiled in ([\d.]+) s", line) < 60

@@ -1,0 +1,56 @@
+"""The commands that `make demo` runs exist, as do the settings that they name."""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+import operator
+import shlex
+import subprocess
+from pathlib import Path
+
+import pytest
+from ml_collections import config_dict
+
+from logvggt_jax.cli import _parser
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def commands() -> list[list[str]]:
+    done = subprocess.run(["make", "-n", "demo"], cwd=ROOT, capture_output=True, text=True, check=True, timeout=60)
+    return [shlex.split(line) for line in done.stdout.replace("\\\n", " ").splitlines()]
+
+
+def test_the_demo_names_configurations_and_fields_that_exist(
+    commands: list[list[str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(ROOT))
+    scripts = []
+    for words in commands:
+        options = dict(word.removeprefix("--").split("=", 1) for word in words if word.startswith("--") and "=" in word)
+        if "config" not in options:
+            continue
+        scripts += [word for word in words if word.endswith(".py") and not word.startswith("--")]
+        spec = importlib.util.spec_from_file_location("configuration", ROOT / options["config"])
+        assert spec is not None
+        assert spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        config = module.get_config()
+        assert isinstance(config, config_dict.ConfigDict)
+        for name in options:
+            if name.startswith("config."):
+                functools.reduce(operator.getitem, name.split(".")[1:], config)
+    assert scripts == ["train.py", "eval.py"]
+
+
+def test_the_demo_calls_the_command_line_as_it_is(commands: list[list[str]]) -> None:
+    called = []
+    for words in commands:
+        for position, word in enumerate(words):
+            if word.endswith("/logvggt"):
+                _parser().parse_args(words[position + 1 :])
+                called.append(words[position + 1])
+    assert called == ["render-room", "reconstruct"]
