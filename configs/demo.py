@@ -1,6 +1,6 @@
 """The tiny model for `make demo`: about six minutes of training on two CPU cores, compilation included.
 
-python train.py --config=configs/demo.py --workdir=runs/demo
+python train.py --config=configs/demo.py --workdir=runs/demo/training
 """
 
 from ml_collections import ConfigDict
