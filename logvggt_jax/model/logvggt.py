@@ -124,7 +124,7 @@ class LogVGGT:
         remat: bool = False,
     ) -> WindowOutput:
         """All windows of sequences [B, T, H, W, 3] as one scan; the outputs of `apply` short of the poses."""
-        self._mask(images, frame_mask)
+        whole_mask = self._mask(images, frame_mask)
         num_frames, stride, overlap = images.shape[1], self.config.windows.stride, self._overlap
 
         def frames_from(first: jax.Array | int, count: int) -> tuple[jax.Array, jax.Array]:
@@ -151,24 +151,27 @@ class LogVGGT:
         one_step = jax.eval_shape(advance, state, jnp.int32(0))[1]
         buffers = jax.tree.map(
             lambda x: jnp.zeros_like(state.patch_tokens, shape=(x.shape[0], padded, *x.shape[2:]), dtype=x.dtype),
-            one_step,
+            dataclasses.replace(one_step, frame_mask=None),
         )
 
         def write(buffers: WindowOutput, out: WindowOutput, first: jax.Array | int) -> WindowOutput:
             return jax.tree.map(
-                lambda buffer, x: jax.lax.dynamic_update_slice_in_dim(buffer, x, first, axis=1), buffers, out
+                lambda buffer, x: jax.lax.dynamic_update_slice_in_dim(buffer, x, first, axis=1),
+                buffers,
+                dataclasses.replace(out, frame_mask=None),
             )
 
         def body(
-            carry: tuple[WindowState, WindowOutput], window: jax.Array
-        ) -> tuple[tuple[WindowState, WindowOutput], None]:
-            state, buffers = carry
+            carry: tuple[WindowState, WindowOutput, jax.Array], _: None
+        ) -> tuple[tuple[WindowState, WindowOutput, jax.Array], None]:
+            state, buffers, window = carry
             state, out = advance(state, window)
-            return (state, write(buffers, out, window * stride)), None
+            return (state, write(buffers, out, window * stride), window + 1), None
 
-        (state, buffers), _ = jax.lax.scan(body, (state, buffers), jnp.arange(windows))
+        (state, buffers, _), _ = jax.lax.scan(body, (state, buffers, jnp.int32(0)), length=windows)
         buffers = write(buffers, self.finish(variables, state), windows * stride)
-        return jax.tree.map(lambda x: x[:, :num_frames], buffers)
+        frames = jax.tree.map(lambda x: x[:, :num_frames], buffers)
+        return dataclasses.replace(frames, frame_mask=whole_mask)
 
     # Streams.
 
@@ -300,12 +303,12 @@ class LogVGGT:
         register_mask: jax.Array,
     ) -> jax.Array:
         """GCCR alone: [B, N, 2C], [B, M, 4, 2C], bool [B, M] -> [B, N, 2C]; the identity when disabled."""
+        if not self.config.refinement.enabled:
+            return camera_tokens
         width, registers = 2 * self.config.encoder.embed_dim, self.config.aggregator.num_registers
         _check("camera_tokens", camera_tokens, (None, None, width), jnp.floating)
         _check("register_tokens", register_tokens, (len(camera_tokens), None, registers, width), jnp.floating)
         _check("register_mask", register_mask, register_tokens.shape[:2], jnp.bool_)
-        if not self.config.refinement.enabled:
-            return camera_tokens
         params = variables["params"]["gccr"]
         return _run(self._gccr, params, camera_tokens, register_tokens, register_mask)
 

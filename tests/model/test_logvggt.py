@@ -55,10 +55,10 @@ def test_a_thawed_encoder_is_trained_and_rematerialisation_changes_no_gradient(s
     silent = {name for name, norm in norms(again).items() if norm == 0}
     assert silent == {"['encoder']['mask_token']"}
     for part in set(plain) - {"encoder"}:
+        # Some gradients are zero but for rounding (keys' biases, say): the part's largest sets the scale.
+        scale = max(float(np.abs(leaf).max()) for leaf in jax.tree.leaves(plain[part]))
         jax.tree.map(
-            lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3 * np.abs(a).max()),
-            plain[part],
-            again[part],
+            functools.partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-5 * scale), plain[part], again[part]
         )
 
 
@@ -96,8 +96,13 @@ def test_bfloat16_stays_close_to_float32(small_config, small_variables):
     """Norm of the difference over norm of the reference."""
     model = LogVGGT(small_config)
     half = LogVGGT(dataclasses.replace(small_config, dtype="bfloat16"))
-    expected = jax.jit(model.apply)(small_variables, video())
-    actual = jax.jit(half.apply)(small_variables, video())
+    # Depths of ordinary size: of exponentials up to a million, one pixel would make up the whole norm.
+    variables = jax.tree.map(np.asarray, small_variables)
+    output = variables["params"]["depth_head"]["output_2"]
+    variables["params"]["depth_head"]["output_2"] = jax.tree.map(lambda x: 0.1 * x, output)
+    expected = jax.jit(model.apply)(variables, video())
+    actual = jax.jit(half.apply)(variables, video())
+    assert 1.5 < np.asarray(expected.depth).max() < 100
     for name in ("camera_tokens", "register_tokens", "depth", "depth_confidence", "pose_encodings"):
         a, b = np.asarray(getattr(actual, name)), np.asarray(getattr(expected, name))
         assert a.dtype == np.float32

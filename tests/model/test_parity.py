@@ -176,6 +176,15 @@ def test_cameras(predictions, golden):
     assert relative_error(predictions.intrinsics[0], golden["intrinsics"]) <= DENSE
 
 
+@pytest.mark.slow
+def test_bfloat16_stays_close_to_float32(predictions, golden, converted):
+    config, params = converted
+    model = LogVGGT(dataclasses.replace(config, dtype="bfloat16"))
+    found = jax.jit(model.apply)({"params": params}, golden["images_u8"][None])
+    for name in ("camera_tokens", "register_tokens", "depth", "depth_confidence", "pose_encodings"):
+        assert relative_error(getattr(found, name), getattr(predictions, name)) <= 1e-2, name
+
+
 def test_the_first_window_is_vggt_on_its_frames(golden, converted):
     config, params = converted
     model = LogVGGT(dataclasses.replace(config, point_head=None, windows=WindowConfig(size=4, stride=2)))
