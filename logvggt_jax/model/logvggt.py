@@ -124,7 +124,7 @@ class LogVGGT:
         remat: bool = False,
     ) -> WindowOutput:
         """All windows of sequences [B, T, H, W, 3] as one scan; the outputs of `apply` short of the poses."""
-        whole_mask = self._mask(images, frame_mask)
+        self._mask(images, frame_mask)
         num_frames, stride, overlap = images.shape[1], self.config.windows.stride, self._overlap
 
         def frames_from(first: jax.Array | int, count: int) -> tuple[jax.Array, jax.Array]:
@@ -151,14 +151,12 @@ class LogVGGT:
         one_step = jax.eval_shape(advance, state, jnp.int32(0))[1]
         buffers = jax.tree.map(
             lambda x: jnp.zeros_like(state.patch_tokens, shape=(x.shape[0], padded, *x.shape[2:]), dtype=x.dtype),
-            dataclasses.replace(one_step, frame_mask=None),
+            one_step,
         )
 
         def write(buffers: WindowOutput, out: WindowOutput, first: jax.Array | int) -> WindowOutput:
             return jax.tree.map(
-                lambda buffer, x: jax.lax.dynamic_update_slice_in_dim(buffer, x, first, axis=1),
-                buffers,
-                dataclasses.replace(out, frame_mask=None),
+                lambda buffer, x: jax.lax.dynamic_update_slice_in_dim(buffer, x, first, axis=1), buffers, out
             )
 
         def body(
@@ -170,8 +168,7 @@ class LogVGGT:
 
         (state, buffers, _), _ = jax.lax.scan(body, (state, buffers, jnp.int32(0)), length=windows)
         buffers = write(buffers, self.finish(variables, state), windows * stride)
-        frames = jax.tree.map(lambda x: x[:, :num_frames], buffers)
-        return dataclasses.replace(frames, frame_mask=whole_mask)
+        return jax.tree.map(lambda x: x[:, :num_frames], buffers)
 
     # Streams.
 
