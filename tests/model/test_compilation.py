@@ -52,7 +52,7 @@ def test_compiles_for_a_described_tpu_with_the_flash_kernel(topology: str, memor
     assert figure(r"(\d+) calls of the flash kernel", line) >= ATTENTIONS
     arguments = figure(r"arguments ([\d.]+) GiB", line) * GIB
     temporaries = figure(r"temporaries ([\d.]+) GiB", line) * GIB
-    assert arguments > 4e9, "a billion parameters of four bytes"
+    assert arguments > 3.7e9, "what the step reads: encoder, aggregator and depth head, 0.94 billion float32"
     assert temporaries > 0
     assert arguments + temporaries < memory
 
