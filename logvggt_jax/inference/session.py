@@ -167,7 +167,7 @@ class StreamSession:
           ValueError: another shape or dtype, or the session is closed.
         """
         if self._closed:
-            raise ValueError("this session is closed: make another StreamSession for another sequence")
+            raise ValueError("this stream is closed: make another StreamSession for another sequence")
         frames = np.asarray(frames)
         frames = frames[None] if frames.ndim == 3 else frames
         self._check(frames)
