@@ -10,6 +10,7 @@ identity for the first thousands of steps.
 import math
 
 from ml_collections import ConfigDict
+from ml_collections.config_dict import placeholder
 
 HEIGHT, WIDTH = 56, 70
 # Focal lengths of `compass` rooms in units of the image width, and their middle.
@@ -22,7 +23,7 @@ def get_config() -> ConfigDict:
     """The run; fields as `logvggt_jax.training.config.TrainConfig` and `ModelConfig` document them."""
     config = ConfigDict()
     config.seed = 0
-    config.initial_weights = None
+    config.initial_weights = placeholder(str)
     config.model = {
         # 4 x 5 patches: the position embedding needs no more than a grid of 5.
         "encoder": {"embed_dim": 64, "depth": 2, "num_heads": 4, "position_grid": 5, "frozen": False},
@@ -77,7 +78,7 @@ def get_config() -> ConfigDict:
         "reverse": 0.5,
         "worker_count": 0,
         "num_threads": 1,
-        "cache_dir": None,
+        "cache_dir": placeholder(str),
     }
     config.validation = {
         "source": {
@@ -96,7 +97,7 @@ def get_config() -> ConfigDict:
     config.save_every = 500
     config.keep_checkpoints = 2
     config.max_skipped_in_a_row = 20
-    config.max_minutes = None
+    config.max_minutes = placeholder(float)
     return config
 
 

@@ -14,12 +14,13 @@ PACKAGE = ROOT / "logvggt_jax"
 ALLOWED = {
     "types": set(),
     "config": set(),
+    "user_cache": set(),
     "geometry": set(),
     "model": {"types", "config", "geometry"},
-    "data": {"types", "config", "geometry"},
+    "data": {"types", "config", "user_cache", "geometry"},
     "weights": {"types", "config", "geometry", "model"},
     "training": {"types", "config", "geometry", "model", "weights", "data", "evaluation"},
-    "inference": {"types", "config", "geometry", "model", "weights", "data"},
+    "inference": {"types", "config", "user_cache", "geometry", "model", "weights", "data"},
     "evaluation": {"types", "config", "geometry", "model", "weights", "data"},
 }
 ENTRY_POINTS = {"__init__", "__main__", "cli"}

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import jax
 
+from logvggt_jax.user_cache import user_cache_folder
+
 
 def default_cache_folder() -> Path:
     """`logvggt/xla` in the user's cache folder (`XDG_CACHE_HOME`, else `~/.cache`)."""
-    base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-    return Path(base).expanduser() / "logvggt" / "xla"
+    return user_cache_folder("xla")
 
 
 def enable_compilation_cache(folder: str | None = None) -> Path | None:

@@ -134,7 +134,7 @@ def test_splits_follow_the_list_files(root: Path):
     assert SevenScenes(den).sequences == ("den/seq-01", "den/seq-02")
     assert SevenScenes(den, "train").sequences == ("den/seq-01",)
     assert SevenScenes(den, "test").sequences == ("den/seq-02",)
-    with pytest.raises(ValueError, match="no validation split"):
+    with pytest.raises(ValueError, match="7-Scenes has no split 'val'"):
         SevenScenes(den, "val")
     with pytest.raises(FileNotFoundError, match=r"attic/TestSplit\.txt.*split='all'"):
         SevenScenes(root, "test")
@@ -150,7 +150,7 @@ def test_roots_without_sequences_or_of_two_kinds_are_refused(root: Path):
     with pytest.raises(FileNotFoundError, match="absent: no such folder"):
         SevenScenes(root / "absent")
     (root / "empty").mkdir()
-    with pytest.raises(FileNotFoundError, match="no 7-Scenes sequences"):
+    with pytest.raises(FileNotFoundError, match="no sequences of 7-Scenes"):
         SevenScenes(root / "empty")
     write_frame(root / "seq-01", 0, size=(48, 64))
     with pytest.raises(ValueError, match="side by side"):

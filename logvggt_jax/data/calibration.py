@@ -1,0 +1,100 @@
+"""Numbers from calibration and pose files, checked: intrinsics in pixels, world-to-camera OpenCV extrinsics."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from logvggt_jax.geometry import invert, nearest_rotation
+
+# Camera axes x right, y up, z back to x right, y down, z forward, and the reverse; multiplied from the right onto
+# camera-to-world, from the left onto world-to-camera matrices.
+OPENGL_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
+_ROTATION_TOLERANCE = 0.01
+# Focal length over the longer edge: a full circle's fisheye is below, a telescope above.
+_FOCAL_RANGE = (0.1, 50.0)
+
+
+def numbers(text: str, where: str | Path, *, count: int | None = None) -> np.ndarray:
+    """All numbers of a text, float64 [n]; nan and inf are numbers.
+
+    Raises ValueError naming `where` for other words, or another number than `count`.
+    """
+    try:
+        values = np.array([float(word) for word in text.replace(",", " ").split()])
+    except ValueError as error:
+        raise ValueError(f"{where}: expected numbers: {error}; fetch the file again") from error
+    if count is not None and len(values) != count:
+        raise ValueError(f"{where}: expected {count} numbers, got {len(values)}: fetch the file again")
+    return values
+
+
+def pinhole(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
+    """Intrinsics [3, 3] float64, pixels with centres at integers."""
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+def scaled(intrinsics: np.ndarray, scale_x: float, scale_y: float) -> np.ndarray:
+    """Intrinsics [3, 3] of a picture resized by these factors: f' = s f, c' = (c + 0.5) s - 0.5."""
+    shift = np.array([[scale_x, 0, 0.5 * scale_x - 0.5], [0, scale_y, 0.5 * scale_y - 0.5], [0, 0, 1]])
+    return shift @ intrinsics
+
+
+def world_to_camera(pose: np.ndarray, where: str | Path, *, stored: str) -> np.ndarray | None:
+    """World-to-camera [4, 4] float64 of a stored rigid transform, its rotation projected onto SO(3).
+
+    Args:
+      pose: [3, 4] or [4, 4], OpenCV camera axes.
+      where: file (and line) for errors.
+      stored: `camera_to_world` or `world_to_camera`, what `pose` is.
+
+    Returns:
+      The extrinsics, or None where `pose` is not finite (lost tracking).
+
+    Raises:
+      ValueError: not a rotation to 0.01, mirrored, or a last row other than 0 0 0 1.
+    """
+    if not np.isfinite(pose).all():
+        return None
+    rotation = nearest_rotation(np.asarray(pose[:3, :3], np.float64))
+    last_row_fits = len(pose) == 3 or np.abs(pose[3] - [0, 0, 0, 1]).max() < 1e-3
+    if not last_row_fits or np.abs(pose[:3, :3] - rotation).max() > _ROTATION_TOLERANCE:
+        raise ValueError(
+            f"{where}: not a rigid transform (a rotation to {_ROTATION_TOLERANCE} and the last row 0 0 0 1 are "
+            "expected): fetch the file again"
+        )
+    rigid = np.eye(4)
+    rigid[:3, :3], rigid[:3, 3] = rotation, pose[:3, 3]
+    if stored == "world_to_camera":
+        return rigid
+    if stored == "camera_to_world":
+        return invert(rigid)
+    raise ValueError(f"stored must be camera_to_world or world_to_camera, got {stored!r}")
+
+
+def check_intrinsics(intrinsics: np.ndarray, size: tuple[int, int], where: str | Path) -> None:
+    """Raises ValueError naming `where` unless intrinsics [3, 3] can belong to a picture of `size` (H, W).
+
+    Expected: finite, focal lengths of 0.1 to 50 times the longer edge, a principal point within half a picture of
+    the picture, no more than a little skew, the last row 0 0 1.
+    """
+    height, width = size
+    longer = max(size)
+    low, high = _FOCAL_RANGE[0] * longer, _FOCAL_RANGE[1] * longer
+    fx, fy, cx, cy = intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]
+    plausible = (
+        np.isfinite(intrinsics).all()
+        and low <= fx <= high
+        and low <= fy <= high
+        and -width / 2 <= cx <= 1.5 * width
+        and -height / 2 <= cy <= 1.5 * height
+        and abs(intrinsics[0, 1]) < 0.1 * fx
+        and np.abs(intrinsics[1:, 0]).max() < 1e-6
+        and np.abs(intrinsics[2] - [0, 0, 1]).max() < 1e-6
+    )
+    if not plausible:
+        raise ValueError(
+            f"{where}: intrinsics fx={fx:g} fy={fy:g} cx={cx:g} cy={cy:g} cannot belong to a picture of "
+            f"{width} x {height}: fetch the calibration again"
+        )
