@@ -11,6 +11,8 @@ import functools
 import jax
 import jax.numpy as jnp
 
+from logvggt_jax.model.precision import product_precision
+
 # Scores of one block: small enough for a CPU's cache hierarchy, large enough to keep matrix units busy.
 _BLOCK_SCORES = {"cpu": 2**20, "gpu": 2**26, "tpu": 2**24}
 # Below this many scores in all, one batched product beats any loop.
@@ -64,15 +66,16 @@ def _weights(scores: jax.Array, valid: jax.Array | None) -> jax.Array:
 
 def _batched(query: jax.Array, key: jax.Array, value: jax.Array, key_valid: jax.Array | None) -> jax.Array:
     scale = query.shape[-1] ** -0.5
-    scores = jnp.einsum("bqhd,bkhd->bhqk", query * scale, key, preferred_element_type=jnp.float32)
+    precision = product_precision(query.dtype)
+    scores = jnp.einsum("bqhd,bkhd->bhqk", query * scale, key, precision=precision, preferred_element_type=jnp.float32)
     weights = _weights(scores, None if key_valid is None else key_valid[:, None, None, :])
-    return jnp.einsum("bhqk,bkhd->bqhd", weights.astype(value.dtype), value)
+    return jnp.einsum("bhqk,bkhd->bqhd", weights.astype(value.dtype), value, precision=precision)
 
 
 def _blockwise(query: jax.Array, key: jax.Array, value: jax.Array, key_valid: jax.Array | None) -> jax.Array:
     """Exact attention, one block of queries of a few heads at a time; the backward pass recomputes a block."""
     batch, queries, heads, head_dim = query.shape
-    keys = key.shape[1]
+    keys, precision = key.shape[1], product_precision(query.dtype)
     block_scores = _BLOCK_SCORES.get(jax.default_backend(), 2**20)
     block = max(1, min(queries, block_scores // keys))
     heads_at_once = max(1, min(heads, block_scores // (block * keys)))
@@ -98,11 +101,11 @@ def _blockwise(query: jax.Array, key: jax.Array, value: jax.Array, key_valid: ja
         q_block = jax.lax.dynamic_index_in_dim(q_block, position, 1, keepdims=False)
         k_block = jax.lax.dynamic_index_in_dim(k, group, 0, keepdims=False)
         v_block = jax.lax.dynamic_index_in_dim(v, group, 0, keepdims=False)
-        scores = jnp.einsum("hqd,hkd->hqk", q_block, k_block, preferred_element_type=jnp.float32)
+        scores = jnp.einsum("hqd,hkd->hqk", q_block, k_block, precision=precision, preferred_element_type=jnp.float32)
         valid = None
         if key_valid is not None:
             valid = jax.lax.dynamic_index_in_dim(key_valid, group // (groups // batch), 0, keepdims=False)
-        return jnp.einsum("hqk,hkd->hqd", _weights(scores, valid).astype(v.dtype), v_block)
+        return jnp.einsum("hqk,hkd->hqd", _weights(scores, valid).astype(v.dtype), v_block, precision=precision)
 
     out = jax.lax.map(one_block, jnp.arange(groups * num_blocks))
     out = out.reshape(batch, heads // heads_at_once, num_blocks, heads_at_once, block, head_dim)

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from logvggt_jax.model.initializers import constant, fan_in_normal
+from logvggt_jax.model.precision import product_precision
 
 
 class Convolution(nn.Module):
@@ -32,7 +33,7 @@ class Convolution(nn.Module):
         kernel = self.param("kernel", fan_in_normal, (size, size, channels, self.features)).astype(dtype)
         x = x.astype(dtype)
         if size == 1:
-            y = x @ kernel[0, 0]
+            y = jnp.matmul(x, kernel[0, 0], precision=product_precision(dtype))
         elif self.strides == 1 and jax.default_backend() == "cpu":
             # The sum makes the kernel vary over devices as x does, for shard_map's sake.
             y = _looped_convolution(x, kernel + jnp.zeros_like(x, shape=kernel.shape))
@@ -51,6 +52,7 @@ def _convolve(x: jax.Array, kernel: jax.Array, strides: int) -> jax.Array:
         (strides, strides),
         ((margin, margin), (margin, margin)),
         dimension_numbers=("NHWC", "HWIO", "NHWC"),
+        precision=product_precision(x.dtype),
     )
 
 
@@ -72,7 +74,9 @@ def _backward(saved: tuple[jax.Array, jax.Array], gradient: jax.Array) -> tuple[
     margin = (size - 1) // 2
     padded = jnp.pad(x, ((0, 0), (margin, margin), (margin, margin), (0, 0)))
     shifted = [padded[:, i : i + height, j : j + width] for i in range(size) for j in range(size)]
-    kernel_gradient = jnp.einsum("nhwc,nhwf->cf", jnp.concatenate(shifted, axis=-1), gradient)
+    kernel_gradient = jnp.einsum(
+        "nhwc,nhwf->cf", jnp.concatenate(shifted, axis=-1), gradient, precision=product_precision(x.dtype)
+    )
     return x_gradient, kernel_gradient.reshape(kernel.shape)
 
 

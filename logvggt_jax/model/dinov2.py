@@ -10,6 +10,7 @@ import numpy as np
 from logvggt_jax.config import EncoderConfig
 from logvggt_jax.model.initializers import constant, fan_in_normal, normal
 from logvggt_jax.model.layers import Block, layer_norm
+from logvggt_jax.model.precision import product_precision
 
 _IMAGE_MEAN = np.array([0.485, 0.456, 0.406], np.float32)
 _IMAGE_STD = np.array([0.229, 0.224, 0.225], np.float32)
@@ -33,7 +34,8 @@ class PatchEmbedding(nn.Module):
         patches = images.reshape(count, height // size, size, width // size, size, channels)
         patches = patches.transpose(0, 1, 3, 2, 4, 5).reshape(count, -1, size * size * channels)
         dtype = jnp.dtype(self.dtype)
-        return patches.astype(dtype) @ kernel.reshape(-1, self.features).astype(dtype) + bias.astype(dtype)
+        matrix = kernel.reshape(-1, self.features).astype(dtype)
+        return jnp.matmul(patches.astype(dtype), matrix, precision=product_precision(dtype)) + bias.astype(dtype)
 
 
 class DinoV2(nn.Module):

@@ -14,6 +14,7 @@ from logvggt_jax.config import DPTConfig
 from logvggt_jax.model.convolution import Convolution
 from logvggt_jax.model.initializers import constant, normal
 from logvggt_jax.model.layers import layer_norm
+from logvggt_jax.model.precision import product_precision
 
 
 class DPTHead(nn.Module):
@@ -67,7 +68,9 @@ class UpConv(nn.Module):
         kernel = self.param("kernel", normal(x.shape[-1] ** -0.5), shape)
         bias = self.param("bias", constant(0.0), (self.features,))
         dtype = jnp.dtype(self.dtype)
-        tiles = jnp.einsum("nijc,abco->niajbo", x.astype(dtype), kernel.astype(dtype))
+        tiles = jnp.einsum(
+            "nijc,abco->niajbo", x.astype(dtype), kernel.astype(dtype), precision=product_precision(dtype)
+        )
         count, height, _, width, _, _ = tiles.shape
         return tiles.reshape(count, height * k, width * k, self.features) + bias.astype(dtype)
 
@@ -133,8 +136,9 @@ def _resize_bilinear(x: jax.Array, size: tuple[int, int]) -> jax.Array:
         return x
     rows = jnp.asarray(_interpolation_matrix(x.shape[1], size[0]), x.dtype)
     columns = jnp.asarray(_interpolation_matrix(x.shape[2], size[1]), x.dtype)
-    x = jnp.einsum("yh,nhwc->nywc", rows, x)
-    return jnp.einsum("xw,nywc->nyxc", columns, x)
+    precision = product_precision(x.dtype)
+    x = jnp.einsum("yh,nhwc->nywc", rows, x, precision=precision)
+    return jnp.einsum("xw,nywc->nyxc", columns, x, precision=precision)
 
 
 def _uv_embedding(shape: tuple[int, ...], aspect: float) -> np.ndarray:

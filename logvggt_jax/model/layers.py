@@ -11,6 +11,7 @@ import jax.numpy as jnp
 
 from logvggt_jax.model.attention import attention
 from logvggt_jax.model.initializers import constant, fan_in_normal
+from logvggt_jax.model.precision import product_precision
 from logvggt_jax.model.rope import RopeTable, apply_rope
 
 
@@ -19,6 +20,7 @@ def dense(features: int, name: str, dtype: str = "float32", *, kernel_init: Any 
     return nn.Dense(
         features,
         dtype=dtype,
+        precision=product_precision(dtype),
         dot_general=functools.partial(jax.lax.dot_general, preferred_element_type=jnp.float32),
         kernel_init=kernel_init,
         bias_init=constant(0.0),
