@@ -2,7 +2,8 @@
 
     python train.py --config=configs/tiny.py --workdir=runs/tiny
 
-Run the same command again to go on after an interruption. Any field of the configuration can be changed on the
+Run the same command again to go on after an interruption. On several machines start it on each of them with
+--distributed. Any field of the configuration can be changed on the
 command line: --config.optimizer.learning_rate=5e-4.
 """
 
@@ -18,6 +19,7 @@ from ml_collections import config_flags
 from logvggt_jax.inference.compilation_cache import enable_compilation_cache
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.loop import NonFiniteTraining, train
+from logvggt_jax.training.processes import join_processes
 from logvggt_jax.training.sharding import data_mesh, use_cpu_cores
 
 _CONFIG = config_flags.DEFINE_config_file("config", None, "File with the run's settings.", lock_config=True)
@@ -25,6 +27,12 @@ _WORKDIR = flags.DEFINE_string("workdir", None, "Folder for checkpoints, the mod
 _RESUME_STEP = flags.DEFINE_integer(
     "resume_step", None, "Checkpoint to go on from, dropping later ones; by default the latest."
 )
+_DISTRIBUTED = flags.DEFINE_bool(
+    "distributed", False, "This is one of several processes; start the same command once on every machine."
+)
+_COORDINATOR = flags.DEFINE_string("coordinator", None, "host:port of process 0, where the cluster does not say.")
+_NUM_PROCESSES = flags.DEFINE_integer("num_processes", None, "Processes of the run, where the cluster does not say.")
+_PROCESS_ID = flags.DEFINE_integer("process_id", None, "Of this process, from 0, where the cluster does not say.")
 _CACHE = flags.DEFINE_string(
     "compilation_cache", None, "Folder that keeps compiled programs, `none` for none; by default the user's cache."
 )
@@ -37,7 +45,11 @@ def main(arguments: Sequence[str]) -> None:
     enable_compilation_cache(_CACHE.value)
     try:
         config = TrainConfig.from_dict(_CONFIG.value.to_dict())
-        use_cpu_cores(config)
+        use_cpu_cores(config, num_processes=_NUM_PROCESSES.value or 1)
+        if _DISTRIBUTED.value:
+            join_processes(
+                coordinator=_COORDINATOR.value, num_processes=_NUM_PROCESSES.value, process_id=_PROCESS_ID.value
+            )
         train(config, Path(_WORKDIR.value), mesh=data_mesh(), resume_step=_RESUME_STEP.value)
     except (ValueError, OSError, ImportError, NonFiniteTraining) as error:
         # Errors of settings, data and checkpoints say in one line what to mend; -v 1 shows where they arose.

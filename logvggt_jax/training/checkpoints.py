@@ -59,7 +59,8 @@ class RunCheckpoints:
         step = int(state.step)
         params, rest = _parts(state)
         # First, so that a run that is killed in between goes on from an older checkpoint and writes both again.
-        save_model(self.model_folder, self.config.model, params)
+        if jax.process_index() == 0:
+            save_model(self.model_folder, self.config.model, params)
         meta = {
             "step": step,
             "stage": position.stage,

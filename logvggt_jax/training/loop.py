@@ -20,6 +20,7 @@ from logvggt_jax.training.initialization import initial_parameters
 from logvggt_jax.training.interruption import StopRequest
 from logvggt_jax.training.metrics_log import MetricsLog
 from logvggt_jax.training.optimizer import learning_rate_schedule, make_optimizer
+from logvggt_jax.training.processes import ASK_EVERY, any_process
 from logvggt_jax.training.progress import Speedometer, duration, progress_line
 from logvggt_jax.training.sharding import check_batch_size, put_batch, replicated
 from logvggt_jax.training.state import TrainState, initial_state
@@ -59,8 +60,8 @@ def train(config: TrainConfig, workdir: Path, *, mesh: Mesh, resume_step: int | 
     with run.checkpoints, StopRequest() as stop:
         first, position = run.restore(resume_step)
         datasets = open_sources(config.data)
-        console = Console(quiet=jax.process_index() != 0)
-        with MetricsLog(workdir, first_step=first, console=console) as log:
+        silent = jax.process_index() != 0
+        with MetricsLog(workdir, first_step=first, console=Console(), silent=silent) as log:
             log.say(f"{mesh.size} devices, {first}/{config.total_steps} steps done, results in {workdir}")
             run.train(datasets, position, log, stop)
     return run.state
@@ -131,7 +132,7 @@ class _Run:
             if len(in_flight) > STEPS_IN_FLIGHT:
                 in_flight.popleft().block_until_ready()
 
-            ending = self._reason_to_end(stop)
+            ending = self._reason_to_end(stop, step)
             last = step == end or ending is not None
             if step % config.log_every == 0 or step == 1 or last:
                 self._log(step, stage, metrics, log)
@@ -157,8 +158,7 @@ class _Run:
     def _log(self, step: int, stage: StageConfig, metrics: Metrics, log: MetricsLog) -> None:
         values = {name: float(value) for name, value in jax.device_get(metrics).items()}
         self.speed.read(stage)
-        if jax.process_index() == 0:
-            log.write(step, {**values, "frames_per_second": self.speed.frames_per_second})
+        log.write(step, {**values, "frames_per_second": self.speed.frames_per_second})
         log.say(progress_line(step, self.config.total_steps, stage.name, values, self.speed))
         if values["longest_skip"] >= self.config.max_skipped_in_a_row:
             raise NonFiniteTraining(
@@ -172,8 +172,7 @@ class _Run:
             return
         started = time.perf_counter()
         values = self.validation(self.state.params)
-        if jax.process_index() == 0:
-            log.write(step, values)
+        log.write(step, values)
         log.say(
             f"validation after step {step} ({duration(time.perf_counter() - started)}): "
             f"abs_rel {values['validation/abs_rel']:.3f} (constant depth {values['validation/constant_abs_rel']:.3f}), "
@@ -183,12 +182,18 @@ class _Run:
         )
         self.speed.restart()
 
-    def _reason_to_end(self, stop: StopRequest) -> str | None:
+    def _reason_to_end(self, stop: StopRequest, step: int) -> str | None:
+        reason = None
         if stop.reason is not None:
-            return f"received {stop.reason}"
-        if self.deadline is not None and time.monotonic() > self.deadline:
-            return f"max_minutes={self.config.max_minutes} are over"
-        return None
+            reason = f"received {stop.reason}"
+        elif self.deadline is not None and time.monotonic() > self.deadline:
+            reason = f"max_minutes={self.config.max_minutes} are over"
+        if jax.process_count() == 1:
+            return reason
+        # A process that left alone would let the others wait for its share of the next step for ever.
+        if step % ASK_EVERY or not any_process(reason is not None):
+            return None
+        return reason or "another process is to stop"
 
 
 def _frozen_modules(config: TrainConfig) -> tuple[str, ...]:

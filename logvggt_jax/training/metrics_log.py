@@ -21,10 +21,14 @@ class MetricsLog:
     that the file reads like one uninterrupted run.
     """
 
-    def __init__(self, workdir: Path, *, first_step: int, console: Console) -> None:
-        workdir.mkdir(parents=True, exist_ok=True)
+    def __init__(self, workdir: Path, *, first_step: int, console: Console, silent: bool = False) -> None:
+        """Args: `silent` writes and says nothing, as is right for all processes of a run but the first."""
         self.path = workdir / FILE_NAME
         self.console = console
+        self.silent = silent
+        if silent:
+            return
+        workdir.mkdir(parents=True, exist_ok=True)
         _drop_later_lines(self.path, first_step)
         self._file = self.path.open("a")
         self._tensorboard = SummaryWriter(str(workdir / "tensorboard"), purge_step=first_step + 1)
@@ -33,11 +37,14 @@ class MetricsLog:
         return self
 
     def __exit__(self, *_: Any) -> None:
-        self._file.close()
-        self._tensorboard.close()
+        if not self.silent:
+            self._file.close()
+            self._tensorboard.close()
 
     def write(self, step: int, values: dict[str, float]) -> None:
         """Appends one line {"step", "time" (seconds since 1970), …}; non-finite values become null."""
+        if self.silent:
+            return
         finite = {name: value if math.isfinite(value) else None for name, value in values.items()}
         self._file.write(json.dumps({"step": step, "time": round(time.time(), 3), **finite}) + "\n")
         self._file.flush()
@@ -47,7 +54,8 @@ class MetricsLog:
 
     def say(self, message: str) -> None:
         """One line on the terminal."""
-        self.console.print(message, highlight=False, soft_wrap=True)
+        if not self.silent:
+            self.console.print(message, highlight=False, soft_wrap=True)
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:

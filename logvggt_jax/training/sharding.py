@@ -22,15 +22,15 @@ def data_mesh(num_devices: int | None = None) -> Mesh:
     return jax.make_mesh((len(devices),), (DATA_AXIS,), axis_types=(AxisType.Auto,), devices=devices)
 
 
-def use_cpu_cores(config: TrainConfig) -> None:
+def use_cpu_cores(config: TrainConfig, *, num_processes: int = 1) -> None:
     """Makes devices of a CPU's cores, as many as the batches of all stages split over; before JAX's first use.
 
     One core computes a step of a small model; data parallelism puts the others to work. Accelerators are not
     affected.
     """
-    common = math.gcd(*(stage.batch_size for stage in config.stages))
+    common = math.gcd(*(stage.batch_size for stage in config.stages)) // num_processes
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    jax.config.update("jax_num_cpu_devices", max(n for n in range(1, cores + 1) if common % n == 0))
+    jax.config.update("jax_num_cpu_devices", max((n for n in range(1, cores + 1) if common % n == 0), default=1))
 
 
 def replicated(mesh: Mesh) -> NamedSharding:

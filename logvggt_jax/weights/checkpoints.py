@@ -102,7 +102,7 @@ def save_model(path: str | Path, config: ModelConfig, params: Any) -> None:
         fresh, old = Path(scratch) / "new", Path(scratch) / "old"
         fresh.mkdir()
         with _checkpointer() as checkpointer:
-            checkpointer.save(fresh / "params", params)
+            checkpointer.save(fresh / "params", jax.device_get(params))
             checkpointer.wait_until_finished()
         (fresh / "config.json").write_text(json.dumps(description, indent=2) + "\n")
         if path.exists():
@@ -223,8 +223,14 @@ def convert(source: str | Path, destination: str | Path, *, point_head: bool = F
 
 
 def _checkpointer() -> ocp.StandardCheckpointer:
+    # A model folder is one process's own affair, whoever else trains with it.
+    alone = ocp.options.MultiprocessingOptions(
+        primary_host=jax.process_index(),
+        active_processes={jax.process_index()},
+        barrier_sync_key_prefix=f"model_of_process_{jax.process_index()}",
+    )
     # Orbax's default of 96 GB in flight holds every parameter twice.
-    return ocp.StandardCheckpointer(save_concurrent_gb=1, restore_concurrent_gb=1)
+    return ocp.StandardCheckpointer(multiprocessing_options=alone, save_concurrent_gb=1, restore_concurrent_gb=1)
 
 
 def _named_leaves(tree: Any) -> Iterator[tuple[str, Any]]:

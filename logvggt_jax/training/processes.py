@@ -1,0 +1,43 @@
+"""Several processes that train together, one or more for each machine."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+from jax.experimental import multihost_utils
+
+# Steps between two questions whether anybody wants to stop: each costs a round trip over the network.
+ASK_EVERY = 10
+
+
+def join_processes(
+    *, coordinator: str | None = None, num_processes: int | None = None, process_id: int | None = None
+) -> None:
+    """Joins the other processes of this run; before JAX's first use of a device.
+
+    Args:
+      coordinator: host:port of process 0. None for all three lets JAX ask the cluster: Slurm, Open MPI, Kubernetes
+        and TPU pods know the answers.
+      num_processes: of the run.
+      process_id: of this process, from 0.
+
+    Raises:
+      ValueError: some of the three are missing, or the cluster does not know them.
+    """
+    given = [value is not None for value in (coordinator, num_processes, process_id)]
+    if any(given) and not all(given):
+        raise ValueError("give all of --coordinator, --num_processes and --process_id, or none of them")
+    try:
+        jax.distributed.initialize(coordinator, num_processes, process_id)
+    except (RuntimeError, ValueError) as error:
+        raise ValueError(
+            f"cannot join the other processes ({error}); outside of Slurm, MPI, Kubernetes and TPU pods give "
+            "--coordinator=HOST:PORT, --num_processes and --process_id"
+        ) from error
+
+
+def any_process(wants: bool) -> bool:
+    """Whether this is true of at least one process; all processes have to ask at the same point."""
+    if jax.process_count() == 1:
+        return wants
+    return bool(np.any(multihost_utils.process_allgather(np.array(wants))))
