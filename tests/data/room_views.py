@@ -43,4 +43,4 @@ def check_views(
     for first in range(len(views) - 1):
         for one, other in ((first, first + 1), (first + 1, first)):
             difference, share = disagreement(frames, one, other)
-            assert difference < 0.015 and share > overlap, (one, other, difference, share)
+            assert difference < 0.008 and share > overlap, (one, other, difference, share)
