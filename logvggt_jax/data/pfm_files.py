@@ -1,0 +1,41 @@
+"""Portable float maps: depth as 32-bit floats behind three lines of text."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+# One white space ends the header; what follows belongs to the numbers.
+_HEADER = re.compile(rb"(P[fF])\s+(\d+)\s+(\d+)\s+([+-]?[0-9.]+(?:[eE][+-]?\d+)?)\s")
+
+
+def read_pfm(path: str | Path) -> np.ndarray:
+    """Float map [H, W] float32, top row first (files hold the bottom row first).
+
+    A negative scale in the header means little-endian numbers; its size is no unit and is ignored.
+
+    Raises:
+      FileNotFoundError: no such file.
+      ValueError: no header of a single-channel map, or another number of bytes than it promises; names the file.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file; fetch it again or remove the frame's other files")
+    data = path.read_bytes()
+    header = _HEADER.match(data)
+    if header is None or header[1] != b"Pf":
+        raise ValueError(
+            f"{path}: expected a single-channel float map ('Pf', width, height, scale), got {data[:16]!r}: "
+            "fetch it again"
+        )
+    width, height = int(header[2]), int(header[3])
+    expected, found = 4 * width * height, len(data) - header.end()
+    if found != expected or not expected:
+        raise ValueError(
+            f"{path}: a float map of {width} x {height} has {expected} bytes after its header, got {found}: "
+            "fetch it again"
+        )
+    numbers = np.frombuffer(data, "<f4" if float(header[4]) < 0 else ">f4", offset=header.end())
+    return numbers.reshape(height, width)[::-1].astype(np.float32)
