@@ -111,6 +111,8 @@ def test_the_gathered_form_comes_back(tmp_path: Path, suffix: str):
     name = f"{DRIVE}/image_gathered{suffix}"
     assert kitti.sequences == (name,)
     assert_comes_back(kitti, name)
+    with pytest.raises(FileNotFoundError, match="no sequences of KITTI depth"):
+        KITTI(tmp_path, "train")
     # Annotations without raw pictures do not hide it, a whole drive does.
     write_drive(tmp_path / "whole")
     (tmp_path / "whole/val").rename(tmp_path / "val")

@@ -89,6 +89,15 @@ def test_a_written_export_comes_back_at_the_depth_cameras_size_in_numeric_order(
     assert_shows_room(frames, ORDER, INTRINSICS, depth_step=STEP, picture_error=3)
 
 
+def test_colour_is_averaged_over_the_pixels_that_a_depth_pixel_covers(root: Path):
+    v, u = np.indices((2 * SIZE[0], 2 * SIZE[1]))
+    board = np.repeat((((u + v) % 2) * 200).astype(np.uint8)[..., None], 3, axis=2)
+    path = root / "scans_train/scene0000_00/color/8.jpg"
+    cv2.imwrite(str(path), board, [cv2.IMWRITE_JPEG_QUALITY, 100])
+    image = ScanNet(root).read("scene0000_00", [0]).images[0]
+    assert np.abs(image.astype(int) - 100).max() <= 5
+
+
 @pytest.mark.parametrize("part", ["scannetv2", "."])
 def test_other_folders_of_scenes_are_read(tmp_path: Path, part: str):
     write_scene(tmp_path / part / "scene0011_01")
