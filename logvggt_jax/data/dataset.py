@@ -61,11 +61,17 @@ def check_indices(indices: Sequence[int], num_frames: int, where: str) -> list[i
     return checked
 
 
-def check_frames(frames: Frames, where: str) -> None:
+def check_frames(frames: Frames, where: str, *, poses: bool = True) -> None:
     """Raises ValueError, naming `where` and the frame, unless `frames` can be trained or evaluated on.
 
     Checked: shapes and dtypes as `Frames` documents them, depth finite and not negative, intrinsics finite with
     positive focal lengths, extrinsics finite and rigid (rotation orthonormal to 1e-3, determinant +1).
+
+    Args:
+      frames: what a data set handed out.
+      where: data set and sequence, for messages.
+      poses: whether poses are needed. If not, extrinsics may be NaN throughout, as those of sets without poses are;
+        extrinsics of which only a part is NaN are refused all the same.
     """
     if frames.images.ndim != 4 or frames.images.shape[3] != 3 or frames.images.dtype != np.uint8:
         raise ValueError(f"{where}: images must be uint8 [T, H, W, 3], got {frames.images.dtype} {frames.images.shape}")
@@ -83,10 +89,14 @@ def check_frames(frames: Frames, where: str) -> None:
         "depth must not be negative (0 marks invalid pixels)": (frames.depth >= 0).all((1, 2)),
         "intrinsics must be finite with positive focal lengths": np.isfinite(frames.intrinsics).all((1, 2))
         & (focal > 0).all(1),
+    }
+    pose_checks = {
         "extrinsics must be finite": np.isfinite(frames.extrinsics).all((1, 2)),
         "extrinsics must hold rotations (R R^T = I to 1e-3, determinant +1)": orthonormal
         & (np.linalg.det(rotation) > 0),
     }
+    if poses or not np.isnan(frames.extrinsics).all():
+        checks |= pose_checks
     for requirement, passed in checks.items():
         if not passed.all():
             frame = int(np.argmin(passed))
