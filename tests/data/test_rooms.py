@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 import pytest
 
@@ -204,13 +202,3 @@ def test_unknown_rooms_and_frames_are_named():
     for indices in ([24], [-1], []):
         with pytest.raises(IndexError, match="room-00008"):
             rooms.read("room-00008", indices)
-
-
-@pytest.mark.slow
-def test_one_core_renders_a_hundred_frames_a_second():
-    rooms = Rooms("train")
-    rooms.read(rooms.sequences[0], range(10))
-    start = time.perf_counter()
-    for name in rooms.sequences[1:4]:
-        rooms.read(name, range(96))
-    assert 3 * 96 / (time.perf_counter() - start) > 100
