@@ -37,7 +37,8 @@ def write_image(path: Path, image: np.ndarray) -> None:
     """8-bit RGB, or 16-bit depth as it is; JPEG nearly without loss."""
     path.parent.mkdir(parents=True, exist_ok=True)
     stored = image[..., ::-1] if image.ndim == 3 else image
-    assert cv2.imwrite(str(path), stored, [cv2.IMWRITE_JPEG_QUALITY, 100])
+    options = [cv2.IMWRITE_JPEG_QUALITY, 100] if path.suffix == ".jpg" else []
+    assert cv2.imwrite(str(path), stored, options)
 
 
 def relative_poses(extrinsics: np.ndarray) -> np.ndarray:
