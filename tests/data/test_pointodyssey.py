@@ -130,7 +130,7 @@ def test_unequal_counts_are_named(root: Path):
     folder = root / "train/dancing"
     for name in ("rgbs/rgb_00002.jpg", "depths/depth_00002.png"):
         (folder / name).unlink()
-    with pytest.raises(ValueError, match="train/dancing: expected frames 0 to 2.*got 2 frames from 0 to 1"):
+    with pytest.raises(ValueError, match=r"train/dancing: expected frames 0 to 2.*got 2 frames from 0 to 1"):
         PointOdyssey(root).num_frames("train/dancing")
     # As many, but not those.
     write_image(folder / "rgbs/rgb_00003.jpg", VIEWS[2].image)
