@@ -1,0 +1,41 @@
+"""Single-channel OpenEXR pictures, through the OpenEXR package: OpenCV's wheels come without that codec."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+
+def read_exr(path: str | Path) -> np.ndarray:
+    """The only channel of an OpenEXR file, [H, W] float32, in the file's own unit; half floats are widened.
+
+    Raises:
+      ImportError: the OpenEXR package is missing; names the extra that brings it.
+      FileNotFoundError: no such file.
+      ValueError: truncated or damaged file, several parts or channels, or integer pixels; names the file.
+    """
+    try:
+        import OpenEXR
+    except ImportError as error:
+        raise ImportError(f'{path}: reading EXR needs OpenEXR: pip install "logvggt-jax[data]"') from error
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"{path}: no such file; fetch it again or remove the frame's other files")
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            count = len(file.parts)
+            channels = {name: channel.pixels for name, channel in file.channels().items()}
+    except (RuntimeError, ValueError) as error:
+        # A part whose pixels cannot be decoded is left out, so that asking for it fails.
+        raise ValueError(f"{path}: truncated or damaged EXR file ({error}): fetch it again") from error
+    if count != 1 or len(channels) != 1:
+        raise ValueError(
+            f"{path}: expected one part with one channel, got {count} with {', '.join(channels)}: "
+            "replace it with the data set's original file"
+        )
+    (pixels,) = channels.values()
+    if not np.issubdtype(pixels.dtype, np.floating):
+        raise ValueError(
+            f"{path}: expected half or float pixels, got {pixels.dtype}: replace it with the data set's original file"
+        )
+    return pixels.astype(np.float32)

@@ -1,0 +1,55 @@
+"""Arrays from HDF5 files that hold one array each, with damage reported by file."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+
+
+def read_hdf5(
+    path: str | Path, dataset: str, *, shape: tuple[int | None, ...], content: bytes | None = None
+) -> np.ndarray:
+    """Array `dataset` of an HDF5 file, in the file's own type and unit.
+
+    Args:
+      path: the file, also where errors are named.
+      dataset: name of the array.
+      shape: what the array's shape must be; None stands for any length.
+      content: the file's bytes, where they have been read already.
+
+    Raises:
+      ImportError: the h5py package is missing; names the extra that brings it.
+      FileNotFoundError: no such file.
+      ValueError: not an HDF5 file, truncated or damaged, no such array, not numbers or another shape; names the file.
+    """
+    try:
+        import h5py
+    except ImportError as error:
+        raise ImportError(f'{path}: reading HDF5 needs h5py: pip install "logvggt-jax[data]"') from error
+    if content is None and not Path(path).is_file():
+        raise FileNotFoundError(f"{path}: no such file; fetch it again or remove the frame's other files")
+    try:
+        with h5py.File(path if content is None else io.BytesIO(content), "r") as file:
+            names = list(file)
+            array = file[dataset][()] if isinstance(file.get(dataset), h5py.Dataset) else None
+    except (OSError, RuntimeError) as error:
+        reason = str(error).partition("\n")[0]
+        raise ValueError(f"{path}: truncated or damaged HDF5 file ({reason}): fetch it again") from error
+    if array is None:
+        raise ValueError(
+            f"{path}: no array {dataset!r}, only {', '.join(names) or 'nothing'}: "
+            "replace it with the data set's original file"
+        )
+    array = np.asarray(array)
+    fits = len(array.shape) == len(shape) and all(
+        wanted in (None, given) for wanted, given in zip(shape, array.shape, strict=True)
+    )
+    if not fits or array.dtype.kind not in "iuf":
+        expected = " x ".join("any" if length is None else str(length) for length in shape)
+        raise ValueError(
+            f"{path}: expected numbers of shape {expected} in {dataset!r}, got {array.dtype} {array.shape}: "
+            "replace it with the data set's original file"
+        )
+    return array
