@@ -25,7 +25,7 @@ import numpy as np
 from logvggt_jax.data.calibration import numbers, pinhole
 from logvggt_jax.data.folder_dataset import NO_POSES, FolderDataset, FrameRecord, Listing
 from logvggt_jax.data.image_files import read_depth, read_rgb
-from logvggt_jax.data.listing_index import ListingIndex, SourceFiles
+from logvggt_jax.data.listing_index import SourceFiles
 from logvggt_jax.data.pose_track import PoseTrack
 from logvggt_jax.data.quarter_turns import turned_extrinsics, turned_intrinsics, turns_to_upright
 from logvggt_jax.data.relative_intrinsics import in_pixels, relative
@@ -59,10 +59,8 @@ class ARKitScenes(FolderDataset):
 
     def __init__(self, root: str | Path, split: str = "all", *, upright: bool = True) -> None:
         """As `FolderDataset`; `upright=False` hands pictures out in their stored orientation."""
-        super().__init__(root, split)
         self.upright = upright
-        if not upright:  # other listings of the same files
-            self._index = ListingIndex(f"{self.name}-stored", self.root)
+        super().__init__(root, split, variant="" if upright else "stored")
 
     def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
         places: dict[str, Path] = {}
@@ -97,7 +95,7 @@ class ARKitScenes(FolderDataset):
                         image=pictures[time],
                         depth=depths[time],
                         # Millions of one-line files: opened with their pictures, not to list them.
-                        mask=calibrations[near],
+                        companion=calibrations[near],
                         intrinsics=_WITH_THE_PICTURE,
                         extrinsics=extrinsics,
                     )
@@ -113,8 +111,8 @@ class ARKitScenes(FolderDataset):
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         image = read_rgb(record.image)
         size = image.shape[:2]
-        assert record.mask is not None
-        intrinsics = in_pixels(_calibration(record.mask), size, record.image)
+        assert record.companion is not None
+        intrinsics = in_pixels(_calibration(record.companion), size, record.image)
         intrinsics = turned_intrinsics(intrinsics, size, record.quarter_turns)
         return image, _at_size(read_depth(record.depth), size, record.depth), intrinsics
 

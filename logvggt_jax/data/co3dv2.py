@@ -22,7 +22,7 @@ import numpy as np
 from logvggt_jax.data.co3d_annotations import FrameAnnotation, frame_annotations, quality_scores
 from logvggt_jax.data.folder_dataset import FolderDataset, FrameRecord, Listing
 from logvggt_jax.data.image_files import read_depth, read_rgb
-from logvggt_jax.data.listing_index import ListingIndex, SourceFiles
+from logvggt_jax.data.listing_index import SourceFiles
 from logvggt_jax.data.relative_intrinsics import in_pixels, relative
 from logvggt_jax.data.split_lists import sequences_present
 
@@ -73,11 +73,10 @@ class Co3Dv2(FolderDataset):
 
     def __init__(self, root: str | Path, split: str = "all") -> None:
         """As `FolderDataset`; a category's annotations are read when one of its sequences is first used."""
-        super().__init__(root, split)
-        # The same sequence can have other frames in another split.
-        self._index = ListingIndex(f"{self.name}-{split}", self.root)
         # Annotations take many seconds to parse: the last category's serve all of its sequences.
         self._category: _Category | None = None
+        # The same sequence can have other frames in another split.
+        super().__init__(root, split, variant=split)
 
     def __getstate__(self) -> dict[str, Any]:
         """Worker processes are not sent a category's annotations."""
@@ -146,7 +145,7 @@ class Co3Dv2(FolderDataset):
                     name=image.stem,
                     image=image,
                     depth=depth,
-                    mask=mask,
+                    companion=mask,
                     intrinsics=relative(annotation.intrinsics(), annotation.size),
                     extrinsics=extrinsics,
                     depth_scale=annotation.depth_scale,
@@ -167,11 +166,11 @@ class Co3Dv2(FolderDataset):
         image = read_rgb(record.image)
         depth = read_depth(record.depth).view(np.float16).astype(np.float32) * np.float32(record.depth_scale)
         valid = np.isfinite(depth) & (depth > 0)
-        if record.mask is not None:
-            mask = read_rgb(record.mask)[..., 0]
+        if record.companion is not None:
+            mask = read_rgb(record.companion)[..., 0]
             if mask.shape != depth.shape:
                 raise ValueError(
-                    f"{record.mask}: size {mask.shape} differs from {depth.shape} of {record.depth.name}: "
+                    f"{record.companion}: size {mask.shape} differs from {depth.shape} of {record.depth.name}: "
                     "fetch both again"
                 )
             valid &= mask > 0

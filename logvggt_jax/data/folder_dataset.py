@@ -34,7 +34,7 @@ class FrameRecord:
       depth: depth in the set's own encoding.
       intrinsics: [3, 3] float64, pixels as the set's reader needs them (its `_read_frame` decides).
       extrinsics: [4, 4] float64, world-to-camera, rigid; NaN in sets without poses.
-      mask: picture of the pixels whose depth is valid, or whatever third file the set's depth needs.
+      companion: a third file that the frame needs, such as a mask of valid depth or its calibration.
       depth_scale: factor on the stored depth, where frames differ.
       quarter_turns: counter-clockwise quarter turns from the stored picture to the one handed out.
     """
@@ -44,7 +44,7 @@ class FrameRecord:
     depth: Path
     intrinsics: np.ndarray
     extrinsics: np.ndarray
-    mask: Path | None = None
+    companion: Path | None = None
     depth_scale: float = 1.0
     quarter_turns: int = 0
 
@@ -71,8 +71,13 @@ class FolderDataset(abc.ABC):
     metric: ClassVar[bool]
     splits: ClassVar[tuple[str, ...]]
 
-    def __init__(self, root: str | Path, split: str = "all") -> None:
+    def __init__(self, root: str | Path, split: str = "all", *, variant: str = "") -> None:
         """Lists the sequences; frames are listed when a sequence is first used.
+
+        Args:
+          root: the data set's folder.
+          split: one of `splits`.
+          variant: for readers whose sequences have other frames under other settings; keeps their listings apart.
 
         Raises:
           FileNotFoundError: no such folder, nothing of the set in it, or a list file is missing.
@@ -84,7 +89,7 @@ class FolderDataset(abc.ABC):
         self.root, self.split = Path(root), split
         if not self.root.is_dir():
             raise FileNotFoundError(f"{self.root}: no such folder; pass the folder that holds {self.expects}")
-        self._index = ListingIndex(self.name, self.root)
+        self._index = ListingIndex(f"{self.name}-{variant}" if variant else self.name, self.root)
         self._recent: OrderedDict[str, Listing] = OrderedDict()
         self._counts: dict[str, int] = {}
         self._places = self._listed_sequences()
@@ -209,7 +214,7 @@ def _packed(listing: Listing, root: Path) -> bytes:
         names=np.array([record.name for record in frames]),
         images=paths("image"),
         depths=paths("depth"),
-        masks=paths("mask"),
+        companions=paths("companion"),
         intrinsics=np.stack([record.intrinsics for record in frames]),
         extrinsics=np.stack([record.extrinsics for record in frames]),
         depth_scales=np.array([record.depth_scale for record in frames]),
@@ -228,20 +233,20 @@ def _unpacked(payload: bytes, root: Path) -> Listing:
             name=str(name),
             image=root / str(image),
             depth=root / str(depth),
-            mask=root / str(mask) if str(mask) else None,
+            companion=root / str(companion) if str(companion) else None,
             intrinsics=intrinsics,
             extrinsics=extrinsics,
             depth_scale=float(depth_scale),
             quarter_turns=int(quarter_turns),
         )
-        for name, image, depth, mask, intrinsics, extrinsics, depth_scale, quarter_turns in zip(
+        for name, image, depth, companion, intrinsics, extrinsics, depth_scale, quarter_turns in zip(
             *(
                 columns[name]
                 for name in (
                     "names",
                     "images",
                     "depths",
-                    "masks",
+                    "companions",
                     "intrinsics",
                     "extrinsics",
                     "depth_scales",

@@ -105,15 +105,15 @@ class HyperSim(FolderDataset):
                 dropped["no pose"] += 1
                 continue
             name = f"frame.{number:04d}"
-            frames.append(FrameRecord(name, image, distance, camera.intrinsics, turn @ extrinsics, mask=entities))
+            frames.append(FrameRecord(name, image, distance, camera.intrinsics, turn @ extrinsics, companion=entities))
         return Listing(frames, dropped)
 
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         colour = read_hdf5(record.image, "dataset", shape=(None, None, 3)).astype(np.float32)
         size = colour.shape[:2]
         distance = read_hdf5(record.depth, "dataset", shape=size).astype(np.float64)
-        assert record.mask is not None
-        shown = read_hdf5(record.mask, "dataset", shape=size) != -1
+        assert record.companion is not None
+        shown = read_hdf5(record.companion, "dataset", shape=size) != -1
         intrinsics = _pixels_from_plane(size) @ record.intrinsics
         v, u = np.indices(size)
         rays = np.stack([u, v, np.ones(size)], -1) @ np.linalg.inv(intrinsics).T  # z = 1

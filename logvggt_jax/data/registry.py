@@ -2,51 +2,48 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
+from logvggt_jax.data.arkitscenes import ARKitScenes
+from logvggt_jax.data.blendedmvs import BlendedMVS
+from logvggt_jax.data.bonn import Bonn
+from logvggt_jax.data.co3dv2 import Co3Dv2
 from logvggt_jax.data.dataset import Dataset, check_split
+from logvggt_jax.data.folder_dataset import FolderDataset
+from logvggt_jax.data.hypersim import HyperSim
+from logvggt_jax.data.kitti import KITTI
+from logvggt_jax.data.mvs_synth import MVSSynth
+from logvggt_jax.data.nrgbd import NRGBD
+from logvggt_jax.data.pointodyssey import PointOdyssey
+from logvggt_jax.data.replica import Replica
 from logvggt_jax.data.rooms import Rooms
+from logvggt_jax.data.scannet import ScanNet
 from logvggt_jax.data.seven_scenes import SevenScenes
+from logvggt_jax.data.sintel import Sintel
+from logvggt_jax.data.spring import Spring
+from logvggt_jax.data.tum import TUM
+from logvggt_jax.data.virtual_kitti import VirtualKITTI
+from logvggt_jax.data.wildrgbd import WildRGBD
 
-DATASETS = (
-    "co3dv2",
-    "blendedmvs",
-    "arkitscenes",
-    "wildrgbd",
-    "scannet",
-    "mvs_synth",
-    "pointodyssey",
-    "virtual_kitti",
-    "spring",
-    "hypersim",
-    "replica",
-    "seven_scenes",
-    "nrgbd",
-    "sintel",
-    "bonn",
-    "kitti",
-    "tum",
-    "rooms",
+_FOR_TRAINING: tuple[type[FolderDataset], ...] = (
+    Co3Dv2,
+    BlendedMVS,
+    ARKitScenes,
+    WildRGBD,
+    ScanNet,
+    MVSSynth,
+    PointOdyssey,
+    VirtualKITTI,
+    Spring,
+    HyperSim,
+    Replica,
 )
+_FOR_EVALUATION: tuple[type[FolderDataset], ...] = (SevenScenes, NRGBD, Sintel, Bonn, KITTI, TUM)
+READERS: dict[str, type[FolderDataset]] = {reader.name: reader for reader in (*_FOR_TRAINING, *_FOR_EVALUATION)}
+"""Readers of the sets on disk, by name; the paper's training sets first."""
 
-
-def _open_rooms(root: str | Path | None, split: str) -> Dataset:
-    if root is not None:
-        raise ValueError(f"rooms are procedural and have no folder, got root={root}: pass root=None")
-    return Rooms(split)
-
-
-def _open_seven_scenes(root: str | Path | None, split: str) -> Dataset:
-    if root is None:
-        raise ValueError("seven_scenes needs root, the folder that holds the scenes")
-    return SevenScenes(root, split)
-
-
-_READERS: dict[str, Callable[[str | Path | None, str], Dataset]] = {
-    "rooms": _open_rooms,
-    "seven_scenes": _open_seven_scenes,
-}
+DATASETS: tuple[str, ...] = (*READERS, "rooms")
+"""All names that `open_dataset` knows."""
 
 
 def open_dataset(name: str, root: str | Path | None, split: str = "all") -> Dataset:
@@ -55,15 +52,20 @@ def open_dataset(name: str, root: str | Path | None, split: str = "all") -> Data
     Args:
       name: for example `seven_scenes`.
       root: the data set's folder; None for `rooms`, which are procedural.
-      split: `train`, `val`, `test` or `all`; `all` needs no list file.
+      split: `train`, `val`, `test` or `all`, of those the set has; `all` needs no list file.
 
     Raises:
-      ValueError: unknown name or split, a name without a reader in this version, or a wrong `root`.
+      ValueError: unknown name, a split that the set does not have, or a wrong `root`.
       FileNotFoundError: the folder or a file in it is missing; named.
     """
     check_split(split)
-    if name not in DATASETS:
+    if name == "rooms":
+        if root is not None:
+            raise ValueError(f"rooms are procedural and have no folder, got root={root}: pass root=None")
+        return Rooms(split)
+    if name not in READERS:
         raise ValueError(f"unknown data set {name!r}: choose one of {', '.join(DATASETS)}")
-    if name not in _READERS:
-        raise ValueError(f"this version has no reader for {name!r}; it reads {', '.join(sorted(_READERS))}")
-    return _READERS[name](root, split)
+    reader = READERS[name]
+    if root is None:
+        raise ValueError(f"{name} needs root, the folder that holds {reader.expects}")
+    return reader(root, split)
