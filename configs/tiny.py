@@ -4,7 +4,7 @@
 
 Any field can be changed on the command line, for example --config.optimizer.learning_rate=5e-4. The curriculum
 goes from single windows of 4 frames to clips of 12. Depth is learned within minutes; rotation stays at the
-identity for the first thousands of steps.
+identity for the first two thousand steps.
 """
 
 import math
@@ -57,8 +57,8 @@ def get_config() -> ConfigDict:
         "alpha": 0.2,
     }
     config.stages = {
-        "stage_1": _stage(steps=4600, clip_length=4, batch_size=8, strides=(1, 6)),
-        "stage_2": _stage(steps=950, clip_length=12, batch_size=4, strides=(1, 3)),
+        "stage_1": _stage(steps=2900, clip_length=4, batch_size=8, strides=(1, 6)),
+        "stage_2": _stage(steps=2650, clip_length=12, batch_size=4, strides=(1, 4)),
     }
     config.optimizer = {
         "learning_rate": 1e-3,
@@ -74,7 +74,14 @@ def get_config() -> ConfigDict:
     }
     rooms = {"height": HEIGHT, "width": WIDTH, "num_frames": 48, "style": "compass", "speed": (0.7, 1.3)}
     config.data = {
-        "sources": {"rooms": {"root": None, "split": "train", "options": {**rooms, "num_rooms": 1200}}},
+        # Half of the rooms face one wall: without them rotation can stay at the identity for the whole run.
+        "sources": {
+            "rooms": {
+                "root": None,
+                "split": "train",
+                "options": {**rooms, "num_rooms": 1200, "facing_north": 0.5},
+            },
+        },
         "reverse": 0.5,
         "worker_count": 0,
         "num_threads": 1,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Sequence
 from typing import Any
@@ -37,6 +38,7 @@ class Rooms:
         seed: int = 0,
         speed: float | tuple[float, float] = 1.0,
         period: int = 96,
+        facing_north: float = 0.0,
     ) -> None:
         """Describes the rooms; nothing is rendered yet.
 
@@ -50,6 +52,9 @@ class Rooms:
           seed: of the whole set.
           speed: camera speed, 1 = once round the path in `period` frames; a pair (low, high) draws it per room.
           period: frames of one round at speed 1.
+          facing_north: share of rooms whose camera swings about one and the same wall instead of looking anywhere.
+            A pose relative to the first frame is a difference of two headings: over all headings neither frame
+            alone says anything of it, and learning starts late. About one wall each of them does.
 
         Raises:
           ValueError: an option is out of range; names it.
@@ -66,6 +71,9 @@ class Rooms:
         low, high = speed if isinstance(speed, Sequence) else (speed, speed)
         if not 0 < low <= high:
             raise ValueError(f"rooms: speed must be positive or a pair low <= high, got {speed}")
+        if not 0 <= facing_north <= 1:
+            raise ValueError(f"rooms: facing_north must lie in [0, 1], got {facing_north}")
+        self.facing_north = float(facing_north)
         self.split, self.height, self.width, self.style = split, height, width, style
         self.seed, self.speed, self.period = seed, (float(low), float(high)), period
         self._num_frames = num_frames
@@ -83,6 +91,7 @@ class Rooms:
             "seed": self.seed,
             "speed": list(self.speed),
             "period": self.period,
+            "facing_north": self.facing_north,
             "sequences": [self.sequences[0], self.sequences[-1], len(self.sequences)],
         }
 
@@ -98,7 +107,11 @@ class Rooms:
     def room(self, sequence: str) -> Room:
         """Geometry, textures and camera path of `sequence`."""
         check_sequence(sequence, self._numbers, "rooms")
-        return _room(self.seed, self.style, self._numbers[sequence])
+        number = self._numbers[sequence]
+        room = _room(self.seed, self.style, number)
+        if np.random.default_rng([self.seed, number, 0]).random() < self.facing_north:
+            return dataclasses.replace(room, trajectory=room.trajectory.facing_north())
+        return room
 
     def cameras(self, sequence: str, indices: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
         """Intrinsics [T, 3, 3] and world-to-camera extrinsics [T, 4, 4], float32, without rendering."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,6 +30,12 @@ class Trajectory:
     heading: float
     turns: int
     swing: np.ndarray
+
+    def facing_north(self) -> Trajectory:
+        """The same path, looking about the wall at +z: the yaw swings by 60 degrees to either side."""
+        swing = self.swing.copy()
+        swing[0, 0] = np.deg2rad(60.0)
+        return replace(self, heading=0.0, turns=0, swing=swing)
 
     def positions(self, phases: np.ndarray) -> np.ndarray:
         """Camera positions [N, 3] at phases [N] in radians."""

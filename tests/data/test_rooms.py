@@ -202,3 +202,22 @@ def test_unknown_rooms_and_frames_are_named():
     for indices in ([24], [-1], []):
         with pytest.raises(IndexError, match="room-00008"):
             rooms.read("room-00008", indices)
+
+
+def test_rooms_that_face_north_swing_about_one_wall():
+    names = Rooms("train", **SMALL).sequences
+
+    def widest(share: float) -> np.ndarray:
+        """Largest angle in degrees between the camera's horizontal heading and +z, for each room."""
+        rooms = Rooms("train", **{**SMALL, "num_frames": 96}, facing_north=share)
+        forward = np.stack([rooms.cameras(name, range(96))[1][:, 2, :3] for name in names])
+        return np.degrees(np.abs(np.arctan2(forward[..., 0], forward[..., 2]))).max(1)
+
+    assert (widest(1.0) < 61).all() and (widest(1.0) > 50).all()
+    assert 0 < (widest(0.5) < 61).mean() < 1
+    # The same room otherwise, and by default the same path.
+    room, facing = (Rooms("train", **SMALL, facing_north=share).room(names[0]) for share in (0.0, 1.0))
+    np.testing.assert_array_equal(room.half_size, facing.half_size)
+    np.testing.assert_array_equal(room.trajectory.positions(np.ones(1)), facing.trajectory.positions(np.ones(1)))
+    with pytest.raises(ValueError, match="facing_north"):
+        Rooms(facing_north=1.5)
