@@ -10,7 +10,7 @@ import numpy as np
 from absl import flags, logging
 
 from logvggt_jax.data.dataset import Dataset, check_frames
-from logvggt_jax.data.sampling import ClipSampler, example_rng
+from logvggt_jax.data.sampling import Sampler, example_rng, sampler_for
 from logvggt_jax.data.transforms import fit
 
 Batch = dict[str, np.ndarray]
@@ -19,12 +19,12 @@ Batch = dict[str, np.ndarray]
 class _ReadClip:
     """Turns (example index, sequence name) into one clip; a class, so that worker processes can unpickle it."""
 
-    def __init__(self, name: str, dataset: Dataset, sampler: ClipSampler, size: tuple[int, int], seed: int) -> None:
+    def __init__(self, name: str, dataset: Dataset, sampler: Sampler, size: tuple[int, int], seed: int) -> None:
         self.name, self.dataset, self.sampler, self.size, self.seed = name, dataset, sampler, size, seed
 
     def __call__(self, index: int, sequence: str) -> Batch:
         rng = example_rng(self.seed, index)
-        indices = self.sampler.indices(self.dataset.num_frames(sequence), rng)
+        indices = self.sampler.draw(self.dataset, sequence, rng)
         frames = self.dataset.read(sequence, [int(i) for i in indices])
         check_frames(frames, f"{self.name}, {sequence}, frames {indices[0]} … {indices[-1]}")
         fitted = fit(frames, self.size)
@@ -131,6 +131,7 @@ def training_batches(
     size: tuple[int, int],
     seed: int,
     stride: tuple[int, int] = (1, 1),
+    strides: Mapping[str, tuple[int, int]] | None = None,
     reverse: float = 0.5,
     weights: Mapping[str, float] | None = None,
     process_index: int = 0,
@@ -152,6 +153,7 @@ def training_batches(
       size: (H, W), multiples of 14.
       seed: not negative.
       stride: smallest and largest distance between a clip's frames.
+      strides: the same for single data sets, by name. Sets without an order in time have none (`CovisibilityWalk`).
       reverse: probability of a clip that runs backwards in time.
       weights: share of examples from each data set, default equal.
       process_index: of this process, below `process_count`.
@@ -182,19 +184,25 @@ def training_batches(
         )
     if weights is not None and (set(weights) != set(datasets) or min(weights.values()) <= 0):
         raise ValueError(f"weights must give a positive number for each of {', '.join(datasets)}, got {dict(weights)}")
-    sampler = ClipSampler(length=clip_length, stride=(stride[0], stride[1]), reverse=reverse)
+    strides = dict(strides or {})
+    if not strides.keys() <= datasets.keys():
+        raise ValueError(f"strides must be of {', '.join(datasets)}, got those of {', '.join(strides)}")
+    samplers = {
+        name: sampler_for(dataset, length=clip_length, stride=strides.get(name, stride), reverse=reverse)
+        for name, dataset in datasets.items()
+    }
 
     sources, counts = [], {}
     for position, (name, dataset) in enumerate(datasets.items()):
-        names = [s for s in dataset.sequences if dataset.num_frames(s) >= sampler.shortest]
+        sampler = samplers[name]
+        names = [sequence for sequence in dataset.sequences if sampler.fits(dataset, sequence)]
         if not names:
             raise ValueError(
-                f"{name}: none of {len(dataset.sequences)} sequences has the {sampler.shortest} frames that clips of "
-                f"{clip_length} with stride {stride[0]} need: shorten the clips"
+                f"{name}: none of {len(dataset.sequences)} sequences has {sampler.requirement}: shorten the clips"
             )
         if len(names) < len(dataset.sequences):
             short = len(dataset.sequences) - len(names)
-            logging.warning("%s: %d sequences have under %d frames, left out", name, short, sampler.shortest)
+            logging.warning("%s: %d sequences do not have %s, left out", name, short, sampler.requirement)
         # Each data set draws from its own stream, so that equal sizes do not mean equal choices.
         own_seed = int(np.random.SeedSequence([seed, position]).generate_state(1)[0])
         read = _ReadClip(name, dataset, sampler, size, own_seed)
@@ -204,9 +212,7 @@ def training_batches(
     examples = sources[0] if len(sources) == 1 else grain.MapDataset.mix(sources, weights=shares)
     identity = {
         "seed": seed,
-        "clip_length": clip_length,
-        "stride": [stride[0], stride[1]],
-        "reverse": float(reverse),
+        "samplers": {name: repr(sampler) for name, sampler in samplers.items()},
         "size": [size[0], size[1]],
         "sequences": counts,
         "weights": dict(zip(datasets, shares, strict=True)),

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
+from absl import logging
 
 from logvggt_jax.data.dataset import Dataset
+from logvggt_jax.data.holdouts import check_disjoint, check_held_out
 from logvggt_jax.data.pipeline import BatchIterator, training_batches
 from logvggt_jax.data.registry import open_dataset
 from logvggt_jax.data.room_pool import render_pool
@@ -67,21 +72,58 @@ def open_source(source: SourceConfig) -> Dataset:
         raise ValueError(f"options of the data set 'rooms': {error}") from error
 
 
-def open_sources(config: DataConfig) -> dict[str, Dataset]:
-    """The mixture's data sets by name; rooms are rendered here, once, since rendering costs more than training."""
+def open_sources(config: DataConfig, validation: SourceConfig | None = None) -> dict[str, Dataset]:
+    """The mixture's data sets by name; rooms are rendered here, once, since rendering costs more than training.
+
+    Raises:
+      FileNotFoundError: folders of data sets do not exist and `config.allow_missing` is off, or none exists; named.
+      ValueError: a data set would train on sequences that `config.hold_out` or the `validation` source keeps.
+    """
+    rules = dict(config.hold_out)
     datasets: dict[str, Dataset] = {}
-    for source in config.sources:
+    for source in _present(config):
         dataset = open_source(source)
+        if source.name in rules:
+            check_held_out(
+                source.name, dataset.sequences, rules[source.name], functools.partial(_split_sequences, source)
+            )
+        if validation is not None and (validation.name, validation.root) == (source.name, source.root):
+            check_disjoint(source.name, dataset.sequences, open_source(validation).sequences)
         if isinstance(dataset, Rooms):
             dataset = render_pool(dataset, cache_dir=config.cache_dir, progress=jax.process_index() == 0)
         datasets[source.name] = dataset
     return datasets
 
 
+def _split_sequences(source: SourceConfig, split: str) -> Sequence[str]:
+    return open_source(dataclasses.replace(source, split=split)).sequences
+
+
+def _present(config: DataConfig) -> list[SourceConfig]:
+    """The sources whose folders exist."""
+    missing = [source for source in config.sources if source.root is not None and not Path(source.root).is_dir()]
+    if not missing:
+        return list(config.sources)
+    named = ", ".join(f"{source.name} ({source.root})" for source in missing)
+    if not config.allow_missing:
+        raise FileNotFoundError(
+            f"data sets without their folder: {named}; set data.sources.NAME.root, remove them from the mixture, or "
+            "train on the others with data.allow_missing=True"
+        )
+    present = [source for source in config.sources if source not in missing]
+    if not present:
+        raise FileNotFoundError(f"none of the data sets has its folder: {named}; set data.sources.NAME.root")
+    total = sum(source.weight for source in present)
+    shares = ", ".join(f"{source.name} {source.weight / total:.1%}" for source in present)
+    logging.warning("data sets without their folder are left out: %s; clips come from %s", named, shares)
+    return present
+
+
 def stage_batches(
     datasets: Mapping[str, Dataset], config: DataConfig, stage: StageConfig, *, seed: int
 ) -> BatchesInTurn:
     """This process's share of the batches of a stage; `seed` is the stage's own."""
+    sources = [source for source in config.sources if source.name in datasets]
     streams = [
         training_batches(
             datasets,
@@ -90,8 +132,9 @@ def stage_batches(
             size=size,
             seed=seed * len(stage.sizes) + position,
             stride=(stage.min_stride, stage.max_stride),
+            strides={source.name: source.stride for source in sources if source.stride is not None},
             reverse=config.reverse,
-            weights={source.name: source.weight for source in config.sources},
+            weights={source.name: source.weight for source in sources},
             process_index=jax.process_index(),
             process_count=jax.process_count(),
             worker_count=config.worker_count,

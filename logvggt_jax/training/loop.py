@@ -58,7 +58,8 @@ def train(config: TrainConfig, workdir: Path, *, mesh: Mesh, resume_step: int | 
     run = _Run(config, workdir, mesh)
     with run.checkpoints, StopRequest() as stop:
         first, position = run.restore(resume_step)
-        datasets = open_sources(config.data)
+        validation = None if config.validation is None else config.validation.source
+        datasets = open_sources(config.data, validation)
         console = Console(quiet=jax.process_index() != 0)
         with MetricsLog(workdir, first_step=first, console=console) as log:
             log.say(f"{mesh.size} devices, {first}/{config.total_steps} steps done, results in {workdir}")

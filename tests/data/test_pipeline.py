@@ -88,6 +88,45 @@ def test_every_epoch_visits_every_sequence_once_with_new_clips_in_a_new_order():
     assert len({clip for epoch in epochs for clip in epoch}) > 20
 
 
+def test_a_seed_gives_the_clips_that_it_always_gave():
+    """Results of runs depend on it: these are the clips of the first version."""
+    with batches() as iterator:
+        drawn = clips(iterator, 2)
+    assert drawn == [
+        (7, 2, 5, 8),
+        (3, 0, 2, 4),
+        (5, 2, 3, 4),
+        (6, 1, 4, 7),
+        (0, 2, 4, 6),
+        (2, 8, 6, 4),
+        (1, 5, 6, 7),
+        (4, 2, 4, 6),
+    ]
+
+
+def test_data_sets_have_strides_of_their_own():
+    mixture = {"near": Numbered(4), "far": Numbered(4, first=100)}
+    with batches(mixture, strides={"far": (4, 4)}, stride=(1, 2)) as iterator:
+        drawn = clips(iterator, 20)
+    steps = {far: {abs(b - a) for first, a, b, _ in drawn if (first >= 100) == far} for far in (False, True)}
+    assert steps == {False: {1, 2}, True: {4}}
+    with pytest.raises(ValueError, match="strides must be of near, far"):
+        batches(mixture, strides={"other": (1, 1)})
+
+
+def test_unordered_sets_are_walked():
+    class Photographs(Numbered):
+        def covisibility(self, sequence: str) -> dict[int, list[tuple[int, float]]]:
+            # Even frames see even ones, odd ones odd ones.
+            return {i: [(j, 1.0) for j in range(9) if j != i and (i - j) % 2 == 0] for i in range(9)}
+
+    with batches({"photographs": Photographs(4)}, clip_length=4) as iterator:
+        drawn = clips(iterator, 10)
+    assert all(len({frame % 2 for frame in clip[1:]}) == 1 and len(set(clip[1:])) == 4 for clip in drawn)
+    with pytest.raises(ValueError, match="photographs: none of 4 sequences has the 6 frames connected"):
+        batches({"photographs": Photographs(4)}, clip_length=6)
+
+
 def test_a_seed_decides_everything():
     runs = []
     for seed in (5, 5, 6):
