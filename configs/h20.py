@@ -88,6 +88,20 @@ def get_config(data_root: str = "data") -> ConfigDict:
             name: {"names": rule.names} if rule.names else {"split": rule.split} for name, rule in PUBLISHED.items()
         },
         "allow_missing": False,
+        # VGGT's colour jitter, one draw a clip in seven of ten, and its blur, which it leaves off.
+        "augmentation": {
+            "shared": 0.7,
+            "jitter": 0.9,
+            "brightness": 0.5,
+            "contrast": 0.5,
+            "saturation": 0.5,
+            "hue": 0.1,
+            "grey": 0.05,
+            "blur": 0.05,
+            "blur_sigma": (0.1, 1.0),
+        },
+        "min_valid_depth": 0.01,
+        "max_broken": 0.01,
         "reverse": 0.5,
         "worker_count": 16,
         "num_threads": 2,

@@ -2,16 +2,20 @@
 
 Pixel centres are at integers; resizing by a factor s maps c' = (c + 0.5) s - 0.5. Images are resampled with the
 antialiased bicubic filter (a = -0.5) of Pillow, which VGGT's weights were trained with; depth takes the nearest
-pixel, since a mean across an edge is on neither surface.
+pixel, since a mean across an edge is on neither surface. `preprocess` writes the filter as a matrix product; `fit`
+calls Pillow, which takes half the time on one core (8.6 ms instead of 16.8 from 968 x 1296 to 392 x 518) and, unlike
+OpenCV's faster `INTER_AREA`, crops at fractions of a pixel.
 """
 
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from PIL import Image
 
 from logvggt_jax.types import Frames
 
@@ -104,12 +108,18 @@ def preprocess(
         longer_edge if edge == longer else max(PATCH, PATCH * round(edge * longer_edge / longer / PATCH))
         for edge in (height, width)
     )
-    rows = _resize_matrix(height, size[0], size[0] / height, 0.0)
-    columns = _resize_matrix(width, size[1], size[1] / width, 0.0)
+    rows = _resize_matrix(height, size[0])
+    columns = _resize_matrix(width, size[1])
     images = np.empty((len(frames), *size, 3), np.float32)
     for frame, image in zip(frames, images, strict=True):
         np.divide(_resample(frame, rows, columns), np.float32(255.0), out=image)
     return images, ResizeTransform(original_size=(height, width), size=(size[0], size[1]))
+
+
+def nearest_size(size: tuple[int, int], sizes: Sequence[tuple[int, int]]) -> tuple[int, int]:
+    """The one of `sizes` (H, W) whose aspect ratio is nearest to that of `size`; the first of equally near ones."""
+    aspect = math.log(size[1] / size[0])
+    return min(sizes, key=lambda each: abs(math.log(each[1] / each[0]) - aspect))
 
 
 def fit(frames: Frames, size: tuple[int, int]) -> Frames:
@@ -134,12 +144,14 @@ def fit(frames: Frames, size: tuple[int, int]) -> Frames:
     depth = np.empty((len(crops), height, width), np.float32)
     intrinsics = frames.intrinsics.copy()
     for index, (scale, left, top) in enumerate(crops):
-        rows = _resize_matrix(source_height, height, scale, top)
-        columns = _resize_matrix(source_width, width, scale, left)
-        images[index] = _resample(frames.images[index], rows, columns)
-        nearest_rows = _nearest(height, scale, top, source_height)
-        nearest_columns = _nearest(width, scale, left, source_width)
-        depth[index] = frames.depth[index][nearest_rows[:, None], nearest_columns]
+        # Only rounding can put a border outside the picture.
+        right, bottom = min(left + width / scale, source_width), min(top + height / scale, source_height)
+        picture = Image.fromarray(frames.images[index])
+        box = (max(left, 0.0), max(top, 0.0), right, bottom)
+        images[index] = np.asarray(picture.resize((width, height), Image.Resampling.BICUBIC, box=box))
+        rows = _nearest(height, scale, top, source_height)
+        columns = _nearest(width, scale, left, source_width)
+        depth[index] = frames.depth[index][rows][:, columns]
         intrinsics[index, :2, :2] *= scale
         intrinsics[index, :2, 2] = width / 2, height / 2
     return frames._replace(images=images, depth=depth, intrinsics=intrinsics)
@@ -173,9 +185,10 @@ def _nearest(out_size: int, scale: float, start: float, in_size: int) -> np.ndar
 
 
 @functools.lru_cache(maxsize=64)
-def _resize_matrix(in_size: int, out_size: int, scale: float, start: float) -> np.ndarray:
+def _resize_matrix(in_size: int, out_size: int) -> np.ndarray:
     """Filter weights [out_size, in_size] float32, rows sum to 1; the kernel widens when shrinking."""
-    centres = (np.arange(out_size) + 0.5) / scale - 0.5 + start
+    scale = out_size / in_size
+    centres = (np.arange(out_size) + 0.5) / scale - 0.5
     distance = np.abs(np.arange(in_size) - centres[:, None]) * min(scale, 1.0)
     near = (1.5 * distance - 2.5) * distance**2 + 1.0
     far = ((-0.5 * distance + 2.5) * distance - 4.0) * distance + 2.0

@@ -1,4 +1,4 @@
-"""The data streams of a run: data sets opened once, one stream for each image size of a stage."""
+"""The data of a run: data sets opened once, one stream of batches for each stage."""
 
 from __future__ import annotations
 
@@ -6,10 +6,8 @@ import dataclasses
 import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
-import numpy as np
 from absl import logging
 
 from logvggt_jax.data.dataset import Dataset
@@ -19,45 +17,6 @@ from logvggt_jax.data.registry import open_dataset
 from logvggt_jax.data.room_pool import render_pool
 from logvggt_jax.data.rooms import Rooms
 from logvggt_jax.training.config import DataConfig, SourceConfig, StageConfig
-
-
-class BatchesInTurn:
-    """Endless batches from several streams in turn; a context manager that ends their threads.
-
-    The state counts what was handed out, so that it agrees with the training state when it is read before the
-    next batch is drawn.
-    """
-
-    def __init__(self, streams: Sequence[BatchIterator]) -> None:
-        self._streams = list(streams)
-        self._turn = 0
-
-    def __enter__(self) -> BatchesInTurn:
-        return self
-
-    def __exit__(self, *_: Any) -> None:
-        for stream in self._streams:
-            stream.close()
-
-    def __next__(self) -> dict[str, np.ndarray]:
-        batch = next(self._streams[self._turn])
-        self._turn = (self._turn + 1) % len(self._streams)
-        return batch
-
-    def get_state(self) -> dict[str, Any]:
-        """JSON values for `set_state`."""
-        return {"turn": self._turn, "streams": [stream.get_state() for stream in self._streams]}
-
-    def set_state(self, state: Mapping[str, Any]) -> None:
-        """Goes on where `get_state` was called; ValueError if the streams are others."""
-        if len(state["streams"]) != len(self._streams):
-            raise ValueError(
-                f"the data state is of {len(state['streams'])} image sizes, this stage has {len(self._streams)}: "
-                "set stages back or start a new --workdir"
-            )
-        self._turn = int(state["turn"])
-        for stream, saved in zip(self._streams, state["streams"], strict=True):
-            stream.set_state(saved)
 
 
 def open_source(source: SourceConfig) -> Dataset:
@@ -121,25 +80,24 @@ def _present(config: DataConfig) -> list[SourceConfig]:
 
 def stage_batches(
     datasets: Mapping[str, Dataset], config: DataConfig, stage: StageConfig, *, seed: int
-) -> BatchesInTurn:
+) -> BatchIterator:
     """This process's share of the batches of a stage; `seed` is the stage's own."""
     sources = [source for source in config.sources if source.name in datasets]
-    streams = [
-        training_batches(
-            datasets,
-            clip_length=stage.clip_length,
-            batch_size=stage.batch_size,
-            size=size,
-            seed=seed * len(stage.sizes) + position,
-            stride=(stage.min_stride, stage.max_stride),
-            strides={source.name: source.stride for source in sources if source.stride is not None},
-            reverse=config.reverse,
-            weights={source.name: source.weight for source in sources},
-            process_index=jax.process_index(),
-            process_count=jax.process_count(),
-            worker_count=config.worker_count,
-            num_threads=config.num_threads,
-        )
-        for position, size in enumerate(stage.sizes)
-    ]
-    return BatchesInTurn(streams)
+    return training_batches(
+        datasets,
+        clip_length=stage.clip_length,
+        batch_size=stage.batch_size,
+        sizes=stage.sizes,
+        seed=seed,
+        stride=(stage.min_stride, stage.max_stride),
+        strides={source.name: source.stride for source in sources if source.stride is not None},
+        reverse=config.reverse,
+        weights={source.name: source.weight for source in sources},
+        augmentation=config.augmentation,
+        min_valid_depth=config.min_valid_depth,
+        max_broken=config.max_broken,
+        process_index=jax.process_index(),
+        process_count=jax.process_count(),
+        worker_count=config.worker_count,
+        num_threads=config.num_threads,
+    )

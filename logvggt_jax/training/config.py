@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from logvggt_jax.config import ModelConfig
+from logvggt_jax.data.augmentation import ColourAugmentation
 from logvggt_jax.data.holdouts import HoldOut
 
 LOSSES = ("log_vggt", "vggt")
@@ -84,8 +85,8 @@ class OptimizerConfig:
 class StageConfig:
     """One stage of the curriculum: `steps` batches of `batch_size` clips (over all devices) of `clip_length` frames.
 
-    Strides are drawn from `min_stride` to `max_stride`. Images are `sizes`, (height, width) each: one compiled
-    program and one data stream a size, taken in turn.
+    Strides are drawn from `min_stride` to `max_stride`. Images are `sizes`, (height, width) each, one compiled
+    program a size: a clip has the one nearest to its own aspect ratio, a batch clips of one size.
     """
 
     name: str
@@ -143,7 +144,9 @@ class DataConfig:
     Clips run backwards in time with probability `reverse`. `worker_count` processes read ahead (0: none, this
     process reads), each with `num_threads` threads. Rendered rooms are kept in `cache_dir`, in memory if None.
     `hold_out` (sorted pairs of data set and rule) says what must not be trained on. A data set whose folder does not
-    exist is an error, with `allow_missing` a warning: the others then share its part.
+    exist is an error, with `allow_missing` a warning: the others then share its part. `augmentation` changes the
+    pictures' colours, None leaves them. A clip that cannot be read, or of whose pixels less than `min_valid_depth`
+    have depth, is replaced; more than `max_broken` of the clips end the run, with 0 the first.
     """
 
     sources: tuple[SourceConfig, ...]
@@ -153,9 +156,14 @@ class DataConfig:
     cache_dir: str | None
     hold_out: tuple[tuple[str, HoldOut], ...] = ()
     allow_missing: bool = False
+    augmentation: ColourAugmentation | None = None
+    min_valid_depth: float = 0.0
+    max_broken: float = 0.0
 
     def __post_init__(self) -> None:
         _require(bool(self.sources), "data.sources is empty: name at least one data set")
+        for field in ("min_valid_depth", "max_broken"):
+            _require(0 <= getattr(self, field) < 1, f"data.{field} must lie in [0, 1), got {getattr(self, field)}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -242,6 +250,8 @@ class TrainConfig:
             (name, _build(HoldOut, rule, f"config.data.hold_out.{name}"))
             for name, rule in sorted(dict(data.get("hold_out", {})).items())
         )
+        if data.get("augmentation") is not None:
+            data["augmentation"] = _build(ColourAugmentation, data["augmentation"], "config.data.augmentation")
         values["data"] = _build(DataConfig, data, "config.data")
         if validation is not None:
             validation = dict(validation)
