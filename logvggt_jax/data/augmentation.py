@@ -47,15 +47,13 @@ class ColourAugmentation:
         if len(self.blur_sigma) != 2 or not 0 < self.blur_sigma[0] <= self.blur_sigma[1]:
             raise ValueError(f"augmentation.blur_sigma must be a pair 0 < low <= high, got {self.blur_sigma}")
 
-    def __call__(self, images: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Changed copies of `images`, uint8 RGB [T, H, W, 3]."""
+    def __call__(self, images: np.ndarray, rng: np.random.Generator) -> None:
+        """Changes `images`, uint8 RGB [T, H, W, 3] in C order, in place."""
         groups = [slice(None)] if rng.random() < self.shared else [slice(i, i + 1) for i in range(len(images))]
-        result = np.empty_like(images)
         for group in groups:
-            self._change(images[group], result[group], rng)
-        return result
+            self._change(images[group], rng)
 
-    def _change(self, images: np.ndarray, result: np.ndarray, rng: np.random.Generator) -> None:
+    def _change(self, images: np.ndarray, rng: np.random.Generator) -> None:
         """One draw for all `images`."""
         colours, offset = np.eye(3), 0.0
         if rng.random() < self.jitter:
@@ -72,10 +70,10 @@ class ColourAugmentation:
         sigma = float(rng.uniform(*self.blur_sigma)) if rng.random() < self.blur else None
         # All steps are one affine map of the colours: clipped once, and rounded once to 0.6 of a level.
         affine = np.column_stack([colours, np.full(3, offset)])
-        for image, changed in zip(images, result, strict=True):
-            np.copyto(changed, cv2.transform(image, affine))
+        for image in images:
+            cv2.transform(image, affine, dst=image)
             if sigma is not None:
-                np.copyto(changed, cv2.GaussianBlur(changed, (0, 0), sigma))
+                cv2.GaussianBlur(image, (0, 0), sigma, dst=image)
 
 
 def _saturation(factor: float) -> np.ndarray:

@@ -21,8 +21,7 @@ from logvggt_jax.data.augmentation import ColourAugmentation
 from logvggt_jax.data.broken_clips import BrokenClips, describe
 from logvggt_jax.data.dataset import Dataset, check_frames
 from logvggt_jax.data.sampling import Sampler, example_rng, sampler_for
-from logvggt_jax.data.transforms import fit, nearest_size
-from logvggt_jax.types import Frames
+from logvggt_jax.data.transforms import fit_each, nearest_size
 
 Batch = dict[str, np.ndarray]
 Size = tuple[int, int]
@@ -53,24 +52,19 @@ class _ClipReader:
     def __call__(self, index: int, sequence: str) -> Batch:
         rng = example_rng(self.seed, index)
         indices = [int(i) for i in self.sampler.draw(self.dataset, sequence, rng)]
-        clip = self._read(sequence, indices)
+        # One frame at a time: a clip of large pictures would take a gigabyte.
+        frames = (self.dataset.read(sequence, [index]) for index in indices)
+        clip = fit_each(frames, len(indices), self.size)
         where = f"{self.name}, {sequence}, frames {' '.join(map(str, indices))}"
         check_frames(clip, where)
-        valid = np.count_nonzero(clip.depth) / clip.depth.size
+        valid = np.count_nonzero(clip.depth > 0) / clip.depth.size
         if valid < self.min_valid_depth:
             raise ValueError(
                 f"{where}: {valid:.2%} of the pixels have depth, min_valid_depth={self.min_valid_depth:g} asks for more"
             )
-        images = clip.images if self.augmentation is None else self.augmentation(clip.images, rng)
-        return {"images": images, "depth": clip.depth, "intrinsics": clip.intrinsics, "extrinsics": clip.extrinsics}
-
-    def _read(self, sequence: str, indices: Sequence[int]) -> Frames:
-        """Fitted frames, opened one at a time: a clip of large pictures would take a gigabyte."""
-        fitted = [fit(self.dataset.read(sequence, [index]), self.size) for index in indices]
-        return Frames(
-            **{name: np.concatenate([getattr(frames, name) for frames in fitted]) for name in _FIELDS},
-            metric=fitted[0].metric,
-        )
+        if self.augmentation is not None:
+            self.augmentation(clip.images, rng)
+        return {name: getattr(clip, name) for name in _FIELDS}
 
 
 class _ReplaceBroken:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -133,28 +133,74 @@ def fit(frames: Frames, size: tuple[int, int]) -> Frames:
     Raises:
       ValueError: `size` is not two multiples of 14, or a principal point lies outside its image.
     """
+    _check_size(size)
+    source = frames.images.shape[1:3]
+    if source == size and all(crop == (1.0, 0.0, 0.0) for crop in _crops(frames, size)):
+        return frames
+    count = len(frames.images)
+    fitted = frames._replace(
+        images=np.empty((count, *size, 3), np.uint8),
+        depth=np.empty((count, *size), np.float32),
+        intrinsics=np.empty((count, 3, 3), np.float32),
+    )
+    _fit_into(fitted, 0, frames, size)
+    return fitted
+
+
+def fit_each(frames: Iterable[Frames], count: int, size: tuple[int, int]) -> Frames:
+    """`count` frames that arrive in parts, each fitted as by `fit` and then forgotten, as one new clip.
+
+    Raises ValueError as `fit` does.
+    """
+    _check_size(size)
+    clip = Frames(
+        images=np.empty((count, *size, 3), np.uint8),
+        depth=np.empty((count, *size), np.float32),
+        intrinsics=np.empty((count, 3, 3), np.float32),
+        extrinsics=np.empty((count, 4, 4), np.float32),
+        metric=True,
+    )
+    done = 0
+    for part in frames:
+        _fit_into(clip, done, part, size)
+        clip.extrinsics[done : done + len(part.images)] = part.extrinsics
+        clip = clip._replace(metric=part.metric)
+        done += len(part.images)
+    return clip
+
+
+def _check_size(size: tuple[int, int]) -> None:
     height, width = size
     if height < PATCH or width < PATCH or height % PATCH or width % PATCH:
         raise ValueError(f"size must be two positive multiples of {PATCH}, got {size}")
+
+
+def _fit_into(clip: Frames, first: int, frames: Frames, size: tuple[int, int]) -> None:
+    """Writes `frames` as images, depth and intrinsics `first`, first + 1, … of `clip`."""
+    height, width = size
     source_height, source_width = frames.images.shape[1:3]
-    crops = [_crop(matrix, (source_height, source_width), size) for matrix in frames.intrinsics.astype(np.float64)]
-    if (source_height, source_width) == (height, width) and all(crop == (1.0, 0.0, 0.0) for crop in crops):
-        return frames
-    images = np.empty((len(crops), height, width, 3), np.uint8)
-    depth = np.empty((len(crops), height, width), np.float32)
-    intrinsics = frames.intrinsics.copy()
-    for index, (scale, left, top) in enumerate(crops):
+    for index, (scale, left, top) in enumerate(_crops(frames, size)):
+        place = first + index
+        clip.intrinsics[place] = frames.intrinsics[index]
+        if (source_height, source_width) == size and (scale, left, top) == (1.0, 0.0, 0.0):
+            clip.images[place], clip.depth[place] = frames.images[index], frames.depth[index]
+            continue
         # Only rounding can put a border outside the picture.
         right, bottom = min(left + width / scale, source_width), min(top + height / scale, source_height)
-        picture = Image.fromarray(frames.images[index])
         box = (max(left, 0.0), max(top, 0.0), right, bottom)
-        images[index] = np.asarray(picture.resize((width, height), Image.Resampling.BICUBIC, box=box))
+        picture = Image.fromarray(frames.images[index])
+        clip.images[place] = np.asarray(picture.resize((width, height), Image.Resampling.BICUBIC, box=box))
         rows = _nearest(height, scale, top, source_height)
         columns = _nearest(width, scale, left, source_width)
-        depth[index] = frames.depth[index][rows][:, columns]
-        intrinsics[index, :2, :2] *= scale
-        intrinsics[index, :2, 2] = width / 2, height / 2
-    return frames._replace(images=images, depth=depth, intrinsics=intrinsics)
+        # The mode spares a copy; all columns are inside.
+        np.take(frames.depth[index][rows], columns, axis=1, out=clip.depth[place], mode="clip")
+        clip.intrinsics[place, :2, :2] *= scale
+        clip.intrinsics[place, :2, 2] = width / 2, height / 2
+
+
+def _crops(frames: Frames, size: tuple[int, int]) -> list[tuple[float, float, float]]:
+    source = (frames.images.shape[1], frames.images.shape[2])
+    return [_crop(matrix, source, size) for matrix in frames.intrinsics.astype(np.float64)]
 
 
 def _rescaled(intrinsics: np.ndarray, scale: np.ndarray) -> np.ndarray:
