@@ -4,31 +4,35 @@
 
 `initial_weights` takes what `logvggt convert` wrote, a VGGT checkpoint, or a hub repository. Set the data sets'
 folders with --config.data.sources.scannet.root=/data/scannet and so on; --config=configs/h20.py:DATA_ROOT puts all
-of them under one folder. The paper gives clip lengths, epochs, windows and data sets. Optimiser, mixture, batch
-sizes and the length of an epoch are choices of this project.
+of them under one folder. --config.data.allow_missing=True trains on those that are there. The paper gives clip
+lengths, epochs, windows and data sets. Optimiser, mixture, strides, batch sizes and the length of an epoch are choices
+of this project.
 """
 
 from ml_collections import ConfigDict
 from ml_collections.config_dict import placeholder
+
+from logvggt_jax.data.holdouts import PUBLISHED
 
 STEPS_PER_EPOCH = 800
 NUM_DEVICES = 16
 # (height, width), the longer edge 518: aspect ratios of the data sets, as StreamVGGT trains them.
 LANDSCAPE = ((392, 518), (336, 518), (294, 518), (266, 518), (210, 518), (154, 518))
 PORTRAIT = ((518, 392), (518, 336), (518, 294), (518, 266))
-# Clips of each data set per 30,900: StreamVGGT's mixture, ARKitScenes' two forms as one, Replica as the smallest.
+# Clips of each data set per 30,900: StreamVGGT's mixture, ARKitScenes' two forms as one, Replica as the smallest. The
+# largest distance between frames is CUT3R's, Replica's as ScanNet's; BlendedMVS has no order in time and is walked.
 MIXTURE = {
-    "co3dv2": 4500,
-    "wildrgbd": 4500,
-    "arkitscenes": 6750,
-    "scannet": 4500,
-    "hypersim": 1200,
-    "blendedmvs": 2250,
-    "virtual_kitti": 2250,
-    "spring": 1800,
-    "mvs_synth": 450,
-    "pointodyssey": 2250,
-    "replica": 450,
+    "co3dv2": (4500, 25),
+    "wildrgbd": (4500, 25),
+    "arkitscenes": (6750, 8),
+    "scannet": (4500, 30),
+    "hypersim": (1200, 4),
+    "blendedmvs": (2250, None),
+    "virtual_kitti": (2250, 5),
+    "spring": (1800, 16),
+    "mvs_synth": (450, 4),
+    "pointodyssey": (2250, 4),
+    "replica": (450, 30),
 }
 
 
@@ -71,9 +75,33 @@ def get_config(data_root: str = "data") -> ConfigDict:
     }
     config.data = {
         "sources": {
-            name: {"root": f"{data_root}/{name}", "split": "train", "weight": float(weight)}
-            for name, weight in MIXTURE.items()
+            name: {
+                "root": f"{data_root}/{name}",
+                "split": "train",
+                "weight": float(weight),
+                **({"stride": (1, max_stride)} if max_stride else {}),
+            }
+            for name, (weight, max_stride) in MIXTURE.items()
         },
+        # Never trained on: the run refuses to start if a source contains one of these sequences.
+        "hold_out": {
+            name: {"names": rule.names} if rule.names else {"split": rule.split} for name, rule in PUBLISHED.items()
+        },
+        "allow_missing": False,
+        # VGGT's colour jitter, one draw a clip in seven of ten, and its blur, which it leaves off.
+        "augmentation": {
+            "shared": 0.7,
+            "jitter": 0.9,
+            "brightness": 0.5,
+            "contrast": 0.5,
+            "saturation": 0.5,
+            "hue": 0.1,
+            "grey": 0.05,
+            "blur": 0.05,
+            "blur_sigma": (0.1, 1.0),
+        },
+        "min_valid_depth": 0.01,
+        "max_broken": 0.01,
         "reverse": 0.5,
         "worker_count": 16,
         "num_threads": 2,

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import pytest
 
 from logvggt_jax import LogVGGT, ModelConfig
+from logvggt_jax.data.holdouts import PUBLISHED
 from logvggt_jax.data.rooms import Rooms
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.optimizer import learning_rate_schedule, make_optimizer
@@ -61,6 +62,10 @@ def test_h20_is_the_papers_training(monkeypatch: pytest.MonkeyPatch) -> None:
     assert [(stage.clip_length, stage.steps) for stage in config.stages] == [(12, 100 * 800), (64, 10 * 800)]
     assert len(config.data.sources) == 11
     assert not {source.name for source in config.data.sources} & {"rooms", "seven_scenes", "nrgbd", "sintel", "bonn"}
+    assert dict(config.data.hold_out) == PUBLISHED, "what evaluation uses is not trained on"
+    assert not config.data.allow_missing
+    strides = {source.name: source.stride for source in config.data.sources}
+    assert [name for name, stride in strides.items() if stride is None] == ["blendedmvs"], "the only unordered set"
     for stage in config.stages:
         check_batch_size(stage, data_mesh(16))
 

@@ -28,6 +28,10 @@ class Dataset(Protocol):
         """Number of frames of `sequence` that count."""
         ...
 
+    def image_size(self, sequence: str) -> tuple[int, int]:
+        """(H, W) of the pictures of `sequence`."""
+        ...
+
     def frame_names(self, sequence: str) -> Sequence[str]:
         """Unique names of these frames, in time order."""
         ...

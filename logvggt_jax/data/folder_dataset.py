@@ -105,6 +105,31 @@ class FolderDataset(abc.ABC):
             self._counts[sequence] = len(self._listing(sequence).frames) if count is None else count
         return self._counts[sequence]
 
+    def image_size(self, sequence: str) -> tuple[int, int]:
+        """(H, W) of the pictures handed out, as the first frame has them; kept in the index.
+
+        Where that frame cannot be read, one in the middle and the last one are tried before its error is raised.
+        """
+        records = self._listing(sequence).frames
+        key = f"size {sequence} {records[0].quarter_turns}"
+        payload = self._index.get(key)
+        if payload is not None:
+            height, width = json.loads(payload)
+            return height, width
+        failed: Exception | None = None
+        for position in dict.fromkeys((0, len(records) // 2, len(records) - 1)):
+            try:
+                height, width = self.read(sequence, [position]).images.shape[1:3]
+            except (OSError, ValueError) as error:
+                failed = failed or error
+                continue
+            files = SourceFiles()
+            files.exists(records[position].image)
+            self._index.put(key, json.dumps([height, width]).encode(), 1, files)
+            return height, width
+        assert failed is not None
+        raise failed
+
     def frame_names(self, sequence: str) -> list[str]:
         """Names of these frames, in time order."""
         return [record.name for record in self._listing(sequence).frames]

@@ -37,7 +37,7 @@ def read_rgb(path: str | Path) -> np.ndarray:
     if picture.shape[2] == 4:
         alpha = picture[:, :, 3:].astype(np.float32) / 255.0
         picture = (picture[:, :, :3] * alpha + 255.0 * (1.0 - alpha) + 0.5).astype(np.uint8)
-    return np.ascontiguousarray(picture[:, :, ::-1])
+    return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
 
 
 def read_depth(path: str | Path) -> np.ndarray:

@@ -51,6 +51,10 @@ class RoomPool:
         """Frames of `sequence`."""
         return self.rooms.num_frames(sequence)
 
+    def image_size(self, sequence: str) -> tuple[int, int]:
+        """(H, W): the same for all rooms."""
+        return self.rooms.image_size(sequence)
+
     def frame_names(self, sequence: str) -> list[str]:
         """Names as `Rooms` gives them."""
         return self.rooms.frame_names(sequence)

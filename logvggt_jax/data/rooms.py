@@ -100,6 +100,11 @@ class Rooms:
         check_sequence(sequence, self._numbers, "rooms")
         return self._num_frames
 
+    def image_size(self, sequence: str) -> tuple[int, int]:
+        """(H, W): the same for all rooms."""
+        check_sequence(sequence, self._numbers, "rooms")
+        return self.height, self.width
+
     def frame_names(self, sequence: str) -> list[str]:
         """`frame-000000` and so on."""
         return [f"frame-{index:06d}" for index in range(self.num_frames(sequence))]

@@ -23,7 +23,7 @@ from logvggt_jax.geometry import compose, unproject
 COLOUR_FROM_DEPTH = np.array([-0.025, 0.0, 0.0])  # metres, identity rotation
 _COLOUR_FOCAL, _DEPTH_FOCAL = 525.0, 585.0  # pixels at 640 x 480
 _CENTRE, _SIZE = (320.0, 240.0), (480, 640)
-_MIN_DEPTH, _MAX_DEPTH = 0.001, 10.0  # metres, both valid themselves
+_MAX_DEPTH = 10000  # millimetres, valid itself
 _SEQUENCE = re.compile(r"seq-\d{2}")
 _FRAME_FILE = re.compile(r"(frame-\d{6})\.(color\.png|color\.jpg|depth\.proj\.png|depth\.png|pose\.txt)")
 _LIST_LINE = re.compile(r"[^\d]*(\d+)[^\d]*")
@@ -138,9 +138,8 @@ def _at_size(intrinsics: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 def _metres(raw: np.ndarray) -> np.ndarray:
     """Millimetres uint16 as float32 metres, 0 where invalid (0 and 65535 in the files) or out of range."""
-    # Before anything is carried or cast: 65535 is outside the range too, as 65.5 m.
-    depth = raw.astype(np.float32) / np.float32(1000.0)
-    return np.where((depth >= np.float32(_MIN_DEPTH)) & (depth <= _MAX_DEPTH), depth, np.float32(0.0))
+    # Before anything is carried; compared as integers, which is several times faster. 65535 is out of range as well.
+    return np.where(raw <= _MAX_DEPTH, raw, np.uint16(0)).astype(np.float32) / np.float32(1000.0)
 
 
 def _shifted(extrinsics: np.ndarray) -> np.ndarray:

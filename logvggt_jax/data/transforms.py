@@ -2,16 +2,20 @@
 
 Pixel centres are at integers; resizing by a factor s maps c' = (c + 0.5) s - 0.5. Images are resampled with the
 antialiased bicubic filter (a = -0.5) of Pillow, which VGGT's weights were trained with; depth takes the nearest
-pixel, since a mean across an edge is on neither surface.
+pixel, since a mean across an edge is on neither surface. `preprocess` writes the filter as a matrix product; `fit`
+calls Pillow, which takes half the time on one core (8.6 ms instead of 16.8 from 968 x 1296 to 392 x 518) and, unlike
+OpenCV's faster `INTER_AREA`, crops at fractions of a pixel.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from PIL import Image
 
 from logvggt_jax.types import Frames
 
@@ -104,12 +108,18 @@ def preprocess(
         longer_edge if edge == longer else max(PATCH, PATCH * round(edge * longer_edge / longer / PATCH))
         for edge in (height, width)
     )
-    rows = _resize_matrix(height, size[0], size[0] / height, 0.0)
-    columns = _resize_matrix(width, size[1], size[1] / width, 0.0)
+    rows = _resize_matrix(height, size[0])
+    columns = _resize_matrix(width, size[1])
     images = np.empty((len(frames), *size, 3), np.float32)
     for frame, image in zip(frames, images, strict=True):
         np.divide(_resample(frame, rows, columns), np.float32(255.0), out=image)
     return images, ResizeTransform(original_size=(height, width), size=(size[0], size[1]))
+
+
+def nearest_size(size: tuple[int, int], sizes: Sequence[tuple[int, int]]) -> tuple[int, int]:
+    """The one of `sizes` (H, W) whose aspect ratio is nearest to that of `size`; the first of equally near ones."""
+    aspect = math.log(size[1] / size[0])
+    return min(sizes, key=lambda each: abs(math.log(each[1] / each[0]) - aspect))
 
 
 def fit(frames: Frames, size: tuple[int, int]) -> Frames:
@@ -123,26 +133,74 @@ def fit(frames: Frames, size: tuple[int, int]) -> Frames:
     Raises:
       ValueError: `size` is not two multiples of 14, or a principal point lies outside its image.
     """
+    _check_size(size)
+    source = frames.images.shape[1:3]
+    if source == size and all(crop == (1.0, 0.0, 0.0) for crop in _crops(frames, size)):
+        return frames
+    count = len(frames.images)
+    fitted = frames._replace(
+        images=np.empty((count, *size, 3), np.uint8),
+        depth=np.empty((count, *size), np.float32),
+        intrinsics=np.empty((count, 3, 3), np.float32),
+    )
+    _fit_into(fitted, 0, frames, size)
+    return fitted
+
+
+def fit_each(frames: Iterable[Frames], count: int, size: tuple[int, int]) -> Frames:
+    """`count` frames that arrive in parts, each fitted as by `fit` and then forgotten, as one new clip.
+
+    Raises ValueError as `fit` does.
+    """
+    _check_size(size)
+    clip = Frames(
+        images=np.empty((count, *size, 3), np.uint8),
+        depth=np.empty((count, *size), np.float32),
+        intrinsics=np.empty((count, 3, 3), np.float32),
+        extrinsics=np.empty((count, 4, 4), np.float32),
+        metric=True,
+    )
+    done = 0
+    for part in frames:
+        _fit_into(clip, done, part, size)
+        clip.extrinsics[done : done + len(part.images)] = part.extrinsics
+        clip = clip._replace(metric=part.metric)
+        done += len(part.images)
+    return clip
+
+
+def _check_size(size: tuple[int, int]) -> None:
     height, width = size
     if height < PATCH or width < PATCH or height % PATCH or width % PATCH:
         raise ValueError(f"size must be two positive multiples of {PATCH}, got {size}")
+
+
+def _fit_into(clip: Frames, first: int, frames: Frames, size: tuple[int, int]) -> None:
+    """Writes `frames` as images, depth and intrinsics `first`, first + 1, … of `clip`."""
+    height, width = size
     source_height, source_width = frames.images.shape[1:3]
-    crops = [_crop(matrix, (source_height, source_width), size) for matrix in frames.intrinsics.astype(np.float64)]
-    if (source_height, source_width) == (height, width) and all(crop == (1.0, 0.0, 0.0) for crop in crops):
-        return frames
-    images = np.empty((len(crops), height, width, 3), np.uint8)
-    depth = np.empty((len(crops), height, width), np.float32)
-    intrinsics = frames.intrinsics.copy()
-    for index, (scale, left, top) in enumerate(crops):
-        rows = _resize_matrix(source_height, height, scale, top)
-        columns = _resize_matrix(source_width, width, scale, left)
-        images[index] = _resample(frames.images[index], rows, columns)
-        nearest_rows = _nearest(height, scale, top, source_height)
-        nearest_columns = _nearest(width, scale, left, source_width)
-        depth[index] = frames.depth[index][nearest_rows[:, None], nearest_columns]
-        intrinsics[index, :2, :2] *= scale
-        intrinsics[index, :2, 2] = width / 2, height / 2
-    return frames._replace(images=images, depth=depth, intrinsics=intrinsics)
+    for index, (scale, left, top) in enumerate(_crops(frames, size)):
+        place = first + index
+        clip.intrinsics[place] = frames.intrinsics[index]
+        if (source_height, source_width) == size and (scale, left, top) == (1.0, 0.0, 0.0):
+            clip.images[place], clip.depth[place] = frames.images[index], frames.depth[index]
+            continue
+        # Only rounding can put a border outside the picture.
+        right, bottom = min(left + width / scale, source_width), min(top + height / scale, source_height)
+        box = (max(left, 0.0), max(top, 0.0), right, bottom)
+        picture = Image.fromarray(frames.images[index])
+        clip.images[place] = np.asarray(picture.resize((width, height), Image.Resampling.BICUBIC, box=box))
+        rows = _nearest(height, scale, top, source_height)
+        columns = _nearest(width, scale, left, source_width)
+        # The mode spares a copy; all columns are inside.
+        np.take(frames.depth[index][rows], columns, axis=1, out=clip.depth[place], mode="clip")
+        clip.intrinsics[place, :2, :2] *= scale
+        clip.intrinsics[place, :2, 2] = width / 2, height / 2
+
+
+def _crops(frames: Frames, size: tuple[int, int]) -> list[tuple[float, float, float]]:
+    source = (frames.images.shape[1], frames.images.shape[2])
+    return [_crop(matrix, source, size) for matrix in frames.intrinsics.astype(np.float64)]
 
 
 def _rescaled(intrinsics: np.ndarray, scale: np.ndarray) -> np.ndarray:
@@ -173,9 +231,10 @@ def _nearest(out_size: int, scale: float, start: float, in_size: int) -> np.ndar
 
 
 @functools.lru_cache(maxsize=64)
-def _resize_matrix(in_size: int, out_size: int, scale: float, start: float) -> np.ndarray:
+def _resize_matrix(in_size: int, out_size: int) -> np.ndarray:
     """Filter weights [out_size, in_size] float32, rows sum to 1; the kernel widens when shrinking."""
-    centres = (np.arange(out_size) + 0.5) / scale - 0.5 + start
+    scale = out_size / in_size
+    centres = (np.arange(out_size) + 0.5) / scale - 0.5
     distance = np.abs(np.arange(in_size) - centres[:, None]) * min(scale, 1.0)
     near = (1.5 * distance - 2.5) * distance**2 + 1.0
     far = ((-0.5 * distance + 2.5) * distance - 4.0) * distance + 2.0

@@ -14,6 +14,8 @@ from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.state import TrainState
 from logvggt_jax.weights.checkpoints import check_destination, digests, save_model, verify_digests
 
+# How fast, from where and with how many broken clips the data come; the data stream checks that they are the same.
+FREE_DATA_SETTINGS = ("worker_count", "num_threads", "cache_dir", "max_broken")
 LIBRARIES = ("logvggt-jax", "jax", "flax", "optax", "orbax-checkpoint", "grain")
 
 
@@ -129,13 +131,23 @@ class RunCheckpoints:
     def _check_configuration(self, stored: Mapping[str, Any], where: str) -> None:
         ours = _json(self.config.to_dict())
         for part in ("model", "stages", "data", "loss", "optimizer", "seed"):
-            difference = _first_difference(stored.get(part), ours[part], part)
+            theirs = stored.get(part)
+            if part == "data" and theirs is not None:
+                theirs, ours[part] = _what_decides_clips(theirs), _what_decides_clips(ours[part])
+            difference = _first_difference(theirs, ours[part], part)
             if difference is not None:
                 name, theirs, mine = difference
                 raise ValueError(
                     f"{where} was written with {name}={theirs!r}, the configuration says {mine!r}; "
                     "set it back or start a new --workdir"
                 )
+
+
+def _what_decides_clips(data: Mapping[str, Any]) -> dict[str, Any]:
+    """The data settings without those that a run may change when it goes on: its clips stay the same."""
+    kept = {name: value for name, value in data.items() if name not in FREE_DATA_SETTINGS}
+    kept["sources"] = [{name: value for name, value in source.items() if name != "root"} for source in data["sources"]]
+    return kept
 
 
 def _parts(state: TrainState) -> tuple[Any, dict[str, Any]]:

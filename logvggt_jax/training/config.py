@@ -10,6 +10,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from logvggt_jax.config import ModelConfig
+from logvggt_jax.data.augmentation import ColourAugmentation
+from logvggt_jax.data.holdouts import HoldOut
 
 LOSSES = ("log_vggt", "vggt")
 SCHEDULES = ("cosine", "linear_tail")
@@ -83,8 +85,8 @@ class OptimizerConfig:
 class StageConfig:
     """One stage of the curriculum: `steps` batches of `batch_size` clips (over all devices) of `clip_length` frames.
 
-    Strides are drawn from `min_stride` to `max_stride`. Images are `sizes`, (height, width) each: one compiled
-    program and one data stream a size, taken in turn.
+    Strides are drawn from `min_stride` to `max_stride`. Images are `sizes`, (height, width) each, one compiled
+    program a size: a clip has the one nearest to its own aspect ratio, a batch clips of one size.
     """
 
     name: str
@@ -111,14 +113,15 @@ class StageConfig:
 class SourceConfig:
     """One data set of a mixture.
 
-    `weight` is its share of the clips relative to the others'. `options` (sorted pairs) are the keyword arguments
-    of procedural rooms.
+    `weight` is its share of the clips relative to the others'. `stride`, smallest and largest, takes the place of
+    the stage's. `options` (sorted pairs) are the keyword arguments of procedural rooms.
     """
 
     name: str
     root: str | None
     split: str
     weight: float = 1.0
+    stride: tuple[int, int] | None = None
     options: tuple[tuple[str, Any], ...] = ()
 
     def __post_init__(self) -> None:
@@ -126,6 +129,12 @@ class SourceConfig:
             self, "options", tuple(sorted((key, _frozen(value)) for key, value in dict(self.options).items()))
         )
         _require(self.weight > 0, f"data set {self.name!r}: weight must be positive, got {self.weight}")
+        if self.stride is not None:
+            object.__setattr__(self, "stride", tuple(self.stride))
+            _require(
+                len(self.stride) == 2 and 1 <= self.stride[0] <= self.stride[1],
+                f"data set {self.name!r}: stride must be a pair 1 <= low <= high, got {self.stride}",
+            )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,6 +143,10 @@ class DataConfig:
 
     Clips run backwards in time with probability `reverse`. `worker_count` processes read ahead (0: none, this
     process reads), each with `num_threads` threads. Rendered rooms are kept in `cache_dir`, in memory if None.
+    `hold_out` (sorted pairs of data set and rule) says what must not be trained on. A data set whose folder does not
+    exist is an error, with `allow_missing` a warning: the others then share its part. `augmentation` changes the
+    pictures' colours, None leaves them. A clip that cannot be read, or of whose pixels less than `min_valid_depth`
+    have depth, is replaced; more than `max_broken` of the clips end the run, with 0 the first.
     """
 
     sources: tuple[SourceConfig, ...]
@@ -141,9 +154,16 @@ class DataConfig:
     worker_count: int
     num_threads: int
     cache_dir: str | None
+    hold_out: tuple[tuple[str, HoldOut], ...] = ()
+    allow_missing: bool = False
+    augmentation: ColourAugmentation | None = None
+    min_valid_depth: float = 0.0
+    max_broken: float = 0.0
 
     def __post_init__(self) -> None:
         _require(bool(self.sources), "data.sources is empty: name at least one data set")
+        for field in ("min_valid_depth", "max_broken"):
+            _require(0 <= getattr(self, field) < 1, f"data.{field} must lie in [0, 1), got {getattr(self, field)}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -206,8 +226,8 @@ class TrainConfig:
     def from_dict(cls, values: Mapping[str, Any]) -> TrainConfig:
         """A run from nested mappings, as files under `configs/` build them.
 
-        `stages` maps names to fields and runs in the order of the names; `data.sources` maps data-set names to
-        fields.
+        `stages` maps names to fields and runs in the order of the names; `data.sources` and `data.hold_out` map
+        data-set names to fields.
 
         Raises:
           ValueError: An unknown or missing field, or a value out of range; names it and the known ones.
@@ -226,6 +246,12 @@ class TrainConfig:
             _build(SourceConfig, {"name": name, **data["sources"][name]}, f"config.data.sources.{name}")
             for name in sorted(data["sources"])
         )
+        data["hold_out"] = tuple(
+            (name, _build(HoldOut, rule, f"config.data.hold_out.{name}"))
+            for name, rule in sorted(dict(data.get("hold_out", {})).items())
+        )
+        if data.get("augmentation") is not None:
+            data["augmentation"] = _build(ColourAugmentation, data["augmentation"], "config.data.augmentation")
         values["data"] = _build(DataConfig, data, "config.data")
         if validation is not None:
             validation = dict(validation)

@@ -13,16 +13,17 @@ from rich.console import Console
 
 from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.model.logvggt import LogVGGT
-from logvggt_jax.training.batches import BatchesInTurn, open_sources, stage_batches
+from logvggt_jax.training.batches import open_sources, stage_batches
 from logvggt_jax.training.checkpoints import Position, RunCheckpoints
 from logvggt_jax.training.config import StageConfig, TrainConfig
+from logvggt_jax.training.device_batches import DeviceBatches
 from logvggt_jax.training.initialization import initial_parameters
 from logvggt_jax.training.interruption import StopRequest
 from logvggt_jax.training.metrics_log import MetricsLog
 from logvggt_jax.training.optimizer import learning_rate_schedule, make_optimizer
 from logvggt_jax.training.processes import ASK_EVERY, any_process
 from logvggt_jax.training.progress import Speedometer, duration, progress_line
-from logvggt_jax.training.sharding import check_batch_size, put_batch, replicated
+from logvggt_jax.training.sharding import check_batch_size, replicated
 from logvggt_jax.training.state import TrainState, initial_state
 from logvggt_jax.training.step import Batch, CompiledSteps, Metrics, make_loss, make_train_step
 from logvggt_jax.training.validation import Validation
@@ -59,7 +60,8 @@ def train(config: TrainConfig, workdir: Path, *, mesh: Mesh, resume_step: int | 
     run = _Run(config, workdir, mesh)
     with run.checkpoints, StopRequest() as stop:
         first, position = run.restore(resume_step)
-        datasets = open_sources(config.data)
+        validation = None if config.validation is None else config.validation.source
+        datasets = open_sources(config.data, validation)
         silent = jax.process_index() != 0
         with MetricsLog(workdir, first_step=first, console=Console(), silent=silent) as log:
             log.say(f"{mesh.size} devices, {first}/{config.total_steps} steps done, results in {workdir}")
@@ -100,10 +102,11 @@ class _Run:
             if step >= end:
                 continue
             seed = self.config.seed * len(self.config.stages) + index
-            with stage_batches(datasets, self.config.data, stage, seed=seed) as batches:
+            with stage_batches(datasets, self.config.data, stage, seed=seed) as source:
                 if position is not None and position.stage == index:
-                    batches.set_state(position.data)
-                step = self._train_stage(index, stage, batches, step, end, log, stop)
+                    source.set_state(position.data)
+                with DeviceBatches(source, self.mesh) as batches:
+                    step = self._train_stage(index, stage, batches, step, end, log, stop)
             if step < end:
                 break
         log.say(f"{step}/{self.config.total_steps} steps done; model in {self.checkpoints.model_folder}")
@@ -112,7 +115,7 @@ class _Run:
         self,
         index: int,
         stage: StageConfig,
-        batches: BatchesInTurn,
+        batches: DeviceBatches,
         step: int,
         end: int,
         log: MetricsLog,
@@ -123,7 +126,7 @@ class _Run:
         in_flight: deque[jax.Array] = deque()
         self.speed.restart()
         while step < end:
-            batch = put_batch(next(batches), self.mesh)
+            batch = next(batches)
             self._compile(stage, batch, log)
             self.state, metrics = self.steps(self.state, batch)
             step += 1
@@ -135,10 +138,9 @@ class _Run:
             ending = self._reason_to_end(stop, step)
             last = step == end or ending is not None
             if step % config.log_every == 0 or step == 1 or last:
-                self._log(step, stage, metrics, log)
+                self._log(step, stage, metrics, batches.broken_clips, log)
             if config.validation is not None and (step % config.validation.every == 0 or step == config.total_steps):
                 self._validate(step, log)
-            # Before the next batch is drawn, so that the data stream's state is that of this step.
             if step % config.save_every == 0 or last:
                 self.checkpoints.save(self.state, Position(index, batches.get_state()))
                 self.speed.restart()
@@ -155,8 +157,9 @@ class _Run:
         log.say(f"{stage.name}: step compiled in {time.perf_counter() - started:.0f} s")
         self.speed.restart()
 
-    def _log(self, step: int, stage: StageConfig, metrics: Metrics, log: MetricsLog) -> None:
+    def _log(self, step: int, stage: StageConfig, metrics: Metrics, broken_clips: int, log: MetricsLog) -> None:
         values = {name: float(value) for name, value in jax.device_get(metrics).items()}
+        values["broken_clips"] = float(broken_clips)
         self.speed.read(stage)
         log.write(step, {**values, "frames_per_second": self.speed.frames_per_second})
         log.say(progress_line(step, self.config.total_steps, stage.name, values, self.speed))

@@ -217,6 +217,16 @@ def test_pictures_of_wrong_type_or_size_are_named(root: Path):
         SevenScenes(root).read("den/seq-02", [0, 1])
 
 
+def test_picture_sizes_are_found_once_and_despite_a_broken_frame(root: Path, monkeypatch: pytest.MonkeyPatch):
+    dataset = SevenScenes(root)
+    name = dataset.sequences[0]
+    first = next(root.rglob(f"{name.split('/')[1]}/frame-000000.color.*"))
+    first.write_bytes(first.read_bytes()[:100])
+    assert dataset.image_size(name) == (48, 64)
+    monkeypatch.setattr(SevenScenes, "read", None)
+    assert SevenScenes(root).image_size(name) == (48, 64), "kept in the index"
+
+
 @pytest.mark.parametrize(("gap", "bound", "overlap"), [(10, 0.009, 0.8), (30, 0.014, 0.55)])
 def test_real_frames_agree_with_each_other(seven_scenes_dir: Path, gap: int, bound: float, overlap: float):
     """Depth of one frame carried into another; the raw depth camera's figures are 6.1 mm and 9.3 mm."""

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from logvggt_jax.data.rooms import Rooms
-from logvggt_jax.data.transforms import ResizeTransform, fit, preprocess
+from logvggt_jax.data.transforms import ResizeTransform, fit, nearest_size, preprocess
 from logvggt_jax.geometry import project, unproject
 from logvggt_jax.types import Frames
 
@@ -167,3 +167,28 @@ def test_depth_returns_to_the_original_size():
     assert np.array_equal(transform.depth_to_original(depth), depth.repeat(2, 1).repeat(2, 2))
     with pytest.raises(ValueError, match="28, 42"):
         transform.depth_to_original(depth[:, :, :41])
+
+
+def test_fitting_resamples_as_preprocessing_does(golden_dir: Path):
+    source = np.load(golden_dir / "vggt_preprocess.npz", allow_pickle=False)["src"]
+    # With this principal point the crop is the whole picture.
+    matrix = np.array([[100, 0, 56.5 / 0.7 - 0.5], [0, 100, 42.5 / 0.7 - 0.5], [0, 0, 1]], np.float32)
+    depth, pose = np.ones((1, *source.shape[:2]), np.float32), np.eye(4, dtype=np.float32)[None]
+    frames = Frames(source[None], depth, matrix[None], pose, True)
+    fitted = fit(frames, (84, 112))
+    expected, _ = preprocess([source], longer_edge=112)
+    assert np.abs(fitted.images[0] / 255.0 - expected[0]).max() < 1.01 / 255
+
+
+@settings(deadline=None)
+@given(height=st.integers(20, 2000), width=st.integers(20, 2000))
+def test_the_nearest_size_has_the_nearest_aspect_ratio(height: int, width: int):
+    sizes = [(392, 518), (294, 518), (154, 518), (518, 392), (518, 266)]
+    chosen = nearest_size((height, width), sizes)
+    loss = [max(w / width / (h / height), h / height / (w / width)) for h, w in sizes]
+    assert sizes[int(np.argmin(loss))] == chosen
+    if width >= 1.2 * height:
+        assert chosen[1] > chosen[0], "landscape pictures stay landscape"
+    if height >= 1.2 * width:
+        assert chosen[0] > chosen[1]
+    assert nearest_size((width, height), [(w, h) for h, w in sizes]) == chosen[::-1]

@@ -221,3 +221,15 @@ def test_real_model_trains_and_leaves_a_model_folder(run_config: TrainConfig, tm
     losses = [entry["loss/total"] for entry in _numbers(tmp_path)]
     assert all(np.isfinite(losses))
     assert losses[-1] < losses[0]
+
+
+@pytest.mark.usefixtures("quick")
+def test_workers_may_change_when_a_run_goes_on(
+    run_config: TrainConfig, straight: tuple[TrainState, Path], finished: Path
+) -> None:
+    threads = dataclasses.replace(run_config, data=dataclasses.replace(run_config.data, num_threads=2, max_broken=0.1))
+    _same(train(threads, finished, mesh=data_mesh(2), resume_step=4), straight[0])
+    assert all(entry["broken_clips"] == 0 for entry in _numbers(finished))
+    backwards = dataclasses.replace(run_config, data=dataclasses.replace(run_config.data, reverse=1.0))
+    with pytest.raises(ValueError, match=r"was written with data\.reverse=0\.5, the configuration says 1\.0"):
+        train(backwards, finished, mesh=data_mesh(2))

@@ -7,6 +7,8 @@ from typing import Any
 
 import pytest
 
+from logvggt_jax.data.augmentation import ColourAugmentation
+from logvggt_jax.data.holdouts import HoldOut
 from logvggt_jax.training.config import TrainConfig
 
 
@@ -23,6 +25,20 @@ def test_mapping_gives_the_same_run(run_config: TrainConfig) -> None:
     assert hash(found) == hash(run_config)
 
 
+def test_every_data_setting_survives_the_mapping(run_config: TrainConfig) -> None:
+    options = dict.fromkeys(("shared", "jitter", "brightness", "contrast", "saturation", "hue", "grey", "blur"), 0.1)
+    data = dataclasses.replace(
+        run_config.data,
+        sources=(dataclasses.replace(run_config.data.sources[0], stride=[1, 4]),),
+        hold_out=(("co3dv2", HoldOut(split="test")), ("scannet", HoldOut(names=["scene07*"]))),
+        augmentation=ColourAugmentation(**options, blur_sigma=[0.1, 1.0]),
+        max_broken=0.01,
+    )
+    config = dataclasses.replace(run_config, data=data)
+    found = TrainConfig.from_dict(_mapping(config))
+    assert found == config and hash(found) == hash(config)
+
+
 def test_stages_run_in_the_order_of_their_names(run_config: TrainConfig) -> None:
     values = _mapping(run_config)
     values["stages"] = {"b": values["stages"]["first"], "a": values["stages"]["second"]}
@@ -36,11 +52,14 @@ def test_stages_run_in_the_order_of_their_names(run_config: TrainConfig) -> None
         (("optimizer", "lr"), "unknown field config.optimizer.lr; OptimizerConfig knows learning_rate"),
         (("stages", "first", "frames"), "unknown field config.stages.first.frames"),
         (("data", "sources", "rooms", "path"), "unknown field config.data.sources.rooms.path"),
+        (("data", "hold_out", "scannet", "name"), "unknown field config.data.hold_out.scannet.name"),
+        (("data", "augmentation", "noise"), "unknown field config.data.augmentation.noise; ColourAugmentation knows"),
         (("model", "widht"), "unknown field model.widht"),
     ],
 )
 def test_unknown_fields_are_named(run_config: TrainConfig, path: tuple[str, ...], message: str) -> None:
     values: Any = _mapping(run_config)
+    values["data"] |= {"hold_out": {"scannet": {"names": ["scene07*"]}}, "augmentation": {}}
     target = values
     for name in path[:-1]:
         target = target[name]
@@ -71,6 +90,13 @@ def test_values_out_of_range_are_refused(
 ) -> None:
     with pytest.raises(ValueError, match=message):
         dataclasses.replace(getattr(run_config, part), **{field: value})
+
+
+def test_data_settings_are_checked(run_config: TrainConfig) -> None:
+    with pytest.raises(ValueError, match=r"data set 'rooms': stride must be a pair 1 <= low <= high, got \(3, 2\)"):
+        dataclasses.replace(run_config.data.sources[0], stride=(3, 2))
+    with pytest.raises(ValueError, match=r"data\.max_broken must lie in \[0, 1\), got 1\.0"):
+        dataclasses.replace(run_config.data, max_broken=1.0)
 
 
 def test_stages_are_checked(run_config: TrainConfig) -> None:

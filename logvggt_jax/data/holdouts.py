@@ -1,0 +1,83 @@
+"""Sequences that evaluation uses and that training must therefore never see.
+
+ScanNet, Co3Dv2 and Virtual KITTI are trained on and evaluated on; they are divided by scene. The other evaluation
+sets are not trained on at all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+
+_SHOWN = 10
+
+
+@dataclass(frozen=True)
+class HoldOut:
+    """What of one data set is kept for evaluation; both rules apply where both are given.
+
+    Attributes:
+      names: patterns with the wildcards of `fnmatch`. A sequence is held out if one matches its name or one part
+        of the name between slashes: `Scene20` holds out `Scene20/clone/Camera_0`.
+      split: a split of the same data set, all of whose sequences are held out.
+    """
+
+    names: tuple[str, ...] = ()
+    split: str | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "names", tuple(self.names))
+        if not self.names and self.split is None:
+            raise ValueError("a hold-out needs names or a split; leave the data set out of hold_out otherwise")
+
+    def matches(self, sequence: str) -> bool:
+        """Whether `names` hold `sequence` out."""
+        parts = (sequence, *sequence.split("/"))
+        return any(fnmatchcase(part, pattern) for pattern in self.names for part in parts)
+
+
+# What published evaluations use: ScanNet's test list, the test sequences of Co3Dv2's fewview_dev lists (the reader's
+# split `test`), and the last scene of Virtual KITTI.
+PUBLISHED = {
+    "scannet": HoldOut(names=tuple(f"scene{number:04d}_00" for number in range(707, 807))),
+    "co3dv2": HoldOut(split="test"),
+    "virtual_kitti": HoldOut(names=("Scene20",)),
+}
+
+
+def check_held_out(
+    name: str, sequences: Sequence[str], rule: HoldOut, split_sequences: Callable[[str], Sequence[str]]
+) -> None:
+    """Raises ValueError naming the training `sequences` of data set `name` that `rule` holds out.
+
+    Args:
+      name: of the data set.
+      sequences: those to be trained on.
+      rule: what is held out.
+      split_sequences: the sequences of a split of the same data set.
+    """
+    of_split = set() if rule.split is None else set(split_sequences(rule.split))
+    shared = [sequence for sequence in sequences if sequence in of_split or rule.matches(sequence)]
+    if shared:
+        raise ValueError(
+            f"{name}: {len(shared)} of {len(sequences)} training sequences are held out for evaluation "
+            f"({shown(shared)}): train on another split, or change data.hold_out.{name}"
+        )
+
+
+def check_disjoint(name: str, sequences: Sequence[str], evaluated: Sequence[str]) -> None:
+    """Raises ValueError naming what training `sequences` of data set `name` share with the `evaluated` ones."""
+    kept = set(evaluated)
+    shared = [sequence for sequence in sequences if sequence in kept]
+    if shared:
+        raise ValueError(
+            f"{name}: {len(shared)} sequences are trained on and validated on ({shown(shared)}): "
+            "choose other splits for data.sources and validation.source"
+        )
+
+
+def shown(names: Sequence[str]) -> str:
+    """The first few of `names`, and how many more there are."""
+    rest = len(names) - _SHOWN
+    return ", ".join(names[:_SHOWN]) + (f" and {rest} more" if rest > 0 else "")

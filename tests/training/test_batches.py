@@ -1,0 +1,65 @@
+"""Opening a run's data: what must not be trained on, what may be absent."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+from absl import logging
+
+from logvggt_jax.data.holdouts import HoldOut
+from logvggt_jax.training.batches import open_sources, stage_batches
+from logvggt_jax.training.config import DataConfig, SourceConfig, TrainConfig
+
+OPTIONS = {"height": 28, "width": 42, "num_frames": 8, "num_rooms": 8}
+
+
+def rooms(split: str) -> SourceConfig:
+    return SourceConfig(name="rooms", root=None, split=split, options=tuple(OPTIONS.items()))
+
+
+def data(**changes: object) -> DataConfig:
+    fields = {"sources": (rooms("train"),), "reverse": 0.5, "worker_count": 0, "num_threads": 0, "cache_dir": None}
+    return DataConfig(**{**fields, **changes})
+
+
+def test_held_out_sequences_are_not_opened_for_training() -> None:
+    held_out = (("rooms", HoldOut(names=("room-00003", "room-9*"))),)
+    with pytest.raises(ValueError, match=r"rooms: 1 of 8 training sequences are held out .*\(room-00003\)"):
+        open_sources(data(hold_out=held_out))
+    assert "rooms" in open_sources(data(hold_out=(("rooms", HoldOut(names=("room-9*",), split="val")),)))
+    # Each number is in one split only; `all` contains them.
+    everything = dataclasses.replace(rooms("all"), options=(("height", 28), ("width", 42), ("num_frames", 4)))
+    with pytest.raises(ValueError, match=r"room-00008.* more\): train on another split"):
+        open_sources(data(sources=(everything,), hold_out=(("rooms", HoldOut(split="val")),)))
+
+
+def test_validation_sequences_are_not_trained_on() -> None:
+    open_sources(data(), rooms("val"))
+    with pytest.raises(ValueError, match="rooms: 8 sequences are trained on and validated on"):
+        open_sources(data(), rooms("train"))
+
+
+def test_missing_data_sets_are_an_error_unless_allowed(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, run_config: TrainConfig
+) -> None:
+    absent = SourceConfig(name="seven_scenes", root=str(tmp_path / "none"), split="train", weight=3.0)
+    sources = (rooms("train"), absent)
+    with pytest.raises(FileNotFoundError, match=r"seven_scenes \(.*none\); .*data\.allow_missing=True"):
+        open_sources(data(sources=sources))
+    config = data(sources=sources, allow_missing=True)
+    logging.use_python_logging(quiet=True)
+    datasets = open_sources(config)
+    assert list(datasets) == ["rooms"]
+    assert "seven_scenes" in caplog.text and "rooms 100.0%" in caplog.text
+    with stage_batches(datasets, config, run_config.stages[0], seed=0) as batches:
+        assert next(batches)["images"].shape == (2, 2, 28, 42, 3)
+    with pytest.raises(FileNotFoundError, match="none of the data sets"):
+        open_sources(data(sources=(absent,), allow_missing=True))
+
+
+def test_a_damaged_data_set_is_not_a_missing_one(tmp_path: Path) -> None:
+    present = SourceConfig(name="seven_scenes", root=str(tmp_path), split="all")
+    with pytest.raises(FileNotFoundError, match="no sequences of 7-Scenes"):
+        open_sources(data(sources=(rooms("train"), present), allow_missing=True))
