@@ -6,6 +6,8 @@ import abc
 import io
 import json
 import os
+import zipfile
+import zlib
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,6 +15,7 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
+from absl import logging
 
 from logvggt_jax.data.calibration import check_intrinsics
 from logvggt_jax.data.dataset import check_indices, check_sequence, check_split
@@ -23,7 +26,7 @@ from logvggt_jax.types import Frames
 NO_POSES = np.full((4, 4), np.nan)
 # Listings kept in memory; a set of twenty thousand sequences would fill it with all of them.
 _RECENT = 64
-_GAPS = (10, 5, 2, 1)
+_GAPS = (30, 10, 5, 2, 1)
 
 
 @dataclass(frozen=True)
@@ -122,7 +125,7 @@ class FolderDataset(abc.ABC):
     def neighbours(self, sequence: str, index: int) -> list[int]:
         """Frames that may see what frame `index` sees, those seen from farther away first.
 
-        Here those ten, five, two and one later in the video, or as much earlier at its end.
+        Here those 30, 10, 5, 2 and 1 later in the video, or as much earlier at its end.
         """
         count = self.num_frames(sequence)
         frames = [index + gap if index + gap < count else index - gap for gap in _GAPS]
@@ -198,9 +201,8 @@ class FolderDataset(abc.ABC):
             return self._recent[sequence]
         key = f"frames {sequence}"
         payload = self._index.get(key)
-        if payload is not None:
-            listing = _unpacked(payload, self.root)
-        else:
+        listing = None if payload is None else _unpacked(payload, self.root)
+        if listing is None:
             files = SourceFiles()
             listing = self._list_frames(sequence, self._places[sequence], files)
             if not listing.frames:
@@ -239,10 +241,15 @@ def _packed(listing: Listing, root: Path) -> bytes:
     return buffer.getvalue()
 
 
-def _unpacked(payload: bytes, root: Path) -> Listing:
-    with np.load(io.BytesIO(payload), allow_pickle=False) as packed:
-        columns = {name: packed[name] for name in packed.files}
-    dropped = json.loads(str(columns.pop("dropped")))
+def _unpacked(payload: bytes, root: Path) -> Listing | None:
+    """The listing that `_packed` stored; None where its bytes are damaged, which SQLite does not notice."""
+    try:
+        with np.load(io.BytesIO(payload), allow_pickle=False) as packed:
+            columns = {name: packed[name] for name in packed.files}
+        dropped = json.loads(str(columns.pop("dropped")))
+    except (ValueError, KeyError, EOFError, OSError, zipfile.BadZipFile, zlib.error) as error:
+        logging.warning("a damaged listing of %s is made anew (%r)", root, error)
+        return None
     frames = [
         FrameRecord(
             name=str(name),
