@@ -123,8 +123,6 @@ def _info(options: argparse.Namespace) -> None:
 
 
 def _check_data(options: argparse.Namespace) -> int:
-    from rich.console import Console
-
     from logvggt_jax.data.checks import check_copy
 
     report = check_copy(
@@ -136,10 +134,7 @@ def _check_data(options: argparse.Namespace) -> int:
         picture=options.output,
         progress=True,
     )
-    if options.json:
-        print(json.dumps(report.as_json(), indent=1))
-    else:
-        report.print(Console())
+    print(json.dumps(report.as_json(), indent=1) if options.json else report.text())
     return PROBLEMS_FOUND if report.problems else 0
 
 

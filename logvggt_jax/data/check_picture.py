@@ -49,7 +49,9 @@ def write_check_picture(path: Path, dataset: FolderDataset, sequences: Sequence[
             axis.set_axis_off()
         for place, (frames, index) in enumerate(zip(views, sequence.examples, strict=True)):
             _draw_frame(figure, row[2 * place : 2 * place + 2], frames, names[index])
-        row[0].text(-0.04, 0.5, sequence.name, rotation=90, va="center", ha="right", transform=row[0].transAxes)
+        row[0].text(
+            -0.04, 0.5, sequence.name, rotation=90, va="center", ha="right", transform=row[0].transAxes, fontsize=8
+        )
         _draw_from_above(row[4], dataset.extrinsics(sequence.name), views)
     figure.suptitle(dataset.title, fontsize=10)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.png")

@@ -8,11 +8,9 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 # What a terminal shows; JSON has everything.
-_ROWS, _EXAMPLES = 40, 3
+_LINES, _EXAMPLES = 40, 3
 
 
 @dataclass(frozen=True)
@@ -119,19 +117,17 @@ class CheckReport:
             "sequences": [asdict(sequence) for sequence in self.sequences],
         }
 
-    def print(self, console: Console) -> None:
-        """Totals, a table of the sequences and the problems; long lists are cut, and say so."""
-        for line in self._totals():
-            console.print(line, markup=False, highlight=False, soft_wrap=True)
+    def text(self) -> str:
+        """Totals, a line for each sequence, and the problems; long lists are cut, and say so."""
+        lines = list(self._totals())
         faulty = [sequence for sequence in self.sequences if sequence.problems]
-        shown = self.sequences if len(self.sequences) <= _ROWS else faulty[:_ROWS]
-        if shown:
-            console.print(self._table(shown))
+        shown = self.sequences if len(self.sequences) <= _LINES else faulty[:_LINES]
+        lines += (self._line(sequence) for sequence in shown)
         if len(shown) < len(self.sequences):
-            console.print(f"{len(shown)} of {len(self.sequences)} sequences shown; --json prints all", highlight=False)
+            lines.append(f"({len(shown):,} of {len(self.sequences):,} sequences shown; --json prints all)")
         for sequence in faulty:
-            for line in _problem_lines(sequence):
-                console.print(line, markup=False, highlight=False, soft_wrap=True)
+            lines += _problem_lines(sequence)
+        return "\n".join(lines)
 
     def _totals(self) -> Iterator[str]:
         frames = sum(sequence.num_frames for sequence in self.sequences)
@@ -139,7 +135,7 @@ class CheckReport:
         looked_at = len(self.sequences)
         part = f"{looked_at:,}" + (f" of {self.sequences_in_split:,}" if looked_at < self.sequences_in_split else "")
         yield f"{self.title} in {self.root}, split {self.split}"
-        yield f"{part} sequences, {frames:,} frames; {decoded:,} of them decoded"
+        yield f"{part} sequences, {frames:,} frames, {decoded:,} of them decoded; depth is minimum / median / maximum"
         for reason, count in self.dropped_counts().items():
             yield f"{count:,} frames do not count: {reason}"
         figure = self.consistency()
@@ -150,26 +146,22 @@ class CheckReport:
         counts = self.problem_counts()
         yield "problems: " + (", ".join(f"{count:,} {kind}" for kind, count in counts.items()) or "none")
 
-    def _table(self, sequences: Sequence[SequenceReport]) -> Table:
-        table = Table(box=None, pad_edge=False)
-        unit = "m" if self.metric else "units of the set"
-        table.add_column("sequence", overflow="fold")
-        for title in ("frames", "dropped", "decoded", "H x W", f"depth ({unit})", "valid", "consistency", "problems"):
-            table.add_column(title, justify="right")
-        for sequence in sequences:
-            depth = sequence.depth
-            table.add_row(
-                sequence.name,
-                f"{sequence.num_frames:,}",
-                f"{sum((sequence.dropped or {}).values()):,}",
-                f"{sequence.decoded:,}",
-                "-" if sequence.image_size is None else "{} x {}".format(*sequence.image_size),
-                "-" if depth is None else f"{depth.minimum:.3g} / {depth.median:.3g} / {depth.maximum:.3g}",
-                "-" if depth is None else f"{depth.valid_share:.0%}",
-                "-" if sequence.consistency is None else f"{sequence.consistency:.2%}",
-                f"{len(sequence.problems):,}" if sequence.problems else "",
-            )
-        return table
+    def _line(self, sequence: SequenceReport) -> str:
+        parts = [f"{sequence.num_frames:,} frames"]
+        parts += [f"{count:,} dropped ({reason})" for reason, count in (sequence.dropped or {}).items()]
+        if sequence.image_size is not None:
+            parts.append("{} x {} pixels (H x W)".format(*sequence.image_size))
+        if sequence.depth is not None:
+            depth, unit = sequence.depth, " m" if self.metric else ""
+            parts.append(f"depth {depth.minimum:.3g} / {depth.median:.3g} / {depth.maximum:.3g}{unit}")
+            parts.append(f"{depth.valid_share:.0%} valid")
+        if sequence.without_depth:
+            parts.append(f"{sequence.without_depth:,} without depth")
+        if sequence.consistency is not None:
+            parts.append(f"consistency {sequence.consistency:.2%}")
+        if sequence.problems:
+            parts.append(f"{len(sequence.problems):,} problems")
+        return f"  {sequence.name}: {', '.join(parts)}"
 
 
 def _problem_lines(sequence: SequenceReport) -> Iterator[str]:
