@@ -55,7 +55,7 @@ def test_help_names_every_command_and_each_shows_an_example(capsys: pytest.Captu
         with pytest.raises(SystemExit) as exit_:
             main([*command.split(), "--help"])
         assert exit_.value.code == 0
-        assert f"logvggt {command} " in capsys.readouterr().out.split("example:")[1]
+        assert f"logvggt {command}" in capsys.readouterr().out.split("example:")[1]
 
 
 def test_help_does_not_wait_for_jax() -> None:
@@ -182,12 +182,12 @@ def test_data_check_tells_clean_from_damaged_copies(
     assert main([*command, "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["frames"] == report["decoded"] == 5 and report["problem_counts"] == {}
-    (root / "den" / "seq-01" / "frame-000002.depth.png").unlink()
+    (root / "den" / "seq-01" / "frame-000002.depth.proj.png").unlink()
     (root / "den" / "seq-01" / "frame-000003.color.png").unlink()
     assert main(command) == 1
     printed = capsys.readouterr().out
     assert "problems: 2 missing file" in printed
-    assert "frame-000002.depth.png: no such file" in printed and "frame-000003.color.jpg: no such file" in printed
+    assert "frame-000002.depth.png: no such file" in printed and "frame-000003.color.png: no such file" in printed
     assert main([*command, "--json"]) == 1
     report = json.loads(capsys.readouterr().out)
     assert report["problem_counts"] == {"missing file": 2}

@@ -155,7 +155,9 @@ def _check_sequence(
     has_poses = bool(np.isfinite(extrinsics).all())
     wanted = range(count) if all_images else _spread(count, _SAMPLE)
     frames = _decode(dataset, sequence, wanted, pool, problems)
-    figure, compared = _consistency(dataset, sequence, extrinsics, problems) if has_poses else (None, None)
+    figure, compared = None, None
+    if has_poses:
+        figure, compared = _consistency(dataset, sequence, extrinsics, set(wanted) - set(frames), problems)
     if figure is not None and figure > INCONSISTENT:
         problems.add(
             "inconsistent depth and poses",
@@ -235,15 +237,16 @@ def _depth_range(frames: Iterable[_Frame]) -> DepthRange | None:
 
 
 def _consistency(
-    dataset: FolderDataset, sequence: str, extrinsics: np.ndarray, problems: _Problems
+    dataset: FolderDataset, sequence: str, extrinsics: np.ndarray, broken: set[int], problems: _Problems
 ) -> tuple[float | None, float | None]:
-    """Medians of difference and share over a few pairs of frames; None where no two see the same."""
+    """Medians of difference and share over a few pairs of frames that are not known to be broken; None where no two
+    see the same."""
     compared = []
     # Neither the first nor the last frame: those have neighbours on one side only.
     for index in sorted(set(_spread(len(extrinsics), _PAIRS + 2)[1:-1] or [0])):
         try:
-            candidates = dataset.neighbours(sequence, index)
-            if not candidates:
+            candidates = [frame for frame in dataset.neighbours(sequence, index) if frame not in broken]
+            if index in broken or not candidates:
                 continue
             seen = visible_shares(dataset.read(sequence, [index]), 0, extrinsics[candidates])
             # The first that sees enough; failing that, the one that sees most.

@@ -20,7 +20,7 @@ class MissingFiles(FileNotFoundError):
 def missing_files(reasons: Mapping[Path, str]) -> MissingFiles:
     """The error for these files, at least one, each with why it is needed and the mend: names the first of them."""
     path, reason = next(iter(reasons.items()))
-    others = f" (nor {len(reasons) - 1} others)" if len(reasons) > 1 else ""
+    others = f" (nor {len(reasons) - 1} more)" if len(reasons) > 1 else ""
     # An attribute, since OSError gives a second argument a meaning of its own.
     error = MissingFiles(f"{path}: no such file{others}, {reason}")
     error.reasons = dict(reasons)

@@ -154,7 +154,7 @@ class FolderDataset(abc.ABC):
             if images and image.shape != images[0].shape:
                 raise UnequalSizes(
                     f"{record.image}: size {image.shape[:2]} differs from {images[0].shape[:2]} of "
-                    f"{chosen[0].image.name}: frames of one sequence must have one size"
+                    f"{chosen[0].image.name}: frames of one sequence must have one size; fetch both again"
                 )
             check_intrinsics(matrix, image.shape[:2], record.image)
             images.append(image)

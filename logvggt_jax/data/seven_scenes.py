@@ -69,7 +69,7 @@ class SevenScenes(FolderDataset):
             folder / f"{name}.{choices[-1]}": f"but frame {name} has {', '.join(sorted(present))}; fetch it or remove "
             "the frame"
             for name, present in sorted(kinds.items())
-            for choices in (("color.png", "color.jpg"), ("depth.proj.png", "depth.png"), ("pose.txt",))
+            for choices in (("color.jpg", "color.png"), ("depth.proj.png", "depth.png"), ("pose.txt",))
             if not present & set(choices)
         }
         if absent:
