@@ -147,7 +147,7 @@ class CheckReport:
         yield "problems: " + (", ".join(f"{count:,} {kind}" for kind, count in counts.items()) or "none")
 
     def _line(self, sequence: SequenceReport) -> str:
-        parts = [f"{sequence.num_frames:,} frames"]
+        parts = [f"{sequence.num_frames:,} frames" if sequence.num_frames else "frames could not be listed"]
         parts += [f"{count:,} dropped ({reason})" for reason, count in (sequence.dropped or {}).items()]
         if sequence.image_size is not None:
             parts.append("{} x {} pixels (H x W)".format(*sequence.image_size))
@@ -160,7 +160,7 @@ class CheckReport:
         if sequence.consistency is not None:
             parts.append(f"consistency {sequence.consistency:.2%}")
         if sequence.problems:
-            parts.append(f"{len(sequence.problems):,} problems")
+            parts.append(f"problems: {len(sequence.problems):,}")
         return f"  {sequence.name}: {', '.join(parts)}"
 
 
