@@ -1,21 +1,28 @@
-"""The `logvggt` command: convert weights, reconstruct sequences, render a room, look at results."""
+"""The `logvggt` command: convert weights, reconstruct sequences, render a room, check data, look at results."""
 
 # Commands import what they need when they run: JAX takes seconds to load, `--help` should not.
 
 from __future__ import annotations
 
 import argparse
+import json
+import shutil
 import sys
+import textwrap
 import traceback
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 BAD_INPUT, FAILURE, INTERRUPTED = 2, 1, 130
+PROBLEMS_FOUND = 1
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command line and returns the exit code: 0, 2 for bad input, 1 for any other failure.
+
+    `data check` also returns 1 where it found problems.
 
     Args:
       arguments: without the program's name; default `sys.argv[1:]`.
@@ -25,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
-            options.run(options)
+            return options.run(options) or 0
     except KeyboardInterrupt:
         print("logvggt: interrupted; nothing half-written is left", file=sys.stderr)
         return INTERRUPTED
@@ -35,7 +42,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         bad_input = isinstance(error, ValueError | OSError | ImportError)
         print(f"logvggt: error: {_one_line(error, named=not bad_input)}", file=sys.stderr)
         return BAD_INPUT if bad_input else FAILURE
-    return 0
 
 
 def _convert(options: argparse.Namespace) -> None:
@@ -116,6 +122,30 @@ def _info(options: argparse.Namespace) -> None:
     console.print("every parameter equals the digest stored with it")
 
 
+def _check_data(options: argparse.Namespace) -> int:
+    from logvggt_jax.data.checks import check_copy
+
+    report = check_copy(
+        options.name,
+        options.root,
+        split=options.split,
+        max_sequences=options.max_sequences,
+        all_images=options.all_images,
+        picture=options.output,
+        progress=True,
+    )
+    print(json.dumps(report.as_json(), indent=1) if options.json else report.text())
+    return PROBLEMS_FOUND if report.problems else 0
+
+
+def _list_data(_: argparse.Namespace) -> None:
+    from logvggt_jax.data.catalogue import UNPACKING, catalogue
+
+    width = min(shutil.get_terminal_size().columns, 120)
+    print("\n\n".join(entry.text(width) for entry in catalogue()))
+    print("\n" + "\n".join(textwrap.wrap(UNPACKING, width)))
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="logvggt",
@@ -126,11 +156,13 @@ def _parser() -> argparse.ArgumentParser:
     parser.set_defaults(traceback=False)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
 
-    def command(name: str, run: Callable, summary: str, example: str) -> argparse.ArgumentParser:
-        added = commands.add_parser(
+    def command(
+        name: str, run: Callable, summary: str, example: str, *, group: Any = commands, details: str = ""
+    ) -> argparse.ArgumentParser:
+        added = group.add_parser(
             name,
             help=summary,
-            description=summary[0].upper() + summary[1:] + ".",
+            description=f"{summary[0].upper()}{summary[1:]}.{details}",
             epilog=f"example:\n  {example}",
             formatter_class=_Formatter,
         )
@@ -232,6 +264,47 @@ def _parser() -> argparse.ArgumentParser:
         "logvggt info models/vggt-1b",
     )
     sub.add_argument("checkpoint", type=Path, help="model folder made by `logvggt convert` or by training")
+
+    data = commands.add_parser("data", help="data sets: what there is, and whether a copy on disk is sound")
+    data_commands = data.add_subparsers(title="commands", metavar="COMMAND", required=True)
+
+    sub = command(
+        "check",
+        _check_data,
+        "walk a copy of a data set and report what it holds and what is missing or broken",
+        "logvggt data check replica /data/replica --output replica.png",
+        group=data_commands,
+        details=" Prints sequences, frames, frames without pose, depth ranges, how well depth and poses of different "
+        "frames agree, and every problem with its file and mend. Exit code 0: clean, 1: problems found, 2: bad input.",
+    )
+    sub.add_argument("name", help="data set, as `logvggt data list` names it")
+    sub.add_argument("root", type=Path, help="folder of the copy")
+    sub.add_argument(
+        "--split", choices=("train", "val", "test", "all"), default="all", help="only this split's sequences"
+    )
+    sub.add_argument(
+        "--max-sequences", type=int, default=None, metavar="N", help="look at N sequences, evenly spread over the set"
+    )
+    sub.add_argument(
+        "--all-images", action="store_true", help="open every picture instead of a few of each sequence; takes long"
+    )
+    sub.add_argument(
+        "--output",
+        type=Path,
+        default=None,
+        metavar="PICTURE",
+        help="PNG file to write: frames, their depth, and the cameras from above",
+    )
+    sub.add_argument("--json", action="store_true", help="print the whole report as JSON")
+
+    command(
+        "list",
+        _list_data,
+        "every data set: what its folder must hold, how to obtain it, its licence and size",
+        "logvggt data list",
+        group=data_commands,
+        details=" Archives are never unpacked by this package: unpack them with your own tools.",
+    )
     return parser
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -12,10 +14,11 @@ import pytest
 
 from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.cli import main
+from logvggt_jax.data import DATASETS
 from logvggt_jax.inference.compilation_cache import default_cache_folder, enable_compilation_cache
 from logvggt_jax.weights.checkpoints import save_model
 
-COMMANDS = ("convert", "reconstruct", "render-room", "view", "info")
+COMMANDS = ("convert", "reconstruct", "render-room", "view", "info", "data check", "data list")
 
 
 @pytest.fixture(scope="module")
@@ -47,12 +50,12 @@ def test_help_names_every_command_and_each_shows_an_example(capsys: pytest.Captu
         main(["--help"])
     assert exit_.value.code == 0
     text = capsys.readouterr().out
-    assert all(command in text for command in COMMANDS)
+    assert all(command.split()[0] in text for command in COMMANDS)
     for command in COMMANDS:
         with pytest.raises(SystemExit) as exit_:
-            main([command, "--help"])
+            main([*command.split(), "--help"])
         assert exit_.value.code == 0
-        assert f"logvggt {command} " in capsys.readouterr().out.split("example:")[1]
+        assert f"logvggt {command}" in capsys.readouterr().out.split("example:")[1]
 
 
 def test_help_does_not_wait_for_jax() -> None:
@@ -62,6 +65,8 @@ import contextlib, sys
 from logvggt_jax.cli import main
 with contextlib.suppress(SystemExit):
     main(["reconstruct", "--help"])
+with contextlib.suppress(SystemExit):
+    main(["data", "check", "--help"])
 assert "jax" not in sys.modules
 import logvggt_jax
 assert all(getattr(logvggt_jax, name) is not None for name in logvggt_jax.__all__)
@@ -73,7 +78,19 @@ assert not hasattr(logvggt_jax, "LogVGTT")
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize("arguments", [[], ["fly"], ["info"], ["info", "x", "--fast"], ["view", "x", "--port", "y"]])
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["fly"],
+        ["info"],
+        ["info", "x", "--fast"],
+        ["view", "x", "--port", "y"],
+        ["data"],
+        ["data", "check", "replica"],
+        ["data", "check", "replica", "x", "--split", "y"],
+    ],
+)
 def test_wrong_usage_exits_with_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as exit_:
         main(arguments)
@@ -148,6 +165,44 @@ def test_bad_input_is_one_line_and_exit_code_2(
     assert_fails(capsys, ["render-room", "--output", str(room)], str(room), "--overwrite")
     assert_fails(capsys, ["render-room", "--output", str(output), "--frames", "0"], "num_frames")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["empty", "truncated"]
+
+
+def test_data_check_tells_clean_from_damaged_copies(
+    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # A rendered room has the names of 7-Scenes; its depth and colour camera are one, so only files are judged here.
+    root = tmp_path / "7scenes"
+    shutil.copytree(room, root / "den" / "seq-01")
+    picture = tmp_path / "check.png"
+    command = ["data", "check", "seven_scenes", str(root)]
+    assert main([*command, "--all-images", "--output", str(picture)]) == 0
+    printed = capsys.readouterr().out
+    assert "den/seq-01: 5 frames" in printed and "problems: none" in printed
+    assert picture.stat().st_size > 0
+    assert main([*command, "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["frames"] == report["decoded"] == 5 and report["problem_counts"] == {}
+    (root / "den" / "seq-01" / "frame-000002.depth.proj.png").unlink()
+    (root / "den" / "seq-01" / "frame-000003.color.png").unlink()
+    assert main(command) == 1
+    printed = capsys.readouterr().out
+    assert "problems: 2 missing file" in printed
+    assert "frame-000002.depth.png: no such file" in printed and "frame-000003.color.png: no such file" in printed
+    assert main([*command, "--json"]) == 1
+    report = json.loads(capsys.readouterr().out)
+    assert report["problem_counts"] == {"missing file": 2}
+    assert_fails(capsys, ["data", "check", "seven", str(root)], "'seven'", "seven_scenes")
+    assert_fails(capsys, ["data", "check", "rooms", str(root)], "rooms")
+    assert_fails(capsys, ["data", "check", "seven_scenes", str(tmp_path / "x")], str(tmp_path / "x"))
+    assert_fails(capsys, [*command, "--max-sequences", "0"], "max_sequences", "0")
+
+
+def test_data_list_names_every_set(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["data", "list"]) == 0
+    printed = capsys.readouterr().out
+    for name in DATASETS:
+        assert f"\n{name}: " in f"\n{printed}"
+    assert "never unpacked" in " ".join(printed.split())
 
 
 def test_traceback_only_when_asked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -23,6 +23,7 @@ import cv2
 import numpy as np
 
 from logvggt_jax.data.calibration import numbers, pinhole
+from logvggt_jax.data.errors import UnequalSizes
 from logvggt_jax.data.folder_dataset import NO_POSES, FolderDataset, FrameRecord, Listing
 from logvggt_jax.data.image_files import read_depth, read_rgb
 from logvggt_jax.data.listing_index import SourceFiles
@@ -165,7 +166,7 @@ def _at_size(depth: np.ndarray, size: tuple[int, int], path: Path) -> np.ndarray
     """Millimetres uint16 [h, w] as float32 metres in a picture of `size`, by the nearest neighbour."""
     factors = size[0] / depth.shape[0], size[1] / depth.shape[1]
     if abs(factors[0] / factors[1] - 1) > _SHAPE_TOLERANCE:
-        raise ValueError(
+        raise UnequalSizes(
             f"{path}: depth of {depth.shape[1]} x {depth.shape[0]} does not have the shape of its picture of "
             f"{size[1]} x {size[0]}: download both again"
         )

@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from logvggt_jax.data.calibration import numbers, world_to_camera
+from logvggt_jax.data.errors import missing_files
 from logvggt_jax.data.folder_dataset import FolderDataset, FrameRecord, Listing
 from logvggt_jax.data.image_files import read_rgb
 from logvggt_jax.data.listing_index import SourceFiles
@@ -69,6 +70,10 @@ class BlendedMVS(FolderDataset):
                 neighbours[index[image]] = sorted(known, key=lambda pair: -pair[1])
         return neighbours
 
+    def neighbours(self, sequence: str, index: int) -> list[int]:
+        """The neighbours of `covisibility`, the best first: numbers next to each other need not see the same."""
+        return [other for other, _ in self.covisibility(sequence).get(index, [])]
+
     def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
         names = files.names(self.root, self.expects)
         scenes = [name for name in names if _SCENE.fullmatch(name) and (self.root / name).is_dir()]
@@ -93,15 +98,18 @@ class BlendedMVS(FolderDataset):
             names = files.names(folder / place, f"the scene's {place}; unpack its zip file again")
             for match in filter(None, map(pattern.fullmatch, names)):
                 found.setdefault(match[1], set()).add(kind)
+        absent = {
+            folder / place / form.format(name): f"but frame {name} has {', '.join(sorted(kinds))}; fetch it or remove "
+            "the frame"
+            for name, kinds in sorted(found.items())
+            for kind, (place, _, form) in _FILES.items()
+            if kind not in kinds
+        }
+        if absent:
+            raise missing_files(absent)
         frames, lost = [], 0
-        for name, kinds in sorted(found.items()):
+        for name in sorted(found):
             paths = {kind: folder / place / form.format(name) for kind, (place, _, form) in _FILES.items()}
-            for kind, path in paths.items():
-                if kind not in kinds:
-                    raise FileNotFoundError(
-                        f"{path}: no such file, but frame {name} has {', '.join(sorted(kinds))}; "
-                        "fetch it or remove the frame"
-                    )
             intrinsics, stored = _camera(files.text(paths["camera"], "the frame's camera"), paths["camera"])
             extrinsics = world_to_camera(stored, paths["camera"], stored="world_to_camera")
             if extrinsics is None:

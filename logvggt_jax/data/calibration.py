@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from logvggt_jax.data.errors import AbsurdIntrinsics, BadPose
 from logvggt_jax.geometry import invert, nearest_rotation
 
 # Camera axes x right, y up, z back to x right, y down, z forward, and the reverse; multiplied from the right onto
@@ -60,7 +61,7 @@ def world_to_camera(pose: np.ndarray, where: str | Path, *, stored: str) -> np.n
     rotation = nearest_rotation(np.asarray(pose[:3, :3], np.float64))
     last_row_fits = len(pose) == 3 or np.abs(pose[3] - [0, 0, 0, 1]).max() < 1e-3
     if not last_row_fits or np.abs(pose[:3, :3] - rotation).max() > _ROTATION_TOLERANCE:
-        raise ValueError(
+        raise BadPose(
             f"{where}: not a rigid transform (a rotation to {_ROTATION_TOLERANCE} and the last row 0 0 0 1 are "
             "expected): fetch the file again"
         )
@@ -94,7 +95,7 @@ def check_intrinsics(intrinsics: np.ndarray, size: tuple[int, int], where: str |
         and np.abs(intrinsics[2] - [0, 0, 1]).max() < 1e-6
     )
     if not plausible:
-        raise ValueError(
+        raise AbsurdIntrinsics(
             f"{where}: intrinsics fx={fx:g} fy={fy:g} cx={cx:g} cy={cy:g} cannot belong to a picture of "
             f"{width} x {height}: fetch the calibration again"
         )

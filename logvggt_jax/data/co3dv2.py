@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from logvggt_jax.data.co3d_annotations import FrameAnnotation, frame_annotations, quality_scores
+from logvggt_jax.data.errors import UnequalSizes, missing_files
 from logvggt_jax.data.folder_dataset import FolderDataset, FrameRecord, Listing
 from logvggt_jax.data.image_files import read_depth, read_rgb
 from logvggt_jax.data.listing_index import SourceFiles
@@ -128,6 +129,7 @@ class Co3Dv2(FolderDataset):
         frames = []
         dropped = {"no pose": 0, "no depth": 0}
         present: dict[Path, set[str]] = {}
+        absent: list[Path] = []
         for annotation in self._annotations(folder.parent, files).get(folder.name, []):
             extrinsics = annotation.extrinsics(f"{source}, {annotation.image}")
             if extrinsics is None or annotation.depth is None:
@@ -139,7 +141,7 @@ class Co3Dv2(FolderDataset):
                 if path.parent not in present:
                     present[path.parent] = set(files.names(path.parent, f"{path.name}, which {_FRAMES} names"))
                 if path.name not in present[path.parent]:
-                    raise FileNotFoundError(f"{path}: no such file, but {source} names it; unpack the sequence again")
+                    absent.append(path)
             frames.append(
                 FrameRecord(
                     name=image.stem,
@@ -151,6 +153,8 @@ class Co3Dv2(FolderDataset):
                     depth_scale=annotation.depth_scale,
                 )
             )
+        if absent:
+            raise missing_files(dict.fromkeys(absent, f"but {source} names it; unpack the sequence again"))
         return Listing(frames, {reason: count for reason, count in dropped.items() if count})
 
     def _annotations(self, category: Path, files: SourceFiles) -> Mapping[str, list[FrameAnnotation]]:
@@ -169,7 +173,7 @@ class Co3Dv2(FolderDataset):
         if record.companion is not None:
             mask = read_rgb(record.companion)[..., 0]
             if mask.shape != depth.shape:
-                raise ValueError(
+                raise UnequalSizes(
                     f"{record.companion}: size {mask.shape} differs from {depth.shape} of {record.depth.name}: "
                     "fetch both again"
                 )

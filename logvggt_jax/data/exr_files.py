@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from logvggt_jax.data.errors import BrokenPicture
+
 
 def read_exr(path: str | Path) -> np.ndarray:
     """The only channel of an OpenEXR file, [H, W] float32, in the file's own unit; half floats are widened.
@@ -27,15 +29,15 @@ def read_exr(path: str | Path) -> np.ndarray:
             channels = {name: channel.pixels for name, channel in file.channels().items()}
     except (RuntimeError, ValueError) as error:
         # A part whose pixels cannot be decoded is left out, so that asking for it fails.
-        raise ValueError(f"{path}: truncated or damaged EXR file ({error}): fetch it again") from error
+        raise BrokenPicture(f"{path}: truncated or damaged EXR file ({error}): fetch it again") from error
     if count != 1 or len(channels) != 1:
-        raise ValueError(
+        raise BrokenPicture(
             f"{path}: expected one part with one channel, got {count} with {', '.join(channels)}: "
             "replace it with the data set's original file"
         )
     (pixels,) = channels.values()
     if not np.issubdtype(pixels.dtype, np.floating):
-        raise ValueError(
+        raise BrokenPicture(
             f"{path}: expected half or float pixels, got {pixels.dtype}: replace it with the data set's original file"
         )
     return pixels.astype(np.float32)

@@ -6,6 +6,8 @@ import abc
 import io
 import json
 import os
+import zipfile
+import zlib
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,15 +15,18 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
+from absl import logging
 
 from logvggt_jax.data.calibration import check_intrinsics
 from logvggt_jax.data.dataset import check_indices, check_sequence, check_split
+from logvggt_jax.data.errors import EmptySequence, UnequalSizes
 from logvggt_jax.data.listing_index import ListingIndex, SourceFiles
 from logvggt_jax.types import Frames
 
 NO_POSES = np.full((4, 4), np.nan)
 # Listings kept in memory; a set of twenty thousand sequences would fill it with all of them.
 _RECENT = 64
+_GAPS = (30, 10, 5, 2, 1)
 
 
 @dataclass(frozen=True)
@@ -138,6 +143,19 @@ class FolderDataset(abc.ABC):
         """Frames of the folder that do not count, by reason."""
         return dict(self._listing(sequence).dropped)
 
+    def extrinsics(self, sequence: str) -> np.ndarray:
+        """World-to-camera [T, 4, 4] float32 of these frames, as `read` gives them; no picture is opened."""
+        return np.stack([record.extrinsics for record in self._listing(sequence).frames]).astype(np.float32)
+
+    def neighbours(self, sequence: str, index: int) -> list[int]:
+        """Frames that may see what frame `index` sees, those seen from farther away first.
+
+        Here those 30, 10, 5, 2 and 1 later in the video, or as much earlier at its end.
+        """
+        count = self.num_frames(sequence)
+        frames = [index + gap if index + gap < count else index - gap for gap in _GAPS]
+        return [frame for frame in frames if frame >= 0]
+
     def read(self, sequence: str, indices: Sequence[int]) -> Frames:
         """Frames `indices`, in the order asked for.
 
@@ -154,14 +172,14 @@ class FolderDataset(abc.ABC):
             if record.quarter_turns:
                 image, depth = np.rot90(image, record.quarter_turns), np.rot90(depth, record.quarter_turns)
             if depth.shape != image.shape[:2]:
-                raise ValueError(
+                raise UnequalSizes(
                     f"{record.depth}: size {depth.shape} differs from {image.shape[:2]} of {record.image.name}: "
                     "depth must have the picture's size; fetch both again"
                 )
             if images and image.shape != images[0].shape:
-                raise ValueError(
+                raise UnequalSizes(
                     f"{record.image}: size {image.shape[:2]} differs from {images[0].shape[:2]} of "
-                    f"{chosen[0].image.name}: frames of one sequence must have one size"
+                    f"{chosen[0].image.name}: frames of one sequence must have one size; fetch both again"
                 )
             check_intrinsics(matrix, image.shape[:2], record.image)
             images.append(image)
@@ -208,13 +226,12 @@ class FolderDataset(abc.ABC):
             return self._recent[sequence]
         key = f"frames {sequence}"
         payload = self._index.get(key)
-        if payload is not None:
-            listing = _unpacked(payload, self.root)
-        else:
+        listing = None if payload is None else _unpacked(payload, self.root)
+        if listing is None:
             files = SourceFiles()
             listing = self._list_frames(sequence, self._places[sequence], files)
             if not listing.frames:
-                raise ValueError(
+                raise EmptySequence(
                     f"{self._places[sequence]}: no frame of {self.title} counts here "
                     f"(dropped: {dict(listing.dropped) or 'none'}): fetch the sequence again or remove its folder"
                 )
@@ -249,10 +266,15 @@ def _packed(listing: Listing, root: Path) -> bytes:
     return buffer.getvalue()
 
 
-def _unpacked(payload: bytes, root: Path) -> Listing:
-    with np.load(io.BytesIO(payload), allow_pickle=False) as packed:
-        columns = {name: packed[name] for name in packed.files}
-    dropped = json.loads(str(columns.pop("dropped")))
+def _unpacked(payload: bytes, root: Path) -> Listing | None:
+    """The listing that `_packed` stored; None where its bytes are damaged, which SQLite does not notice."""
+    try:
+        with np.load(io.BytesIO(payload), allow_pickle=False) as packed:
+            columns = {name: packed[name] for name in packed.files}
+        dropped = json.loads(str(columns.pop("dropped")))
+    except (ValueError, KeyError, EOFError, OSError, zipfile.BadZipFile, zlib.error) as error:
+        logging.warning("a damaged listing of %s is made anew (%r)", root, error)
+        return None
     frames = [
         FrameRecord(
             name=str(name),

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from logvggt_jax.data.errors import BrokenPicture
+
 
 def read_hdf5(
     path: str | Path, dataset: str, *, shape: tuple[int | None, ...], content: bytes | None = None
@@ -36,9 +38,9 @@ def read_hdf5(
             array = file[dataset][()] if isinstance(file.get(dataset), h5py.Dataset) else None
     except (OSError, RuntimeError) as error:
         reason = str(error).partition("\n")[0]
-        raise ValueError(f"{path}: truncated or damaged HDF5 file ({reason}): fetch it again") from error
+        raise BrokenPicture(f"{path}: truncated or damaged HDF5 file ({reason}): fetch it again") from error
     if array is None:
-        raise ValueError(
+        raise BrokenPicture(
             f"{path}: no array {dataset!r}, only {', '.join(names) or 'nothing'}: "
             "replace it with the data set's original file"
         )
@@ -48,7 +50,7 @@ def read_hdf5(
     )
     if not fits or array.dtype.kind not in "iuf":
         expected = " x ".join("any" if length is None else str(length) for length in shape)
-        raise ValueError(
+        raise BrokenPicture(
             f"{path}: expected numbers of shape {expected} in {dataset!r}, got {array.dtype} {array.shape}: "
             "replace it with the data set's original file"
         )

@@ -29,6 +29,7 @@ import numpy as np
 from absl import logging
 
 from logvggt_jax.data.calibration import OPENGL_AXES, world_to_camera
+from logvggt_jax.data.errors import UnequalCounts
 from logvggt_jax.data.folder_dataset import FolderDataset, FrameRecord, Listing
 from logvggt_jax.data.hdf5_files import read_hdf5
 from logvggt_jax.data.listing_index import SourceFiles
@@ -88,7 +89,7 @@ class HyperSim(FolderDataset):
             (geometry, "frame.{:04d}.render_entity_id.hdf5"),
         )
         if max(paths) >= len(positions):
-            raise ValueError(
+            raise UnequalCounts(
                 f"{detail}: expected a keyframe for each frame up to {max(paths)}, got {len(positions)}: "
                 "fetch the scene again"
             )

@@ -13,6 +13,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from logvggt_jax.data.errors import BrokenPicture
+
 _JPEG_START = b"\xff\xd8"
 _PNG_START = b"\x89PNG\r\n\x1a\n"
 # Within entropy-coded data a real marker is FF followed by neither 00, a restart marker nor a fill byte.
@@ -31,7 +33,7 @@ def read_rgb(path: str | Path) -> np.ndarray:
     """
     picture = _decode(Path(path))
     if picture.dtype != np.uint8:
-        raise ValueError(f"{path}: expected 8-bit colour, got {picture.dtype}: convert it to 8 bits a channel")
+        raise BrokenPicture(f"{path}: expected 8-bit colour, got {picture.dtype}: convert it to 8 bits a channel")
     if picture.ndim == 2:
         return np.repeat(picture[:, :, None], 3, axis=2)
     if picture.shape[2] == 4:
@@ -49,7 +51,7 @@ def read_depth(path: str | Path) -> np.ndarray:
     """
     picture = _decode(Path(path))
     if picture.dtype != np.uint16 or picture.ndim != 2:
-        raise ValueError(
+        raise BrokenPicture(
             f"{path}: expected 16-bit depth with one channel, got {picture.dtype} with shape {picture.shape}: "
             "replace it with the data set's original file"
         )
@@ -67,13 +69,13 @@ def _decode(path: Path) -> np.ndarray:
     else:
         complete = bool(data)
     if not complete:
-        raise ValueError(f"{path}: truncated or damaged picture of {len(data)} bytes: fetch it again")
+        raise BrokenPicture(f"{path}: truncated or damaged picture of {len(data)} bytes: fetch it again")
     try:
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
-        raise ValueError(f"{path}: not a picture that OpenCV can decode ({error.err}): fetch it again") from error
+        raise BrokenPicture(f"{path}: not a picture that OpenCV can decode ({error.err}): fetch it again") from error
     if picture is None:
-        raise ValueError(f"{path}: not a picture that OpenCV can decode: fetch it again")
+        raise BrokenPicture(f"{path}: not a picture that OpenCV can decode: fetch it again")
     return picture
 
 

@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from logvggt_jax.data.calibration import numbers
+from logvggt_jax.data.errors import missing_files
 from logvggt_jax.data.folder_dataset import NO_POSES, FolderDataset, FrameRecord, Listing
 from logvggt_jax.data.image_files import read_depth, read_rgb
 from logvggt_jax.data.listing_index import SourceFiles
@@ -69,12 +70,13 @@ class KITTI(FolderDataset):
             image_folder = self._raw_pictures(drive)
             depths = numbered_files(files, folder / "proj_depth" / "groundtruth" / "image_02", _PICTURE)
             images = numbered_files(files, image_folder, _PICTURE)
-            for number in depths:
-                if number not in images:
-                    raise FileNotFoundError(
-                        f"{image_folder / _PICTURE.format(number)}: no such file, but {depths[number]} exists; "
-                        "unpack the raw recording again"
-                    )
+            absent = {
+                image_folder / _PICTURE.format(number): f"but {depth} exists; unpack the raw recording again"
+                for number, depth in depths.items()
+                if number not in images
+            }
+            if absent:
+                raise missing_files(absent)
             pairs = [(images[number], depth) for number, depth in depths.items()]
             dropped = len(images) - len(depths)
         else:

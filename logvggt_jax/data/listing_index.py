@@ -16,7 +16,7 @@ from absl import logging
 
 from logvggt_jax.user_cache import user_cache_folder
 
-FORMAT = 1  # part of every index's name; raise it whenever the same files give other listings
+FORMAT = 2  # part of every index's name; raise it whenever the same files give other listings or other bytes
 _TIMEOUT = 30.0  # seconds to wait for another process that writes
 _ABSENT = -1
 _TABLE = "CREATE TABLE IF NOT EXISTS listings (key TEXT PRIMARY KEY, count INTEGER, sources TEXT, payload BLOB)"

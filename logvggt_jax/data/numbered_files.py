@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
+from logvggt_jax.data.errors import missing_files
 from logvggt_jax.data.listing_index import SourceFiles
 
 _PLACE = re.compile(r"\{[^}]*\}")
@@ -44,13 +45,14 @@ def numbered_frames(files: SourceFiles, *kinds: tuple[Path, str]) -> dict[int, t
     """
     found = [numbered_files(files, folder, template) for folder, template in kinds]
     numbers = sorted(set().union(*found))
-    for number in numbers:
-        for (folder, template), paths in zip(kinds, found, strict=True):
-            if number not in paths:
-                raise FileNotFoundError(
-                    f"{folder / template.format(number)}: no such file, but frame {number} has its other files; "
-                    "fetch it again or remove those"
-                )
+    absent = {
+        folder / template.format(number): f"but frame {number} has its other files; fetch it again or remove those"
+        for number in numbers
+        for (folder, template), paths in zip(kinds, found, strict=True)
+        if number not in paths
+    }
+    if absent:
+        raise missing_files(absent)
     return {number: tuple(paths[number] for paths in found) for number in numbers}
 
 

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from logvggt_jax.data.errors import BrokenPicture
+
 # One white space ends the header; what follows belongs to the numbers.
 _HEADER = re.compile(rb"(P[fF])\s+(\d+)\s+(\d+)\s+([+-]?[0-9.]+(?:[eE][+-]?\d+)?)\s")
 
@@ -26,14 +28,14 @@ def read_pfm(path: str | Path) -> np.ndarray:
     data = path.read_bytes()
     header = _HEADER.match(data)
     if header is None or header[1] != b"Pf":
-        raise ValueError(
+        raise BrokenPicture(
             f"{path}: expected a single-channel float map ('Pf', width, height, scale), got {data[:16]!r}: "
             "fetch it again"
         )
     width, height = int(header[2]), int(header[3])
     expected, found = 4 * width * height, len(data) - header.end()
     if found != expected or not expected:
-        raise ValueError(
+        raise BrokenPicture(
             f"{path}: a float map of {width} x {height} has {expected} bytes after its header, got {found}: "
             "fetch it again"
         )

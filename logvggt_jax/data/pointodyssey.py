@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from logvggt_jax.data.calibration import world_to_camera
+from logvggt_jax.data.errors import UnequalCounts
 from logvggt_jax.data.folder_dataset import FolderDataset, FrameRecord, Listing
 from logvggt_jax.data.image_files import read_depth, read_rgb
 from logvggt_jax.data.listing_index import SourceFiles
@@ -58,7 +59,7 @@ class PointOdyssey(FolderDataset):
         intrinsics, extrinsics = _cameras(files, folder)
         paths = numbered_frames(files, (folder / "rgbs", "rgb_{:05d}.jpg"), (folder / "depths", "depth_{:05d}.png"))
         if list(paths) != list(range(len(extrinsics))):
-            raise ValueError(
+            raise UnequalCounts(
                 f"{folder}: expected frames 0 to {len(extrinsics) - 1}, as many as anno.npz has cameras, got "
                 f"{len(paths)} frames from {min(paths)} to {max(paths)}: fetch the sequence again or remove its folder"
             )

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from logvggt_jax.data.calibration import numbers
+from logvggt_jax.data.errors import UnequalCounts
 from logvggt_jax.data.listing_index import SourceFiles
 
 
@@ -28,7 +29,7 @@ def read_pose_list(files: SourceFiles, path: Path, *, count: int, numbers_per_li
     rows = [numbers(line, f"{path}, line {i}", count=numbers_per_line) for i, line in lines if line.strip()]
     lines_per_pose = 16 // numbers_per_line
     if len(rows) != count * lines_per_pose:
-        raise ValueError(
+        raise UnequalCounts(
             f"{path}: expected {count} poses of {lines_per_pose} lines for {count} pictures, got {len(rows)} lines: "
             "fetch the file and the pictures again"
         )

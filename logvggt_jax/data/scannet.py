@@ -22,6 +22,7 @@ import numpy as np
 from absl import logging
 
 from logvggt_jax.data.calibration import numbers, world_to_camera
+from logvggt_jax.data.errors import UnequalSizes
 from logvggt_jax.data.folder_dataset import FolderDataset, FrameRecord, Listing
 from logvggt_jax.data.image_files import read_depth, read_rgb
 from logvggt_jax.data.listing_index import SourceFiles
@@ -93,7 +94,7 @@ class ScanNet(FolderDataset):
         image, raw = read_rgb(record.image), read_depth(record.depth)
         (height, width), (image_height, image_width) = raw.shape, image.shape[:2]
         if abs(image_width * height / (image_height * width) - 1) > _ASPECT_TOLERANCE:
-            raise ValueError(
+            raise UnequalSizes(
                 f"{record.depth}: {width} x {height} has another aspect ratio than {image_width} x {image_height} of "
                 f"{record.image}: export both again"
             )

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from logvggt_jax.data.calibration import numbers, pinhole, scaled, world_to_camera
+from logvggt_jax.data.errors import missing_files
 from logvggt_jax.data.folder_dataset import FolderDataset, FrameRecord, Listing
 from logvggt_jax.data.image_files import read_depth, read_rgb
 from logvggt_jax.data.listing_index import SourceFiles
@@ -64,14 +65,17 @@ class SevenScenes(FolderDataset):
                 kinds.setdefault(match[1], set()).add(match[2])
         if not kinds:
             raise FileNotFoundError(f"{folder}: no files like frame-000000.color.png; unpack the sequence's zip file")
+        absent = {
+            folder / f"{name}.{choices[-1]}": f"but frame {name} has {', '.join(sorted(present))}; fetch it or remove "
+            "the frame"
+            for name, present in sorted(kinds.items())
+            for choices in (("color.jpg", "color.png"), ("depth.proj.png", "depth.png"), ("pose.txt",))
+            if not present & set(choices)
+        }
+        if absent:
+            raise missing_files(absent)
         frames, lost = [], 0
         for name, present in sorted(kinds.items()):
-            for choices in (("color.png", "color.jpg"), ("depth.proj.png", "depth.png"), ("pose.txt",)):
-                if not present & set(choices):
-                    raise FileNotFoundError(
-                        f"{folder / name}.{choices[-1]}: no such file, but frame {name} has "
-                        f"{', '.join(sorted(present))}; fetch it or remove the frame"
-                    )
             path = folder / f"{name}.pose.txt"
             values = numbers(files.text(path, "the frame's pose"), path, count=16)
             pose = world_to_camera(values.reshape(4, 4), path, stored="camera_to_world")

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from logvggt_jax.data.calibration import world_to_camera
+from logvggt_jax.data.errors import BrokenPicture
 from logvggt_jax.data.folder_dataset import FolderDataset, FrameRecord, Listing
 from logvggt_jax.data.image_files import read_rgb
 from logvggt_jax.data.listing_index import SourceFiles
@@ -78,7 +79,7 @@ class Sintel(FolderDataset):
 
 def _camera(content: bytes, path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Intrinsics [3, 3] and world-to-camera [3, 4], float64, of a `.cam` file."""
-    _check_tag(content, path)
+    _check_tag(content, path, ValueError)
     if len(content) != _CAMERA_BYTES:
         raise ValueError(f"{path}: expected {_CAMERA_BYTES} bytes, got {len(content)}: fetch it again")
     values = np.frombuffer(content, "<f8", offset=4).astype(np.float64)
@@ -90,16 +91,16 @@ def _depth(path: Path) -> np.ndarray:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; fetch it again or remove the frame's other files")
     content = path.read_bytes()
-    _check_tag(content, path)
+    _check_tag(content, path, BrokenPicture)
     width, height = (int(size) for size in np.frombuffer(content[4:12].ljust(8, b"\0"), "<i4"))
     expected = 12 + 4 * width * height
     if width < 1 or height < 1 or len(content) != expected:
-        raise ValueError(
+        raise BrokenPicture(
             f"{path}: expected {expected} bytes for {width} x {height} pixels, got {len(content)}: fetch it again"
         )
     return np.frombuffer(content, "<f4", offset=12).astype(np.float32).reshape(height, width)
 
 
-def _check_tag(content: bytes, path: Path) -> None:
+def _check_tag(content: bytes, path: Path, error: type[ValueError]) -> None:
     if content[:4] != _TAG:
-        raise ValueError(f"{path}: expected the tag 202021.25 in the first four bytes: fetch it again")
+        raise error(f"{path}: expected the tag 202021.25 in the first four bytes: fetch it again")

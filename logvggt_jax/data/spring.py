@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from logvggt_jax.data.calibration import numbers, pinhole, world_to_camera
+from logvggt_jax.data.errors import UnequalCounts
 from logvggt_jax.data.folder_dataset import FolderDataset, FrameRecord, Listing
 from logvggt_jax.data.hdf5_files import read_hdf5
 from logvggt_jax.data.image_files import read_rgb
@@ -56,7 +57,7 @@ class Spring(FolderDataset):
         matrices = _rows(files, poses, 16, "the world-to-camera matrix of each frame")
         for path, rows in ((calibration, pinholes), (poses, matrices)):
             if max(paths) > len(rows):
-                raise ValueError(
+                raise UnequalCounts(
                     f"{path}: expected a row for each of the frames 1 to {max(paths)}, got {len(rows)} rows: "
                     "fetch the sequence's cam_data again"
                 )

@@ -15,6 +15,7 @@ from typing import ClassVar
 import numpy as np
 
 from logvggt_jax.data.calibration import numbers, scaled, world_to_camera
+from logvggt_jax.data.errors import BadPose, UnequalCounts, missing_files
 from logvggt_jax.data.folder_dataset import NO_POSES, FolderDataset, FrameRecord, Listing
 from logvggt_jax.data.image_files import read_depth, read_rgb
 from logvggt_jax.data.listing_index import SourceFiles
@@ -116,7 +117,7 @@ class TimedRGBD(FolderDataset):
         else:
             _, depths = _named_files(depth_folder, files)
         if len(depths) != len(images):
-            raise ValueError(
+            raise UnequalCounts(
                 f"{depth_folder}: expected {len(images)} files, as in {folder}/rgb_{count}, got {len(depths)}: "
                 "prepare both again"
             )
@@ -168,7 +169,7 @@ class _Trajectory:
         if not np.isfinite(self._poses[index]).all():
             return None
         if abs(np.linalg.norm(quaternion) - 1) > 0.01:
-            raise ValueError(f"{where}: expected a unit quaternion qx qy qz qw, got {quaternion}: fetch the file again")
+            raise BadPose(f"{where}: expected a unit quaternion qx qy qz qw, got {quaternion}: fetch the file again")
         pose = np.concatenate([quaternion_to_matrix(quaternion), position[:, None]], axis=1)
         return world_to_camera(pose, where, stored="camera_to_world")
 
@@ -190,9 +191,9 @@ def _listed_files(path: Path, files: SourceFiles) -> tuple[np.ndarray, list[Path
         folder: set(files.names(folder, f"the files that {path.name} lists"))
         for folder in {file.parent for file in entries}
     }
-    for file in entries:
-        if file.name not in present[file.parent]:
-            raise FileNotFoundError(f"{file}: no such file, but {path.name} lists it; fetch it or edit the list")
+    absent = [file for file in entries if file.name not in present[file.parent]]
+    if absent:
+        raise missing_files(dict.fromkeys(absent, f"but {path.name} lists it; fetch it or edit the list"))
     ordered = sorted(entries, key=lambda file: entries[file])
     return np.array([entries[file] for file in ordered]), ordered
 

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from logvggt_jax.data.calibration import numbers, world_to_camera
+from logvggt_jax.data.errors import missing_files
 from logvggt_jax.data.folder_dataset import FolderDataset, FrameRecord, Listing
 from logvggt_jax.data.image_files import read_depth, read_rgb
 from logvggt_jax.data.listing_index import SourceFiles
@@ -67,13 +68,14 @@ class WildRGBD(FolderDataset):
         intrinsics = _intrinsics(files, folder / "metadata")
         poses = _poses(files, folder / "cam_poses.txt")
         pictures, depths = (_frames(files, folder / kind) for kind in ("rgb", "depth"))
-        for number in sorted(pictures.keys() | depths.keys() | poses.keys()):
-            for kind, present in (("rgb", pictures), ("depth", depths)):
-                if number not in present:
-                    raise FileNotFoundError(
-                        f"{folder / kind / f'{number:05d}.png'}: no such file, but the frame has other files or a "
-                        "pose; fetch it or remove them"
-                    )
+        absent = {
+            folder / kind / f"{number:05d}.png": "but the frame has other files or a pose; fetch it or remove them"
+            for number in sorted(pictures.keys() | depths.keys() | poses.keys())
+            for kind, present in (("rgb", pictures), ("depth", depths))
+            if number not in present
+        }
+        if absent:
+            raise missing_files(absent)
         frames = []
         for number in sorted(pictures):
             pose = poses.get(number)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import pickle
 from pathlib import Path
 
 import pytest
 
+from logvggt_jax.data.errors import MissingFiles
 from logvggt_jax.data.listing_index import SourceFiles
 from logvggt_jax.data.numbered_files import numbered_files, numbered_frames, without_gaps
 
@@ -38,8 +40,12 @@ def test_a_frame_without_one_of_its_files_names_it(tmp_path: Path):
     with pytest.raises(FileNotFoundError, match=r"a/3\.jpg: no such file"):
         numbered_frames(SourceFiles(), *kinds)
     (depth / "1.png").unlink()
-    with pytest.raises(FileNotFoundError, match=r"b/1\.png: no such file"):
+    with pytest.raises(FileNotFoundError, match=r"b/1\.png: no such file \(nor 1 more\), but frame 1") as caught:
         numbered_frames(SourceFiles(), *kinds)
+    # All of them, also where the error comes from a worker process.
+    error = pickle.loads(pickle.dumps(caught.value))
+    assert isinstance(error, MissingFiles) and str(error) == str(caught.value)
+    assert list(error.reasons) == [depth / "1.png", colour / "3.jpg"]
 
 
 def test_gaps_empty_and_absent_folders_are_named(tmp_path: Path):
