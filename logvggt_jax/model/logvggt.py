@@ -18,7 +18,7 @@ from logvggt_jax.model.aggregator import Aggregator
 from logvggt_jax.model.camera_head import CameraHead
 from logvggt_jax.model.dinov2 import DinoV2
 from logvggt_jax.model.dpt_head import DPTHead, depth_activation, point_activation
-from logvggt_jax.model.gccr import GCCR
+from logvggt_jax.model.gccr import GCCR, RegisterKeys
 from logvggt_jax.model.windows import WindowState, num_windows
 from logvggt_jax.types import Predictions, WindowOutput
 
@@ -309,6 +309,30 @@ class LogVGGT:
         params = variables["params"]["gccr"]
         return _run(self._gccr, params, camera_tokens, register_tokens, register_mask)
 
+    def project_registers(self, variables: Variables, register_tokens: jax.Array) -> RegisterKeys:
+        """GCCR's keys and values of register tokens [B, M, 4, 2C], frame by frame.
+
+        A stream that refines often projects each frame once; over again for every refinement, the cost a frame
+        would grow with the sequence.
+        """
+        width, registers = 2 * self.config.encoder.embed_dim, self.config.aggregator.num_registers
+        _check("register_tokens", register_tokens, (None, None, registers, width), jnp.floating)
+        return _run(self._gccr, variables["params"]["gccr"], register_tokens, method=GCCR.project)
+
+    def attend_registers(
+        self,
+        variables: Variables,
+        camera_tokens: jax.Array,
+        registers: RegisterKeys,
+        register_mask: jax.Array,
+    ) -> jax.Array:
+        """GCCR after `project_registers`: [B, N, 2C], M frames' keys and values, bool [B, M] -> [B, N, 2C]."""
+        width = 2 * self.config.encoder.embed_dim
+        _check("camera_tokens", camera_tokens, (len(registers.key), None, width), jnp.floating)
+        _check("register_mask", register_mask, registers.key.shape[:2], jnp.bool_)
+        params = variables["params"]["gccr"]
+        return _run(self._gccr, params, camera_tokens, registers, register_mask, method=GCCR.attend)
+
     def decode_cameras(self, variables: Variables, camera_tokens: jax.Array, camera_mask: jax.Array) -> jax.Array:
         """Camera head alone: refined tokens [B, N, 2C], bool [B, N] -> pose encodings [B, N, R, 9]."""
         _check("camera_tokens", camera_tokens, (None, None, 2 * self.config.encoder.embed_dim), jnp.floating)
@@ -347,11 +371,15 @@ class LogVGGT:
     ) -> jax.Array:
         """Pose encodings [B, T, R, 9] of whole sequences in the configured mode: full, periodic or online."""
         settings = self.config.refinement
+        registers = self.project_registers(variables, register_tokens) if settings.enabled else None
+
+        def refine_tokens(tokens: jax.Array, register_mask: jax.Array) -> jax.Array:
+            return tokens if registers is None else self.attend_registers(variables, tokens, registers, register_mask)
+
         return refinement.refine_sequence(
-            functools.partial(self.refine_tokens, variables),
+            refine_tokens,
             functools.partial(self.decode_cameras, variables),
             camera_tokens,
-            register_tokens,
             frame_mask,
             period=settings.period,
             context=settings.context,
@@ -384,7 +412,8 @@ class LogVGGT:
 
     @property
     def _gccr(self) -> GCCR:
-        return GCCR(self.config.refinement.num_heads, self.config.dtype, self.config.attention)
+        width = 2 * self.config.encoder.embed_dim
+        return GCCR(width, self.config.refinement.num_heads, self.config.dtype, self.config.attention)
 
     @property
     def _overlap(self) -> int:
