@@ -59,6 +59,38 @@ class Cameras(NamedTuple):
     is_final: np.ndarray
 
 
+def checked_frames(
+    frames: np.ndarray | jax.Array | Sequence[np.ndarray], *, patch_size: int, before: np.ndarray | None
+) -> np.ndarray:
+    """Frames [n, H, W, 3] of one frame [H, W, 3] or several, fit for the model.
+
+    Args:
+      frames: uint8 or floating point in [0, 1].
+      patch_size: H and W must be multiples of it.
+      before: an earlier frame [H, W, 3] of the same stream, whose shape and dtype these must have.
+
+    Raises:
+      ValueError: another shape or dtype.
+    """
+    frames = np.asarray(frames)
+    frames = frames[None] if frames.ndim == 3 else frames
+    shape = frames.shape
+    if len(shape) != 4 or shape[-1] != 3 or 0 in shape:
+        raise ValueError(f"frames must have shape [n, H, W, 3] or [H, W, 3], got {shape}")
+    if shape[1] % patch_size or shape[2] % patch_size:
+        raise ValueError(
+            f"frames of {shape[1]} x {shape[2]} pixels: height and width must be multiples of {patch_size}; "
+            "logvggt_jax.preprocess resizes frames of any size"
+        )
+    if frames.dtype != np.uint8 and not np.issubdtype(frames.dtype, np.floating):
+        raise ValueError(f"frames must be uint8 or floating point in [0, 1], got dtype {frames.dtype}")
+    if before is not None and (before.shape != shape[1:] or before.dtype != frames.dtype):
+        raise ValueError(
+            f"frames of a stream must be alike: {before.dtype} {before.shape} before, now {frames.dtype} {shape[1:]}"
+        )
+    return frames
+
+
 # The model is hashable and static, so that all sessions of a model share their compiled programs.
 
 
@@ -177,9 +209,8 @@ class StreamSession:
         """
         if self._closed:
             raise ValueError("this stream is closed: make another StreamSession for another sequence")
-        frames = np.asarray(frames)
-        frames = frames[None] if frames.ndim == 3 else frames
-        self._check(frames)
+        frames = checked_frames(frames, patch_size=self._model.config.encoder.patch_size, before=self._newest)
+        self._image_size = (frames.shape[1], frames.shape[2])
         results: list[FrameResult] = []
         for frame in frames:
             self._pending.append(frame)
@@ -226,26 +257,6 @@ class StreamSession:
         if not settings.enabled:
             return None
         return register_tokens if settings.period is None else _project(self._model, self._variables, register_tokens)
-
-    def _check(self, frames: np.ndarray) -> None:
-        patch = self._model.config.encoder.patch_size
-        shape = frames.shape
-        if len(shape) != 4 or shape[-1] != 3 or 0 in shape:
-            raise ValueError(f"frames must have shape [n, H, W, 3] or [H, W, 3], got {shape}")
-        if shape[1] % patch or shape[2] % patch:
-            raise ValueError(
-                f"frames of {shape[1]} x {shape[2]} pixels: height and width must be multiples of {patch}; "
-                "logvggt_jax.preprocess resizes frames of any size"
-            )
-        if frames.dtype != np.uint8 and not np.issubdtype(frames.dtype, np.floating):
-            raise ValueError(f"frames must be uint8 or floating point in [0, 1], got dtype {frames.dtype}")
-        before = self._newest
-        if before is not None and (before.shape != shape[1:] or before.dtype != frames.dtype):
-            raise ValueError(
-                f"frames of a stream must be alike: {before.dtype} {before.shape} before, now {frames.dtype} "
-                f"{shape[1:]}"
-            )
-        self._image_size = (shape[1], shape[2])
 
     def _advance(self) -> list[FrameResult]:
         config = self._model.config.windows

@@ -8,7 +8,6 @@ from typing import TypeVar
 import jax
 import jax.numpy as jnp
 
-
 from logvggt_jax.model.gccr import RegisterKeys
 
 Tokens = TypeVar("Tokens")
@@ -55,7 +54,7 @@ class TokenStore:
         return 0 if self.camera is None else self.camera.shape[1]
 
     def append(self, camera: jax.Array, registers: jax.Array | RegisterKeys | None, valid: int) -> None:
-        """Adds the first `valid` of n frames: `camera` [1, n, 2C], `registers` [1, n, 4, 2C] of the same kind always."""
+        """Adds the first `valid` of n frames: `camera` [1, n, 2C], `registers` [1, n, 4, 2C], of one kind always."""
         if self.camera is None:
             self.camera, self.refined = camera[:, :0], camera[:, :0]
             self.registers = jax.tree.map(lambda x: x[:, :0], registers)

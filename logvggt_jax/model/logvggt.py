@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
+from collections.abc import Callable
 from typing import Any
 
 import flax.linen as nn
@@ -25,6 +27,8 @@ from logvggt_jax.types import Predictions, WindowOutput
 Variables = dict[str, Any]
 
 _PATCH_TOKENS = "patch_tokens"
+# Pixels that a dense head takes at once, about 8 frames of 518 x 518: its maps are the model's largest.
+_DENSE_PIXELS = 8 * 518 * 518
 
 
 @dataclasses.dataclass(frozen=True)
@@ -448,7 +452,10 @@ class LogVGGT:
         levels = [patches[:, i].reshape(batch * count, *patches.shape[3:]) for i in range(num_levels)]
 
         def dense(head: DPTHead, name: str) -> jax.Array:
-            raw = _run(head, params[name], levels, grid=grid, image_size=image_size)
+            def frames(levels: list[jax.Array]) -> jax.Array:
+                return _run(head, params[name], levels, grid=grid, image_size=image_size)
+
+            raw = _in_groups(frames, levels, max(1, _DENSE_PIXELS // math.prod(image_size)))
             return raw.reshape(batch, count, *raw.shape[1:])
 
         depth, depth_confidence = depth_activation(dense(self._depth_head, "depth_head"))
@@ -499,6 +506,22 @@ class LogVGGT:
 def _run(module: nn.Module, params: Any, *inputs: Any, **options: Any) -> Any:
     """A linen module as a pure function of its own parameters."""
     return module.apply({"params": params}, *inputs, **options)
+
+
+def _in_groups(function: Callable[[Any], jax.Array], inputs: Any, at_most: int) -> jax.Array:
+    """`function` of arrays [N, ...] that it treats item by item, at most so many items at a time."""
+    count = len(jax.tree.leaves(inputs)[0])
+    groups = -(-count // at_most)
+    if groups == 1:
+        return function(inputs)
+    size = -(-count // groups)
+
+    def split(x: jax.Array) -> jax.Array:
+        x = jnp.pad(x, [(0, groups * size - count), *[(0, 0)] * (x.ndim - 1)])
+        return x.reshape(groups, size, *x.shape[1:])
+
+    out = jax.lax.map(function, jax.tree.map(split, inputs))
+    return out.reshape(groups * size, *out.shape[2:])[:count]
 
 
 def _check(name: str, array: jax.Array, shape: tuple[int | None, ...], kind: Any) -> None:
