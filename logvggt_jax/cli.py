@@ -92,12 +92,13 @@ def _chunks(options: argparse.Namespace) -> ChunkPlan | None:
     """The chunks of `--mode chunks`; None for windows."""
     from logvggt_jax.model.chunks import ChunkPlan
 
-    sizes = {"size": options.chunk_size, "overlap": options.chunk_overlap}
-    given = {name: value for name, value in sizes.items() if value is not None}
+    given = {"--chunk-size": options.chunk_size, "--chunk-overlap": options.chunk_overlap}
     if options.mode == "chunks":
-        return ChunkPlan(**given)
-    if given:
-        raise ValueError(f"--chunk-{next(iter(given))} needs --mode chunks")
+        size = ChunkPlan.size if options.chunk_size is None else options.chunk_size
+        return ChunkPlan(size, size // 2 if options.chunk_overlap is None else options.chunk_overlap)
+    for name, value in given.items():
+        if value is not None:
+            raise ValueError(f"{name} needs --mode chunks")
     return None
 
 
@@ -206,7 +207,7 @@ def _parser() -> argparse.ArgumentParser:
         help="frames of a chunk, as many as memory allows (default: 60)",
     )
     sub.add_argument(
-        "--chunk-overlap", type=int, default=None, metavar="N", help="frames that neighbours share (default: 30)"
+        "--chunk-overlap", type=int, default=None, metavar="N", help="frames that neighbours share (default: half)"
     )
     points = sub.add_argument_group("point cloud")
     points.add_argument(
