@@ -23,21 +23,25 @@ def count_flops(function: Callable[..., Any], *arguments: Any) -> float:
     Raises:
       ValueError: a loop whose number of trips is not fixed.
     """
-    return _true_cost(jax.make_jaxpr(function)(*arguments))
+    return _costs(jax.make_jaxpr(function)(*arguments), {})[0]
 
 
-def _true_cost(program: core.ClosedJaxpr) -> float:
-    total = _cost_with_bodies_once(program)
-    for length, body in _outermost_loops(program.jaxpr):
-        total += length * _true_cost(body) - _cost_with_bodies_once(body)
-    return total
+def _costs(program: core.ClosedJaxpr, known: dict[str, tuple[float, float]]) -> tuple[float, float]:
+    """Operations with every loop times its trips, and with every loop's body once, as XLA counts.
 
-
-def _cost_with_bodies_once(program: core.ClosedJaxpr) -> float:
-    arguments = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in program.in_avals]
-    analysis = jax.jit(core.jaxpr_as_fun(program)).lower(*arguments).cost_analysis()
-    # Programs that only move data have no such entry.
-    return float((analysis or {}).get("flops", 0.0))
+    `known` collects the programs that were counted: layers repeat the same loops.
+    """
+    text = str(program)
+    if text not in known:
+        arguments = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in program.in_avals]
+        analysis = jax.jit(core.jaxpr_as_fun(program)).lower(*arguments).cost_analysis()
+        # Programs that only move data have no such entry.
+        total = once = float((analysis or {}).get("flops", 0.0))
+        for length, body in _outermost_loops(program.jaxpr):
+            body_total, body_once = _costs(body, known)
+            total += length * body_total - body_once
+        known[text] = total, once
+    return known[text]
 
 
 def _outermost_loops(jaxpr: core.Jaxpr) -> Iterator[tuple[int, core.ClosedJaxpr]]:

@@ -188,7 +188,7 @@ class LogVGGT:
         config, batch, image_size = self.config, frames.shape[0], _image_size(frames)
         grid = self._grid(image_size)
         width, registers = config.encoder.embed_dim, config.aggregator.num_registers
-        patch_tokens = self._encode(variables, frames)
+        patch_tokens = self.encode(variables, frames)
         tokens = grid[0] * grid[1] + 1 + registers
 
         def zeros(shape: tuple[int, ...], dtype: Any) -> jax.Array:
@@ -230,29 +230,17 @@ class LogVGGT:
                 f"step continues a stream of {len(state.step)} x {state.image_size} images (batch, height and width), "
                 f"got {len(frames)} x {image_size}; start a new stream for other shapes"
             )
-        grid = self._grid(image_size)
-        fresh = self._encode(variables, frames)
+        fresh = self.encode(variables, frames)
         patch_tokens = jnp.concatenate([state.patch_tokens, fresh], axis=1)
         window_mask = jnp.concatenate([state.frame_mask, frame_mask], axis=1)
         is_first = state.step == 0
-        width = self.config.encoder.embed_dim
-        halves = slice(width, None) if self.config.windows.cache == "output" else slice(None, width)
-        key_tokens, special_tokens = _run(
-            self._aggregator,
-            variables["params"]["aggregator"],
-            patch_tokens,
-            window_mask,
-            state.key_tokens[..., halves],
-            state.frame_mask & ~is_first[:, None],
-            is_first,
-            grid=grid,
-        )
+        key_tokens, special_tokens = self.attend_window(variables, state, patch_tokens, window_mask)
         # An item that has ended shifts its held frames out instead.
         active = is_first | frame_mask.any(1)
         key_tokens = _select(active, key_tokens, _shift_in(state.key_tokens, stride, axis=2))
         special_tokens = _select(active, special_tokens, _shift_in(state.special_tokens, stride, axis=1))
         window_mask = _select(active, window_mask, _shift_in(state.frame_mask, stride, axis=1))
-        out = self._output(
+        out = self.decode_dense(
             variables,
             key_tokens[:, :, :stride],
             special_tokens[:, :stride],
@@ -271,7 +259,7 @@ class LogVGGT:
 
     def finish(self, variables: Variables, state: WindowState) -> WindowOutput:
         """The K − s frames that the last window still holds."""
-        return self._output(variables, state.key_tokens, state.special_tokens, state.frame_mask, state.image_size)
+        return self.decode_dense(variables, state.key_tokens, state.special_tokens, state.frame_mask, state.image_size)
 
     def refine(
         self,
@@ -390,7 +378,82 @@ class LogVGGT:
             group=self.config.windows.stride,
         )
 
-    # Parts.
+    # Parts of a step.
+
+    def encode(self, variables: Variables, images: jax.Array) -> jax.Array:
+        """Patch tokens [B, n, h * w, C] float32 of images [B, n, H, W, 3]; frames are independent."""
+        params = variables["params"]["encoder"]
+        if self.config.encoder.frozen:
+            # At the source: nothing of the encoder's pass is then kept for a backward pass.
+            params = jax.lax.stop_gradient(params)
+        pixels = jnp.asarray(images, jnp.float32) / (255.0 if images.dtype == jnp.uint8 else 1.0)
+        tokens = _run(self._encoder, params, pixels.reshape(-1, *images.shape[2:]))
+        return checkpoint_name(tokens.reshape(*images.shape[:2], *tokens.shape[1:]), _PATCH_TOKENS)
+
+    def attend_window(
+        self, variables: Variables, state: WindowState, patch_tokens: jax.Array, window_mask: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """All attention blocks over one window.
+
+        Args:
+          variables: {"params": …}.
+          state: of the stream before the window, whose cache the key layers see.
+          patch_tokens: [B, K, h * w, C] of the window's frames.
+          window_mask: bool [B, K], False for padding.
+
+        Returns:
+          Key-layer tokens [B, key layers, K, P, 2C] in the compute dtype; special tokens [B, K, 5, 2C] float32.
+        """
+        is_first = state.step == 0
+        width = self.config.encoder.embed_dim
+        halves = slice(width, None) if self.config.windows.cache == "output" else slice(None, width)
+        return _run(
+            self._aggregator,
+            variables["params"]["aggregator"],
+            patch_tokens,
+            window_mask,
+            state.key_tokens[..., halves],
+            state.frame_mask & ~is_first[:, None],
+            is_first,
+            grid=self._grid(state.image_size),
+        )
+
+    def decode_dense(
+        self,
+        variables: Variables,
+        key_tokens: jax.Array,
+        special_tokens: jax.Array,
+        frame_mask: jax.Array,
+        image_size: tuple[int, int],
+    ) -> WindowOutput:
+        """Dense heads over key-layer tokens [B, key layers, n, P, 2C] of n frames, which are independent."""
+        params, grid = variables["params"], self._grid(image_size)
+        batch, num_levels, count = key_tokens.shape[:3]
+        patches = key_tokens[..., 1 + self.config.aggregator.num_registers :, :]
+        levels = [patches[:, i].reshape(batch * count, *patches.shape[3:]) for i in range(num_levels)]
+
+        def dense(head: DPTHead, name: str) -> jax.Array:
+            def frames(levels: list[jax.Array]) -> jax.Array:
+                return _run(head, params[name], levels, grid=grid, image_size=image_size)
+
+            raw = _in_groups(frames, levels, max(1, _DENSE_PIXELS // math.prod(image_size)))
+            return raw.reshape(batch, count, *raw.shape[1:])
+
+        depth, depth_confidence = depth_activation(dense(self._depth_head, "depth_head"))
+        points = points_confidence = None
+        if self.config.point_head is not None:
+            points, points_confidence = point_activation(dense(self._point_head, "point_head"))
+        return WindowOutput(
+            depth=depth,
+            depth_confidence=depth_confidence,
+            camera_tokens=special_tokens[:, :, 0],
+            register_tokens=special_tokens[:, :, 1:],
+            frame_mask=frame_mask,
+            points=points,
+            points_confidence=points_confidence,
+        )
+
+    # Modules.
 
     @property
     def _encoder(self) -> DinoV2:
@@ -426,51 +489,6 @@ class LogVGGT:
     def _grid(self, image_size: tuple[int, int]) -> tuple[int, int]:
         patch = self.config.encoder.patch_size
         return image_size[0] // patch, image_size[1] // patch
-
-    def _encode(self, variables: Variables, images: jax.Array) -> jax.Array:
-        """Patch tokens [B, n, h * w, C] float32 of images [B, n, H, W, 3]."""
-        params = variables["params"]["encoder"]
-        if self.config.encoder.frozen:
-            # At the source: nothing of the encoder's pass is then kept for a backward pass.
-            params = jax.lax.stop_gradient(params)
-        pixels = jnp.asarray(images, jnp.float32) / (255.0 if images.dtype == jnp.uint8 else 1.0)
-        tokens = _run(self._encoder, params, pixels.reshape(-1, *images.shape[2:]))
-        return checkpoint_name(tokens.reshape(*images.shape[:2], *tokens.shape[1:]), _PATCH_TOKENS)
-
-    def _output(
-        self,
-        variables: Variables,
-        key_tokens: jax.Array,
-        special_tokens: jax.Array,
-        frame_mask: jax.Array,
-        image_size: tuple[int, int],
-    ) -> WindowOutput:
-        """Dense heads over key-layer tokens [B, key layers, n, P, 2C] of n frames."""
-        params, grid = variables["params"], self._grid(image_size)
-        batch, num_levels, count = key_tokens.shape[:3]
-        patches = key_tokens[..., 1 + self.config.aggregator.num_registers :, :]
-        levels = [patches[:, i].reshape(batch * count, *patches.shape[3:]) for i in range(num_levels)]
-
-        def dense(head: DPTHead, name: str) -> jax.Array:
-            def frames(levels: list[jax.Array]) -> jax.Array:
-                return _run(head, params[name], levels, grid=grid, image_size=image_size)
-
-            raw = _in_groups(frames, levels, max(1, _DENSE_PIXELS // math.prod(image_size)))
-            return raw.reshape(batch, count, *raw.shape[1:])
-
-        depth, depth_confidence = depth_activation(dense(self._depth_head, "depth_head"))
-        points = points_confidence = None
-        if self.config.point_head is not None:
-            points, points_confidence = point_activation(dense(self._point_head, "point_head"))
-        return WindowOutput(
-            depth=depth,
-            depth_confidence=depth_confidence,
-            camera_tokens=special_tokens[:, :, 0],
-            register_tokens=special_tokens[:, :, 1:],
-            frame_mask=frame_mask,
-            points=points,
-            points_confidence=points_confidence,
-        )
 
     def _check_images(self, images: jax.Array, name: str) -> None:
         patch = self.config.encoder.patch_size
