@@ -16,6 +16,7 @@ import argparse
 import dataclasses
 import json
 import os
+import platform
 import shlex
 import statistics
 import sys
@@ -153,6 +154,17 @@ def transfer(pictures: np.ndarray, stride: int) -> dict[str, float]:
     }
 
 
+def describe_device() -> str:
+    """The default device by name; of a CPU its model and cores, where the system tells."""
+    device = jax.devices()[0]
+    if device.platform != "cpu":
+        return f"{device.device_kind} ({device.platform}), host with {os.cpu_count()} cores"
+    information = Path("/proc/cpuinfo")
+    lines = information.read_text().splitlines() if information.is_file() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return f"{names[0] if names else platform.machine()}, {os.cpu_count()} cores"
+
+
 def by_part(model: LogVGGT, variables: Any, length: int, image_size: tuple[int, int], rounds: int) -> list[PartTime]:
     """Times of all programs of a sequence, each one alone."""
     return [time_part(part, variables, rounds=rounds) for part in sequence_parts(model, length, image_size)]
@@ -271,7 +283,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     per_frame = {mode: {str(n): sum(c.values()) / n for n, c in counts.items()} for mode, counts in flops.items()}
     return {
         "command": shlex.join(["python", *sys.argv]),
-        "device": f"{jax.devices()[0].device_kind} ({jax.devices()[0].platform}, {os.cpu_count()} host cores)",
+        "device": describe_device(),
         "jax": jax.__version__,
         "model": base.to_dict(),
         "image_size": list(options.image_size),

@@ -245,7 +245,7 @@ def test_chunks_of_the_whole_sequence_are_plain_vggt(
     cameras = read_cameras(result.folder / "cameras.json")
     np.testing.assert_allclose([f["extrinsics"] for f in cameras["frames"]], plain.extrinsics, rtol=1e-5, atol=1e-5)
     depth, _ = read_depth(result.folder / "depth" / "frame-000006.npz")
-    np.testing.assert_allclose(depth, plain.depth[6], rtol=1e-3)
+    np.testing.assert_allclose(depth, as_stored(plain.depth[6], plain.depth_confidence[6])[0], rtol=1e-3)
 
 
 def test_bad_arguments_are_named(
