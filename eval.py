@@ -18,8 +18,10 @@ from ml_collections import config_flags
 from logvggt_jax.evaluation.baselines import all_baselines
 from logvggt_jax.evaluation.datasets import open_evaluation_set
 from logvggt_jax.evaluation.methods import network
+from logvggt_jax.evaluation.references import reference_methods
 from logvggt_jax.evaluation.report import print_report, write_report
 from logvggt_jax.evaluation.runner import EvaluationRun, evaluate
+from logvggt_jax.evaluation.variants import variant_methods
 from logvggt_jax.inference.compilation_cache import enable_compilation_cache
 from logvggt_jax.weights import load_model
 
@@ -44,6 +46,9 @@ def main(arguments: Sequence[str]) -> None:
         enable_compilation_cache(_CACHE.value)
         model, variables = load_model(_CHECKPOINT.value)
         methods = [network(model, variables)]
+        if run.references is not None:
+            methods += reference_methods(model, variables, run.references)
+        methods += variant_methods(model, variables, run.variants)
         if run.baselines:
             methods += all_baselines(model, known_set, image_size, source=known, seed=seed)
         command = shlex.join(["python", *sys.argv])

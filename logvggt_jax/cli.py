@@ -13,7 +13,10 @@ import traceback
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from logvggt_jax.model.chunks import ChunkPlan
 
 BAD_INPUT, FAILURE, INTERRUPTED = 2, 1, 130
 PROBLEMS_FOUND = 1
@@ -66,6 +69,7 @@ def _reconstruct(options: argparse.Namespace) -> None:
         "overwrite": options.overwrite,
     }
     # Before the model: a misspelt path should not have to wait for gigabytes of weights.
+    chunks = _chunks(options)
     check_request(options.source, options.output, **selection)
     enable_compilation_cache(options.compilation_cache)
     point_filter = PointFilter(
@@ -80,12 +84,27 @@ def _reconstruct(options: argparse.Namespace) -> None:
         options.output,
         model=model,
         variables=variables,
+        chunks=chunks,
         longer_edge=options.longer_edge,
         point_filter=point_filter,
         num_previews=options.previews,
         **selection,
     )
     print(result.summary())
+
+
+def _chunks(options: argparse.Namespace) -> ChunkPlan | None:
+    """The chunks of `--mode chunks`; None for windows."""
+    from logvggt_jax.model.chunks import ChunkPlan
+
+    given = {"--chunk-size": options.chunk_size, "--chunk-overlap": options.chunk_overlap}
+    if options.mode == "chunks":
+        size = ChunkPlan.size if options.chunk_size is None else options.chunk_size
+        return ChunkPlan(size, size // 2 if options.chunk_overlap is None else options.chunk_overlap)
+    for name, value in given.items():
+        if value is not None:
+            raise ValueError(f"{name} needs --mode chunks")
+    return None
 
 
 def _render_room(options: argparse.Namespace) -> None:
@@ -203,6 +222,23 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--max-frames", type=int, default=None, metavar="N", help="stop after N frames")
     sub.add_argument(
         "--dtype", choices=("float32", "bfloat16"), default=None, help="compute type instead of the checkpoint's own"
+    )
+    sub.add_argument(
+        "--mode",
+        choices=("windows", "chunks"),
+        default="windows",
+        help="windows: LoG-VGGT's stream. chunks: plain VGGT on overlapping chunks chained by similarities, for public "
+        "VGGT weights, which never learned the relay from window to window",
+    )
+    sub.add_argument(
+        "--chunk-size",
+        type=int,
+        default=None,
+        metavar="N",
+        help="frames of a chunk, as many as memory allows (default: 60)",
+    )
+    sub.add_argument(
+        "--chunk-overlap", type=int, default=None, metavar="N", help="frames that neighbours share (default: half)"
     )
     points = sub.add_argument_group("point cloud")
     points.add_argument(

@@ -154,6 +154,9 @@ def test_bad_input_is_one_line_and_exit_code_2(
     assert_fails(capsys, reconstruct(room, checkpoint, "--longer-edge", "50"), "longer_edge", "14", "50")
     assert_fails(capsys, reconstruct(room, checkpoint, "--confidence-percentile", "120"), "confidence_percentile")
     assert_fails(capsys, reconstruct(room, checkpoint, "--stride", "0"), "stride")
+    assert_fails(capsys, reconstruct(room, checkpoint, "--chunk-size", "8"), "--chunk-size needs --mode chunks")
+    chunks = ("--mode", "chunks", "--chunk-size", "8", "--chunk-overlap", "30")
+    assert_fails(capsys, reconstruct(room, checkpoint, *chunks), "chunk overlap must be", "8, got 30")
     truncated = tmp_path / "truncated"
     truncated.mkdir()
     for file in sorted(room.glob("*.color.png"))[:2]:

@@ -14,6 +14,8 @@ def get_config() -> ConfigDict:
     # Rooms of the kind that configs/tiny.py trains on.
     config.rooms = ConfigDict({"num_rooms": 24, "style": "compass", "num_frames": 96})
     config.baselines = True
+    # Chunks of the length that the model was trained at.
+    config.references = ConfigDict({"max_frames": 200, "chunk_size": 12, "chunk_overlap": 6})
 
     config.evaluation = evaluation = ConfigDict()
     # The size that the model was trained at; rooms are rendered at it.

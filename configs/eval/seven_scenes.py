@@ -17,6 +17,8 @@ def get_config() -> ConfigDict:
     # "test" needs the official TestSplit.txt in every scene's folder.
     config.split = "all"
     config.baselines = True
+    # Chunks of the length that the model was trained at.
+    config.references = ConfigDict({"max_frames": 200, "chunk_size": 12, "chunk_overlap": 6})
 
     config.evaluation = evaluation = ConfigDict()
     # The tiny model's size, to which frames are scaled and cropped; VGGT-1B's would be (392, 518).

@@ -28,6 +28,10 @@ class ClipPrediction(NamedTuple):
     intrinsics: np.ndarray | None
 
 
+class PredictionError(ValueError):
+    """A method cannot predict a clip: too long for the memory, nothing to align. The clip counts as failed for it."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Method:
     """A row of the table.
@@ -35,7 +39,7 @@ class Method:
     Attributes:
       name: label of the row.
       knows: what the method was given besides the images, in words, for the reader of the table.
-      predict: images [T, H, W, 3] uint8 to the clip's prediction.
+      predict: images [T, H, W, 3] uint8 to the clip's prediction; raises PredictionError where it has none.
       depth: whether depth is measured.
       pose: whether poses are measured.
       points: whether the point cloud is measured.

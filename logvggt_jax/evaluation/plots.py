@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,12 @@ import numpy as np
 from logvggt_jax.evaluation.depth import align_depth
 from logvggt_jax.evaluation.trajectory import align_trajectory
 from logvggt_jax.geometry import camera_centres, invert
+
+# Paper, appendix on efficiency; its GPU is not named, so that only the shape can be compared.
+_PAPER_FRAMES_PER_SECOND = {
+    "paper, full": {100: 12.4, 200: 12.3, 500: 12.3, 1000: 11.9},
+    "paper, online": {100: 11.5, 200: 10.8, 500: 9.4, 1000: 8.2},
+}
 
 
 def trajectory_plot(path: Path, predicted_extrinsics: np.ndarray, true_extrinsics: np.ndarray) -> None:
@@ -82,6 +89,44 @@ def depth_panel(
                 axis.set_title(title, fontsize=8)
             if column:
                 figure.colorbar(drawn, ax=axis, fraction=0.046, pad=0.03).ax.tick_params(labelsize=6)
+    _save(figure, path)
+
+
+def efficiency_plot(path: Path, report: Mapping[str, Any]) -> None:
+    """Frames a second by length beside the paper's, both relative to the shortest, and the time by part.
+
+    Args:
+      path: PNG file; its folder is created.
+      report: as benchmarks/efficiency.py writes it: `device`, `speed` (rows of `mode`, `frames`,
+        `frames_per_second`) and `parts` (by mode, rows of `name` and `seconds`) of `part_frames` frames.
+    """
+    figure, (rates, relative, parts) = _figure(1, 3, (13.0, 4.0))
+    for mode in dict.fromkeys(row["mode"] for row in report["speed"]):
+        rows = [row for row in report["speed"] if row["mode"] == mode]
+        lengths = [row["frames"] for row in rows]
+        medians = [float(np.median(row["frames_per_second"])) for row in rows]
+        extremes = [[abs(pick(row["frames_per_second"]) - m) for row, m in zip(rows, medians, strict=True)]
+                    for pick in (min, max)]  # fmt: skip
+        rates.errorbar(lengths, medians, yerr=extremes, marker="o", capsize=3, label=mode)
+        relative.plot(lengths, [m / medians[0] for m in medians], "o-", label=mode)
+    for label, values in _PAPER_FRAMES_PER_SECOND.items():
+        relative.plot(list(values), [v / next(iter(values.values())) for v in values.values()], "--", label=label)
+    for axis, title in ((rates, "frames/s"), (relative, "frames/s over those of the shortest")):
+        axis.set_title(title, fontsize=9)
+        axis.set_xlabel("frames of the sequence")
+        axis.set_ylim(bottom=0)
+        axis.legend(fontsize=7)
+    for position, rows in enumerate(report["parts"].values()):
+        bottom = 0.0
+        for index, row in enumerate(rows):
+            # One entry a part in the legend, not one a bar.
+            name = row["name"] if position == 0 else None
+            parts.bar(position, row["seconds"], bottom=bottom, color=f"C{index}", label=name)
+            bottom += row["seconds"]
+    parts.set_xticks(range(len(report["parts"])), list(report["parts"]), fontsize=7)
+    parts.set_title(f"seconds by part, {report['part_frames']} frames", fontsize=9)
+    parts.legend(fontsize=7)
+    figure.suptitle(report["device"], fontsize=9)
     _save(figure, path)
 
 

@@ -21,6 +21,7 @@ from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.data.transforms import fit
 from logvggt_jax.evaluation.methods import ClipPrediction, Method
 from logvggt_jax.evaluation.protocols import ClipScore, ClipTruth, clip_score, data_set_score, prepare_truth
+from logvggt_jax.evaluation.references import ReferenceConfig
 from logvggt_jax.types import Frames
 
 Settings = TypeVar("Settings")
@@ -87,6 +88,8 @@ class EvaluationRun:
       baselines: whether the baselines are evaluated beside the network.
       evaluation: clips and metrics.
       rooms: options of procedural rooms, for `dataset` = `rooms` alone.
+      references: limits of the reference models; None leaves them out.
+      variants: names of `logvggt_jax.evaluation.variants.VARIANTS` that are evaluated beside the network.
     """
 
     title: str
@@ -95,12 +98,20 @@ class EvaluationRun:
     baselines: bool
     evaluation: EvaluationConfig
     rooms: Mapping[str, Any] | None = None
+    references: ReferenceConfig | None = None
+    variants: tuple[str, ...] = ()
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> EvaluationRun:
         """From a configuration file's mapping; ValueError for an unknown or missing field, naming it."""
         run = _from_mapping(cls, values, "")
-        return dataclasses.replace(run, evaluation=EvaluationConfig.from_dict(values["evaluation"]))
+        limits = values.get("references")
+        return dataclasses.replace(
+            run,
+            evaluation=EvaluationConfig.from_dict(values["evaluation"]),
+            references=None if limits is None else _from_mapping(ReferenceConfig, limits, "references."),
+            variants=tuple(run.variants),
+        )
 
 
 def _from_mapping(cls: type[Settings], values: Mapping[str, Any], prefix: str) -> Settings:

@@ -18,6 +18,16 @@ class Similarity(NamedTuple):
         """Transforms points [..., 3]."""
         return self.scale * points @ self.rotation.T + self.translation
 
+    def apply_to_extrinsics(self, extrinsics: np.ndarray) -> np.ndarray:
+        """World-to-camera matrices [..., 3|4, 4] of the same cameras after `apply` has moved the world.
+
+        What a camera sees at depth d it then sees at depth `scale` * d.
+        """
+        moved = np.array(extrinsics, np.float64)
+        moved[..., :3, :3] = extrinsics[..., :3, :3] @ self.rotation.T
+        moved[..., :3, 3] = self.scale * extrinsics[..., :3, 3] - moved[..., :3, :3] @ self.translation
+        return moved
+
 
 def umeyama(source: np.ndarray, target: np.ndarray, weights: np.ndarray | None = None) -> Similarity:
     """Least-squares similarity that maps `source` [N, 3] onto `target` [N, 3] (Umeyama 1991).

@@ -1,5 +1,6 @@
 """Using the model: sources of frames, streams, reconstructions on disk, the viewer."""
 
+from logvggt_jax.inference.chunk_session import ChunkSession
 from logvggt_jax.inference.depth_files import read_depth, write_depth
 from logvggt_jax.inference.point_cloud import PointFilter, write_point_cloud
 from logvggt_jax.inference.reconstruct import Reconstruction, reconstruct
@@ -11,9 +12,12 @@ from logvggt_jax.inference.trajectory_files import (
     write_cameras,
     write_trajectory,
 )
+from logvggt_jax.model.chunks import ChunkPlan
 
 __all__ = [
     "Cameras",
+    "ChunkPlan",
+    "ChunkSession",
     "FolderSource",
     "FrameResult",
     "PointFilter",

@@ -23,6 +23,7 @@ from rich.text import Text
 
 from logvggt_jax.data.transforms import ResizeTransform, preprocess
 from logvggt_jax.geometry import decode_poses
+from logvggt_jax.inference.chunk_session import ChunkSession
 from logvggt_jax.inference.depth_files import (
     as_stored,
     depth_picture,
@@ -40,6 +41,7 @@ from logvggt_jax.inference.point_cloud import (
 from logvggt_jax.inference.session import Cameras, FrameResult, StreamSession
 from logvggt_jax.inference.sources import Source, open_source, read_ahead
 from logvggt_jax.inference.trajectory_files import write_cameras, write_trajectory
+from logvggt_jax.model.chunks import ChunkPlan
 from logvggt_jax.model.logvggt import LogVGGT, Variables
 
 CAMERAS_FILE = "cameras.json"
@@ -49,6 +51,8 @@ DEPTH_FOLDER = "depth"
 PREVIEW_FOLDER = "previews"
 
 _NARROWEST_FIELD_OF_VIEW = 0.01  # radians
+
+_Session = StreamSession | ChunkSession
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,6 +112,7 @@ def reconstruct(
     *,
     model: LogVGGT,
     variables: Variables,
+    chunks: ChunkPlan | None = None,
     longer_edge: int = 518,
     stride: int = 1,
     max_frames: int | None = None,
@@ -120,13 +125,15 @@ def reconstruct(
 
     Frames are read as they are needed, and depth maps are written as they become final; the frames are read a
     second time for the colours of the points, when all poses are final. Memory on device and host is constant but
-    for the compact tokens and the cameras.
+    for the compact tokens and the cameras; with `chunks` it is that of one chunk, and the cameras.
 
     Args:
       source_path: folder of images or video, see `open_source`.
       output: folder to make; it appears when all is done, until then the work lies in `<output>.partial`.
       model: the model.
       variables: {"params": …}.
+      chunks: plain VGGT on overlapping chunks instead of the model's windows, for public VGGT weights; see
+        `logvggt_jax.model.chunks`.
       longer_edge: size in pixels, a multiple of 14, to which the longer edge of the frames is resized; take
         what the model was trained with (518 for VGGT).
       stride: take every `stride`-th frame.
@@ -138,7 +145,8 @@ def reconstruct(
 
     Raises:
       FileExistsError: `output` exists.
-      FileNotFoundError, ValueError: bad source or parameters; nothing is left behind.
+      FileNotFoundError, ValueError: bad source or parameters, or chunks that cannot be aligned; nothing is left
+        behind.
     """
     point_filter = point_filter or PointFilter()
     if num_previews < 0:
@@ -159,7 +167,9 @@ def reconstruct(
         (folder / PREVIEW_FOLDER).mkdir()
         selection = PointSelection(point_filter)
         started = time.monotonic()
-        sequence, cameras = _stream(source, folder, model, variables, longer_edge, selection, bars)
+        session: _Session
+        session = StreamSession(model, variables) if chunks is None else ChunkSession(model, variables, chunks)
+        sequence, cameras = _stream(source, folder, session, longer_edge, selection, bars)
         seconds = time.monotonic() - started
         intrinsics = _write_all_cameras(folder, sequence, cameras)
         previews = set(np.linspace(0, len(sequence.names) - 1, num_previews).round().astype(int).tolist())
@@ -206,8 +216,7 @@ def _pictures(source: Source, longer_edge: int) -> Iterator[_Picture]:
 def _stream(
     source: Source,
     folder: Path,
-    model: LogVGGT,
-    variables: Variables,
+    session: _Session,
     longer_edge: int,
     selection: PointSelection,
     bars: Progress,
@@ -215,7 +224,6 @@ def _stream(
     """First pass: depth to disk, candidate points counted, cameras at the end."""
     names: list[str] = []
     timestamps: list[float] = []
-    session = StreamSession(model, variables)
     task = bars.add_task("Depth and cameras", total=source.expected_frames)
     transform = None
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from logvggt_jax.geometry import decode_poses
 from logvggt_jax.inference.token_store import TokenStore
+from logvggt_jax.model.gccr import RegisterKeys
 from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.model.refinement import trigger_range
 from logvggt_jax.model.windows import WindowState
@@ -58,6 +59,38 @@ class Cameras(NamedTuple):
     is_final: np.ndarray
 
 
+def checked_frames(
+    frames: np.ndarray | jax.Array | Sequence[np.ndarray], *, patch_size: int, before: np.ndarray | None
+) -> np.ndarray:
+    """Frames [n, H, W, 3] of one frame [H, W, 3] or several, fit for the model.
+
+    Args:
+      frames: uint8 or floating point in [0, 1].
+      patch_size: H and W must be multiples of it.
+      before: an earlier frame [H, W, 3] of the same stream, whose shape and dtype these must have.
+
+    Raises:
+      ValueError: another shape or dtype.
+    """
+    frames = np.asarray(frames)
+    frames = frames[None] if frames.ndim == 3 else frames
+    shape = frames.shape
+    if len(shape) != 4 or shape[-1] != 3 or 0 in shape:
+        raise ValueError(f"frames must have shape [n, H, W, 3] or [H, W, 3], got {shape}")
+    if shape[1] % patch_size or shape[2] % patch_size:
+        raise ValueError(
+            f"frames of {shape[1]} x {shape[2]} pixels: height and width must be multiples of {patch_size}; "
+            "logvggt_jax.preprocess resizes frames of any size"
+        )
+    if frames.dtype != np.uint8 and not np.issubdtype(frames.dtype, np.floating):
+        raise ValueError(f"frames must be uint8 or floating point in [0, 1], got dtype {frames.dtype}")
+    if before is not None and (before.shape != shape[1:] or before.dtype != frames.dtype):
+        raise ValueError(
+            f"frames of a stream must be alike: {before.dtype} {before.shape} before, now {frames.dtype} {shape[1:]}"
+        )
+    return frames
+
+
 # The model is hashable and static, so that all sessions of a model share their compiled programs.
 
 
@@ -78,12 +111,17 @@ def _finish(model: LogVGGT, variables: Variables, state: WindowState) -> WindowO
     return model.finish(variables, state)
 
 
+@functools.partial(jax.jit, static_argnums=0)
+def _project(model: LogVGGT, variables: Variables, register_tokens: jax.Array) -> RegisterKeys:
+    return model.project_registers(variables, register_tokens)
+
+
 @functools.partial(jax.jit, static_argnums=0, static_argnames="size")
 def _fire(
     model: LogVGGT,
     variables: Variables,
     camera_tokens: jax.Array,
-    register_tokens: jax.Array,
+    registers: jax.Array | RegisterKeys | None,
     refined: jax.Array,
     start: jax.Array,
     stop: jax.Array,
@@ -97,7 +135,10 @@ def _fire(
     settings, group = model.config.refinement, model.config.windows.stride
     seen = (jnp.arange(camera_tokens.shape[1]) < stop)[None]
     fresh = jax.lax.dynamic_slice_in_dim(camera_tokens, start, size, axis=1)
-    fresh = model.refine_tokens(variables, fresh, register_tokens, seen)
+    if isinstance(registers, RegisterKeys):
+        fresh = model.attend_registers(variables, fresh, registers, seen)
+    elif registers is not None:
+        fresh = model.refine_tokens(variables, fresh, registers, seen)
     refined = jax.lax.dynamic_update_slice_in_dim(refined, fresh, start, axis=1)
     if settings.context is None:
         decoded = model.decode_cameras(variables, refined, seen)
@@ -123,8 +164,8 @@ class StreamSession:
         cameras = session.cameras()
 
     The numbers are those of `model.apply` on the whole sequence, in every refinement mode. Device memory is
-    constant but for the camera and register tokens (20 kB a frame in VGGT-1B's size and bfloat16, twice that in
-    float32); the depth of a frame leaves the device as soon as it is final.
+    constant but for what refinement reads of every frame (49 kB in VGGT-1B's size; 82 kB with a period and float32
+    keys and values); the depth of a frame leaves the device as soon as it is final.
 
     Args:
       model: the model; `model.config.refinement` sets when poses become final.
@@ -143,7 +184,7 @@ class StreamSession:
         # Windows know nothing of refinement: sessions that differ in its mode share their programs.
         plain = dataclasses.replace(model.config.refinement, enabled=True, period=None, context=None)
         self._windows = LogVGGT(dataclasses.replace(model.config, refinement=plain))
-        self._store = TokenStore(chunk=chunk, keep_registers=model.config.refinement.enabled)
+        self._store = TokenStore(chunk=chunk)
         self._pending: list[np.ndarray] = []
         self._state: WindowState | None = None
         self._newest: np.ndarray | None = None
@@ -168,9 +209,8 @@ class StreamSession:
         """
         if self._closed:
             raise ValueError("this stream is closed: make another StreamSession for another sequence")
-        frames = np.asarray(frames)
-        frames = frames[None] if frames.ndim == 3 else frames
-        self._check(frames)
+        frames = checked_frames(frames, patch_size=self._model.config.encoder.patch_size, before=self._newest)
+        self._image_size = (frames.shape[1], frames.shape[2])
         results: list[FrameResult] = []
         for frame in frames:
             self._pending.append(frame)
@@ -197,9 +237,7 @@ class StreamSession:
 
     def cameras(self, *, provisional: bool = False) -> Cameras:
         """Cameras of the frames whose pose is final; with `provisional` of all frames whose depth is final."""
-        encodings = self._encodings
-        if provisional and len(encodings) < self.num_frames:
-            encodings = np.concatenate([encodings, self._refined_until(self.num_frames)[1]])
+        encodings = self._all_encodings(provisional=provisional)
         is_final = np.arange(len(encodings)) < len(self._encodings)
         size = self._image_size if len(encodings) else (1, 1)
         # A field of view of zero, which untrained models predict, is an infinite focal length.
@@ -207,25 +245,18 @@ class StreamSession:
             extrinsics, intrinsics = decode_poses(encodings, size)
         return Cameras(encodings, extrinsics, intrinsics, is_final)
 
-    def _check(self, frames: np.ndarray) -> None:
-        patch = self._model.config.encoder.patch_size
-        shape = frames.shape
-        if len(shape) != 4 or shape[-1] != 3 or 0 in shape:
-            raise ValueError(f"frames must have shape [n, H, W, 3] or [H, W, 3], got {shape}")
-        if shape[1] % patch or shape[2] % patch:
-            raise ValueError(
-                f"frames of {shape[1]} x {shape[2]} pixels: height and width must be multiples of {patch}; "
-                "logvggt_jax.preprocess resizes frames of any size"
-            )
-        if frames.dtype != np.uint8 and not np.issubdtype(frames.dtype, np.floating):
-            raise ValueError(f"frames must be uint8 or floating point in [0, 1], got dtype {frames.dtype}")
-        before = self._newest
-        if before is not None and (before.shape != shape[1:] or before.dtype != frames.dtype):
-            raise ValueError(
-                f"frames of a stream must be alike: {before.dtype} {before.shape} before, now {frames.dtype} "
-                f"{shape[1:]}"
-            )
-        self._image_size = (shape[1], shape[2])
+    def _all_encodings(self, *, provisional: bool) -> np.ndarray:
+        """Final pose encodings [N, 9]; with `provisional` those of all frames whose depth is final."""
+        if not provisional or len(self._encodings) == self.num_frames:
+            return self._encodings
+        return np.concatenate([self._encodings, self._refined_until(self.num_frames)[1]])
+
+    def _registers(self, register_tokens: jax.Array) -> jax.Array | RegisterKeys | None:
+        """What refinement will read of final frames: where it runs more than once, projected once."""
+        settings = self._model.config.refinement
+        if not settings.enabled:
+            return None
+        return register_tokens if settings.period is None else _project(self._model, self._variables, register_tokens)
 
     def _advance(self) -> list[FrameResult]:
         config = self._model.config.windows
@@ -259,24 +290,24 @@ class StreamSession:
         dense: list[tuple[np.ndarray | None, ...]] = []
         for out in outputs:
             valid = int(np.asarray(out.frame_mask).sum())
-            self._store.append(out.camera_tokens, out.register_tokens, valid)
+            self._store.append(out.camera_tokens, self._registers(out.register_tokens), valid)
             leaves = (out.depth, out.depth_confidence, out.points, out.points_confidence)
             arrays = [None if leaf is None else np.asarray(leaf) for leaf in leaves]
             dense += [tuple(None if a is None else a[0, i] for a in arrays) for i in range(valid)]
         self._fire_due_triggers()
-        cameras = self.cameras(provisional=self._provisional)
+        encodings = self._all_encodings(provisional=self._provisional)
         results = []
         for offset, (depth, confidence, points, points_confidence) in enumerate(dense):
             index = first + offset
-            known = index < len(cameras.is_final)
+            known = index < len(encodings)
             assert depth is not None and confidence is not None
             results.append(
                 FrameResult(
                     index=index,
                     depth=depth,
                     confidence=confidence,
-                    pose_encoding=cameras.pose_encoding[index] if known else None,
-                    pose_is_final=bool(known and cameras.is_final[index]),
+                    pose_encoding=encodings[index] if known else None,
+                    pose_is_final=index < len(self._encodings),
                     points=points,
                     points_confidence=points_confidence,
                 )

@@ -3,19 +3,28 @@
 from __future__ import annotations
 
 import functools
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 
+from logvggt_jax.model.gccr import RegisterKeys
+
+Tokens = TypeVar("Tokens")
+
 
 @functools.partial(jax.jit, donate_argnums=0)
-def _write(buffer: jax.Array, values: jax.Array, first: jax.Array) -> jax.Array:
-    return jax.lax.dynamic_update_slice_in_dim(buffer, values.astype(buffer.dtype), first, axis=1)
+def _write(buffers: Tokens, values: Tokens, first: jax.Array) -> Tokens:
+    return jax.tree.map(
+        lambda buffer, new: jax.lax.dynamic_update_slice_in_dim(buffer, new.astype(buffer.dtype), first, axis=1),
+        buffers,
+        values,
+    )
 
 
 @functools.partial(jax.jit, static_argnames="room")
-def _grown(buffer: jax.Array, *, room: int) -> jax.Array:
-    return jnp.pad(buffer, [(0, room if axis == 1 else 0) for axis in range(buffer.ndim)])
+def _grown(buffers: Tokens, *, room: int) -> Tokens:
+    return jax.tree.map(lambda x: jnp.pad(x, [(0, room if axis == 1 else 0) for axis in range(x.ndim)]), buffers)
 
 
 class TokenStore:
@@ -27,15 +36,16 @@ class TokenStore:
     Attributes:
       count: frames stored.
       camera: [1, capacity, 2C] float32.
-      registers: [1, capacity, 4, 2C] float32; None where refinement is off, which reads no registers.
+      registers: register tokens [1, capacity, 4, 2C] float32, or GCCR's keys and values of them, whichever is
+        appended; None where refinement is off, which reads no registers.
       refined: [1, capacity, 2C] float32, frames that a trigger has refined.
     """
 
-    def __init__(self, *, chunk: int, keep_registers: bool) -> None:
-        self._chunk, self._keep_registers = chunk, keep_registers
+    def __init__(self, *, chunk: int) -> None:
+        self._chunk = chunk
         self.count = 0
         self.camera: jax.Array | None = None
-        self.registers: jax.Array | None = None
+        self.registers: jax.Array | RegisterKeys | None = None
         self.refined: jax.Array | None = None
 
     @property
@@ -43,11 +53,11 @@ class TokenStore:
         """Frames that fit without growing."""
         return 0 if self.camera is None else self.camera.shape[1]
 
-    def append(self, camera: jax.Array, registers: jax.Array, valid: int) -> None:
-        """Adds the first `valid` of n frames: `camera` [1, n, 2C], `registers` [1, n, 4, 2C]."""
+    def append(self, camera: jax.Array, registers: jax.Array | RegisterKeys | None, valid: int) -> None:
+        """Adds the first `valid` of n frames: `camera` [1, n, 2C], `registers` [1, n, 4, 2C], of one kind always."""
         if self.camera is None:
             self.camera, self.refined = camera[:, :0], camera[:, :0]
-            self.registers = registers[:, :0] if self._keep_registers else None
+            self.registers = jax.tree.map(lambda x: x[:, :0], registers)
         # Padded frames are written too, so that the slice keeps one shape, and overwritten by the next call.
         self.reserve(self.count + camera.shape[1])
         first = jnp.int32(self.count)

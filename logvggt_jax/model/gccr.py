@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -10,37 +12,60 @@ from logvggt_jax.model.attention import attention
 from logvggt_jax.model.layers import dense, layer_norm
 
 
+class RegisterKeys(NamedTuple):
+    """Keys and values that frames' register tokens give to GCCR.
+
+    Those of a frame do not depend on other frames: a stream projects each frame once.
+
+    Attributes:
+      key: [B, M, 4, 2C] compute dtype.
+      value: [B, M, 4, 2C] compute dtype.
+    """
+
+    key: jax.Array
+    value: jax.Array
+
+
 class GCCR(nn.Module):
     """c' = c + O(Attn(Q(LN(c)), K(LN(R)), V(LN(R)))) (paper, equation of GCCR, with a residual).
 
     O starts at zero, so that a converted VGGT is unchanged.
     """
 
+    width: int
     num_heads: int
     dtype: str
     implementation: str
 
-    @nn.compact
+    def setup(self) -> None:
+        self.camera_norm = layer_norm(1e-5, "camera_norm")
+        self.register_norm = layer_norm(1e-5, "register_norm")
+        self.query = dense(self.width, "query", self.dtype)
+        self.key = dense(self.width, "key", self.dtype)
+        self.value = dense(self.width, "value", self.dtype)
+        self.output = dense(self.width, "output", self.dtype, kernel_init=nn.initializers.zeros_init())
+
     def __call__(self, camera_tokens: jax.Array, register_tokens: jax.Array, register_mask: jax.Array) -> jax.Array:
         """[B, N, 2C], [B, M, 4, 2C], bool [B, M] (False: a frame whose registers do not count) -> [B, N, 2C]."""
-        batch, _, width = camera_tokens.shape
-        per_frame = register_tokens.shape[2]
-        registers = register_tokens.reshape(batch, -1, width)
-        queries = layer_norm(1e-5, "camera_norm")(camera_tokens)
-        context = layer_norm(1e-5, "register_norm")(registers)
+        return self.attend(camera_tokens, self.project(register_tokens), register_mask)
 
-        def heads(tokens: jax.Array, name: str) -> jax.Array:
-            projected = dense(width, name, self.dtype)(tokens).astype(self.dtype)
-            return projected.reshape(*tokens.shape[:2], self.num_heads, width // self.num_heads)
+    def project(self, register_tokens: jax.Array) -> RegisterKeys:
+        """Keys and values of register tokens [B, M, 4, 2C]."""
+        normed = self.register_norm(register_tokens)
+        return RegisterKeys(self.key(normed).astype(self.dtype), self.value(normed).astype(self.dtype))
+
+    def attend(self, camera_tokens: jax.Array, registers: RegisterKeys, register_mask: jax.Array) -> jax.Array:
+        """Refined tokens [B, N, 2C] of camera tokens [B, N, 2C]; `register_mask` bool [B, M]."""
+        queries = self.query(self.camera_norm(camera_tokens)).astype(self.dtype)
+
+        def heads(tokens: jax.Array) -> jax.Array:
+            return tokens.reshape(len(tokens), -1, self.num_heads, self.width // self.num_heads)
 
         out = attention(
-            heads(queries, "query"),
-            heads(context, "key"),
-            heads(context, "value"),
-            jnp.repeat(register_mask, per_frame, axis=1),
+            heads(queries),
+            heads(registers.key),
+            heads(registers.value),
+            jnp.repeat(register_mask, registers.key.shape[2], axis=1),
             implementation=self.implementation,
         )
-        update = dense(width, "output", self.dtype, kernel_init=nn.initializers.zeros_init())(
-            out.reshape(camera_tokens.shape)
-        )
-        return camera_tokens + update.astype(jnp.float32)
+        return camera_tokens + self.output(out.reshape(camera_tokens.shape)).astype(jnp.float32)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
+from collections.abc import Callable
 from typing import Any
 
 import flax.linen as nn
@@ -18,13 +20,15 @@ from logvggt_jax.model.aggregator import Aggregator
 from logvggt_jax.model.camera_head import CameraHead
 from logvggt_jax.model.dinov2 import DinoV2
 from logvggt_jax.model.dpt_head import DPTHead, depth_activation, point_activation
-from logvggt_jax.model.gccr import GCCR
+from logvggt_jax.model.gccr import GCCR, RegisterKeys
 from logvggt_jax.model.windows import WindowState, num_windows
 from logvggt_jax.types import Predictions, WindowOutput
 
 Variables = dict[str, Any]
 
 _PATCH_TOKENS = "patch_tokens"
+# Pixels that a dense head takes at once, about 8 frames of 518 x 518: its maps are the model's largest.
+_DENSE_PIXELS = 8 * 518 * 518
 
 
 @dataclasses.dataclass(frozen=True)
@@ -184,7 +188,7 @@ class LogVGGT:
         config, batch, image_size = self.config, frames.shape[0], _image_size(frames)
         grid = self._grid(image_size)
         width, registers = config.encoder.embed_dim, config.aggregator.num_registers
-        patch_tokens = self._encode(variables, frames)
+        patch_tokens = self.encode(variables, frames)
         tokens = grid[0] * grid[1] + 1 + registers
 
         def zeros(shape: tuple[int, ...], dtype: Any) -> jax.Array:
@@ -226,29 +230,17 @@ class LogVGGT:
                 f"step continues a stream of {len(state.step)} x {state.image_size} images (batch, height and width), "
                 f"got {len(frames)} x {image_size}; start a new stream for other shapes"
             )
-        grid = self._grid(image_size)
-        fresh = self._encode(variables, frames)
+        fresh = self.encode(variables, frames)
         patch_tokens = jnp.concatenate([state.patch_tokens, fresh], axis=1)
         window_mask = jnp.concatenate([state.frame_mask, frame_mask], axis=1)
         is_first = state.step == 0
-        width = self.config.encoder.embed_dim
-        halves = slice(width, None) if self.config.windows.cache == "output" else slice(None, width)
-        key_tokens, special_tokens = _run(
-            self._aggregator,
-            variables["params"]["aggregator"],
-            patch_tokens,
-            window_mask,
-            state.key_tokens[..., halves],
-            state.frame_mask & ~is_first[:, None],
-            is_first,
-            grid=grid,
-        )
+        key_tokens, special_tokens = self.attend_window(variables, state, patch_tokens, window_mask)
         # An item that has ended shifts its held frames out instead.
         active = is_first | frame_mask.any(1)
         key_tokens = _select(active, key_tokens, _shift_in(state.key_tokens, stride, axis=2))
         special_tokens = _select(active, special_tokens, _shift_in(state.special_tokens, stride, axis=1))
         window_mask = _select(active, window_mask, _shift_in(state.frame_mask, stride, axis=1))
-        out = self._output(
+        out = self.decode_dense(
             variables,
             key_tokens[:, :, :stride],
             special_tokens[:, :stride],
@@ -267,7 +259,7 @@ class LogVGGT:
 
     def finish(self, variables: Variables, state: WindowState) -> WindowOutput:
         """The K − s frames that the last window still holds."""
-        return self._output(variables, state.key_tokens, state.special_tokens, state.frame_mask, state.image_size)
+        return self.decode_dense(variables, state.key_tokens, state.special_tokens, state.frame_mask, state.image_size)
 
     def refine(
         self,
@@ -309,6 +301,30 @@ class LogVGGT:
         params = variables["params"]["gccr"]
         return _run(self._gccr, params, camera_tokens, register_tokens, register_mask)
 
+    def project_registers(self, variables: Variables, register_tokens: jax.Array) -> RegisterKeys:
+        """GCCR's keys and values of register tokens [B, M, 4, 2C], frame by frame.
+
+        A stream that refines often projects each frame once; over again for every refinement, the cost a frame
+        would grow with the sequence.
+        """
+        width, registers = 2 * self.config.encoder.embed_dim, self.config.aggregator.num_registers
+        _check("register_tokens", register_tokens, (None, None, registers, width), jnp.floating)
+        return _run(self._gccr, variables["params"]["gccr"], register_tokens, method=GCCR.project)
+
+    def attend_registers(
+        self,
+        variables: Variables,
+        camera_tokens: jax.Array,
+        registers: RegisterKeys,
+        register_mask: jax.Array,
+    ) -> jax.Array:
+        """GCCR after `project_registers`: [B, N, 2C], M frames' keys and values, bool [B, M] -> [B, N, 2C]."""
+        width = 2 * self.config.encoder.embed_dim
+        _check("camera_tokens", camera_tokens, (len(registers.key), None, width), jnp.floating)
+        _check("register_mask", register_mask, registers.key.shape[:2], jnp.bool_)
+        params = variables["params"]["gccr"]
+        return _run(self._gccr, params, camera_tokens, registers, register_mask, method=GCCR.attend)
+
     def decode_cameras(self, variables: Variables, camera_tokens: jax.Array, camera_mask: jax.Array) -> jax.Array:
         """Camera head alone: refined tokens [B, N, 2C], bool [B, N] -> pose encodings [B, N, R, 9]."""
         _check("camera_tokens", camera_tokens, (None, None, 2 * self.config.encoder.embed_dim), jnp.floating)
@@ -347,18 +363,97 @@ class LogVGGT:
     ) -> jax.Array:
         """Pose encodings [B, T, R, 9] of whole sequences in the configured mode: full, periodic or online."""
         settings = self.config.refinement
+        registers = self.project_registers(variables, register_tokens) if settings.enabled else None
+
+        def refine_tokens(tokens: jax.Array, register_mask: jax.Array) -> jax.Array:
+            return tokens if registers is None else self.attend_registers(variables, tokens, registers, register_mask)
+
         return refinement.refine_sequence(
-            functools.partial(self.refine_tokens, variables),
+            refine_tokens,
             functools.partial(self.decode_cameras, variables),
             camera_tokens,
-            register_tokens,
             frame_mask,
             period=settings.period,
             context=settings.context,
             group=self.config.windows.stride,
         )
 
-    # Parts.
+    # Parts of a step.
+
+    def encode(self, variables: Variables, images: jax.Array) -> jax.Array:
+        """Patch tokens [B, n, h * w, C] float32 of images [B, n, H, W, 3]; frames are independent."""
+        params = variables["params"]["encoder"]
+        if self.config.encoder.frozen:
+            # At the source: nothing of the encoder's pass is then kept for a backward pass.
+            params = jax.lax.stop_gradient(params)
+        pixels = jnp.asarray(images, jnp.float32) / (255.0 if images.dtype == jnp.uint8 else 1.0)
+        tokens = _run(self._encoder, params, pixels.reshape(-1, *images.shape[2:]))
+        return checkpoint_name(tokens.reshape(*images.shape[:2], *tokens.shape[1:]), _PATCH_TOKENS)
+
+    def attend_window(
+        self, variables: Variables, state: WindowState, patch_tokens: jax.Array, window_mask: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """All attention blocks over one window.
+
+        Args:
+          variables: {"params": …}.
+          state: of the stream before the window, whose cache the key layers see.
+          patch_tokens: [B, K, h * w, C] of the window's frames.
+          window_mask: bool [B, K], False for padding.
+
+        Returns:
+          Key-layer tokens [B, key layers, K, P, 2C] in the compute dtype; special tokens [B, K, 5, 2C] float32.
+        """
+        is_first = state.step == 0
+        width = self.config.encoder.embed_dim
+        halves = slice(width, None) if self.config.windows.cache == "output" else slice(None, width)
+        return _run(
+            self._aggregator,
+            variables["params"]["aggregator"],
+            patch_tokens,
+            window_mask,
+            state.key_tokens[..., halves],
+            state.frame_mask & ~is_first[:, None],
+            is_first,
+            grid=self._grid(state.image_size),
+        )
+
+    def decode_dense(
+        self,
+        variables: Variables,
+        key_tokens: jax.Array,
+        special_tokens: jax.Array,
+        frame_mask: jax.Array,
+        image_size: tuple[int, int],
+    ) -> WindowOutput:
+        """Dense heads over key-layer tokens [B, key layers, n, P, 2C] of n frames, which are independent."""
+        params, grid = variables["params"], self._grid(image_size)
+        batch, num_levels, count = key_tokens.shape[:3]
+        patches = key_tokens[..., 1 + self.config.aggregator.num_registers :, :]
+        levels = [patches[:, i].reshape(batch * count, *patches.shape[3:]) for i in range(num_levels)]
+
+        def dense(head: DPTHead, name: str) -> jax.Array:
+            def frames(levels: list[jax.Array]) -> jax.Array:
+                return _run(head, params[name], levels, grid=grid, image_size=image_size)
+
+            raw = _in_groups(frames, levels, max(1, _DENSE_PIXELS // math.prod(image_size)))
+            return raw.reshape(batch, count, *raw.shape[1:])
+
+        depth, depth_confidence = depth_activation(dense(self._depth_head, "depth_head"))
+        points = points_confidence = None
+        if self.config.point_head is not None:
+            points, points_confidence = point_activation(dense(self._point_head, "point_head"))
+        return WindowOutput(
+            depth=depth,
+            depth_confidence=depth_confidence,
+            camera_tokens=special_tokens[:, :, 0],
+            register_tokens=special_tokens[:, :, 1:],
+            frame_mask=frame_mask,
+            points=points,
+            points_confidence=points_confidence,
+        )
+
+    # Modules.
 
     @property
     def _encoder(self) -> DinoV2:
@@ -384,7 +479,8 @@ class LogVGGT:
 
     @property
     def _gccr(self) -> GCCR:
-        return GCCR(self.config.refinement.num_heads, self.config.dtype, self.config.attention)
+        width = 2 * self.config.encoder.embed_dim
+        return GCCR(width, self.config.refinement.num_heads, self.config.dtype, self.config.attention)
 
     @property
     def _overlap(self) -> int:
@@ -393,48 +489,6 @@ class LogVGGT:
     def _grid(self, image_size: tuple[int, int]) -> tuple[int, int]:
         patch = self.config.encoder.patch_size
         return image_size[0] // patch, image_size[1] // patch
-
-    def _encode(self, variables: Variables, images: jax.Array) -> jax.Array:
-        """Patch tokens [B, n, h * w, C] float32 of images [B, n, H, W, 3]."""
-        params = variables["params"]["encoder"]
-        if self.config.encoder.frozen:
-            # At the source: nothing of the encoder's pass is then kept for a backward pass.
-            params = jax.lax.stop_gradient(params)
-        pixels = jnp.asarray(images, jnp.float32) / (255.0 if images.dtype == jnp.uint8 else 1.0)
-        tokens = _run(self._encoder, params, pixels.reshape(-1, *images.shape[2:]))
-        return checkpoint_name(tokens.reshape(*images.shape[:2], *tokens.shape[1:]), _PATCH_TOKENS)
-
-    def _output(
-        self,
-        variables: Variables,
-        key_tokens: jax.Array,
-        special_tokens: jax.Array,
-        frame_mask: jax.Array,
-        image_size: tuple[int, int],
-    ) -> WindowOutput:
-        """Dense heads over key-layer tokens [B, key layers, n, P, 2C] of n frames."""
-        params, grid = variables["params"], self._grid(image_size)
-        batch, num_levels, count = key_tokens.shape[:3]
-        patches = key_tokens[..., 1 + self.config.aggregator.num_registers :, :]
-        levels = [patches[:, i].reshape(batch * count, *patches.shape[3:]) for i in range(num_levels)]
-
-        def dense(head: DPTHead, name: str) -> jax.Array:
-            raw = _run(head, params[name], levels, grid=grid, image_size=image_size)
-            return raw.reshape(batch, count, *raw.shape[1:])
-
-        depth, depth_confidence = depth_activation(dense(self._depth_head, "depth_head"))
-        points = points_confidence = None
-        if self.config.point_head is not None:
-            points, points_confidence = point_activation(dense(self._point_head, "point_head"))
-        return WindowOutput(
-            depth=depth,
-            depth_confidence=depth_confidence,
-            camera_tokens=special_tokens[:, :, 0],
-            register_tokens=special_tokens[:, :, 1:],
-            frame_mask=frame_mask,
-            points=points,
-            points_confidence=points_confidence,
-        )
 
     def _check_images(self, images: jax.Array, name: str) -> None:
         patch = self.config.encoder.patch_size
@@ -470,6 +524,22 @@ class LogVGGT:
 def _run(module: nn.Module, params: Any, *inputs: Any, **options: Any) -> Any:
     """A linen module as a pure function of its own parameters."""
     return module.apply({"params": params}, *inputs, **options)
+
+
+def _in_groups(function: Callable[[Any], jax.Array], inputs: Any, at_most: int) -> jax.Array:
+    """`function` of arrays [N, ...] that it treats item by item, at most so many items at a time."""
+    count = len(jax.tree.leaves(inputs)[0])
+    groups = -(-count // at_most)
+    if groups == 1:
+        return function(inputs)
+    size = -(-count // groups)
+
+    def split(x: jax.Array) -> jax.Array:
+        x = jnp.pad(x, [(0, groups * size - count), *[(0, 0)] * (x.ndim - 1)])
+        return x.reshape(groups, size, *x.shape[1:])
+
+    out = jax.lax.map(function, jax.tree.map(split, inputs))
+    return out.reshape(groups * size, *out.shape[2:])[:count]
 
 
 def _check(name: str, array: jax.Array, shape: tuple[int | None, ...], kind: Any) -> None:

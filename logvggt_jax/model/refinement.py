@@ -10,7 +10,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-RefineTokens = Callable[[jax.Array, jax.Array, jax.Array], jax.Array]
+RefineTokens = Callable[[jax.Array, jax.Array], jax.Array]
 DecodeCameras = Callable[[jax.Array, jax.Array], jax.Array]
 
 
@@ -65,7 +65,6 @@ def refine_sequence(
     refine_tokens: RefineTokens,
     decode_cameras: DecodeCameras,
     camera_tokens: jax.Array,
-    register_tokens: jax.Array,
     frame_mask: jax.Array,
     *,
     period: int | None,
@@ -75,10 +74,10 @@ def refine_sequence(
     """Pose encodings [B, T, R, 9] of a whole sequence, whatever the mode.
 
     Args:
-      refine_tokens: GCCR, ([B, n, 2C], [B, T, 4, 2C], bool [B, T]) -> [B, n, 2C].
+      refine_tokens: GCCR over the sequence's registers, ([B, n, 2C], bool [B, T] frames whose registers count) ->
+        [B, n, 2C].
       decode_cameras: camera head, ([B, n, 2C], bool [B, n]) -> [B, n, R, 9].
       camera_tokens: [B, T, 2C].
-      register_tokens: [B, T, 4, 2C].
       frame_mask: bool [B, T], True … True False … False.
       period: frames between triggers, None for one at the end.
       context: frames that the trunk sees beside frame 0, None for all so far.
@@ -87,7 +86,7 @@ def refine_sequence(
     num_frames = camera_tokens.shape[1]
     step = num_frames if period is None else min(period, num_frames)
     if step == num_frames and context is None:
-        refined = refine_tokens(camera_tokens, register_tokens, frame_mask)
+        refined = refine_tokens(camera_tokens, frame_mask)
         return decode_cameras(refined, frame_mask)
 
     triggers = num_triggers(num_frames, step)
@@ -105,7 +104,7 @@ def refine_sequence(
         start = trigger * step
         stop = jnp.minimum(start + step, num_frames)
         fresh = jax.lax.dynamic_slice_in_dim(tokens, start, step, axis=1)
-        fresh = refine_tokens(fresh, register_tokens, frame_mask & (order[:num_frames] < stop))
+        fresh = refine_tokens(fresh, frame_mask & (order[:num_frames] < stop))
         refined = jax.lax.dynamic_update_slice_in_dim(refined, fresh, start, axis=1)
         if context is None:
             decoded = decode_cameras(refined, mask & (order < stop))

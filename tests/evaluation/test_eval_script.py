@@ -32,6 +32,7 @@ def run_eval(*arguments: str) -> subprocess.CompletedProcess[str]:
         (["--checkpoint=does-not-exist"], "does-not-exist"),
         (["--config.evaluation.stride=0"], "stride must be at least 1"),
         (["--config=configs/eval/seven_scenes.py", "--data_root=no-data"], "no-data: no such folder"),
+        (["--config.references.chunk_overlap=12"], "below the chunk size 12, got 12"),
     ],
 )
 def test_wrong_arguments_are_one_line(arguments: list[str], message: str, tmp_path: Path) -> None:
@@ -88,7 +89,7 @@ def test_an_evaluation_leaves_tables_json_and_figures(
         (frames, method["name"]) for frames in (4, 6) for method in results["methods"]
     }
     depths = [entry["scale/abs_rel"] for entry in results["summary"] if entry["method"] != "static camera"]
-    assert len(depths) == 8
+    assert len(depths) == 2 * 6
     assert all(error > 0 for error in depths)
     report = (tmp_path / "out" / "report.md").read_text()
     assert results["command"] in report

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from logvggt_jax.evaluation.plots import depth_panel, trajectory_plot
+from logvggt_jax.evaluation.plots import depth_panel, efficiency_plot, trajectory_plot
 
 
 def poses(count: int) -> np.ndarray:
@@ -54,3 +54,21 @@ def test_a_clip_without_valid_depth_can_be_drawn(tmp_path: Path) -> None:
     nothing = np.zeros((1, 14, 28), np.float32)
     depth_panel(tmp_path / "none.png", np.zeros((1, 14, 28, 3), np.uint8), nothing, nothing + 1)
     assert (tmp_path / "none.png").stat().st_size > 1000
+
+
+def test_efficiency_shows_rates_and_parts(tmp_path: Path) -> None:
+    """Bars of a part are as tall as its share: twice the seconds, about twice the pixels of its colour."""
+    speed = [
+        {"mode": mode, "frames": n, "frames_per_second": [8.0, 9.0, 10.0]} for mode in ("a", "b") for n in (10, 20)
+    ]
+
+    def brown_pixels(name: str, seconds: float) -> int:
+        rows = [{"name": str(i), "seconds": 0.0} for i in range(5)] + [{"name": "last", "seconds": seconds}]
+        rows[0]["seconds"] = 4.0 - seconds
+        efficiency_plot(tmp_path / name, {"device": "d", "speed": speed, "part_frames": 20, "parts": {"a": rows}})
+        blue, green, red = np.moveaxis(cv2.imread(str(tmp_path / name)).astype(int), -1, 0)
+        return int(((abs(red - 140) < 8) & (abs(green - 86) < 8) & (abs(blue - 75) < 8)).sum())
+
+    one, two = brown_pixels("one.png", 1.0), brown_pixels("two.png", 2.0)
+    assert one > 5000
+    assert 1.8 < two / one < 2.2

@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from logvggt_jax.geometry import Similarity, quaternion_to_matrix, robust_similarity, umeyama
+from logvggt_jax.geometry import (
+    Similarity,
+    as_matrix,
+    quaternion_to_matrix,
+    robust_similarity,
+    transform_points,
+    umeyama,
+)
 
 TRUTH = Similarity(2.5, quaternion_to_matrix(np.array([0.3, -0.5, 0.2, 0.8])), np.array([1.0, -2.0, 3.0]))
 
@@ -67,3 +74,12 @@ def test_degenerate_points_are_refused(source: np.ndarray, message: str) -> None
     with pytest.raises(ValueError, match=message) as error:
         umeyama(source, source)
     assert "\n" not in str(error.value)
+
+
+def test_cameras_move_with_their_world() -> None:
+    """A point's place in a camera is the same as before, in the new unit."""
+    pose = np.concatenate([quaternion_to_matrix(np.array([0.1, 0.7, 0.2, -0.4])), [[0.5], [-1.0], [2.0]]], axis=1)
+    moved = TRUTH.apply_to_extrinsics(pose)
+    seen, before = transform_points(moved, TRUTH.apply(points())), transform_points(pose, points())
+    np.testing.assert_allclose(seen, TRUTH.scale * before, atol=1e-12)
+    np.testing.assert_allclose(TRUTH.apply_to_extrinsics(as_matrix(pose)), as_matrix(moved), atol=1e-12)

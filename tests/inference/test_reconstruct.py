@@ -21,6 +21,8 @@ from logvggt_jax.inference.room_sequence import write_room_sequence
 from logvggt_jax.inference.session import StreamSession
 from logvggt_jax.inference.sources import open_source
 from logvggt_jax.inference.trajectory_files import read_cameras, read_trajectory
+from logvggt_jax.model.chunks import ChunkPlan
+from logvggt_jax.model.plain_vggt import predict_plain
 
 # The package exports a function of the module's name.
 reconstruct_module = importlib.import_module("logvggt_jax.inference.reconstruct")
@@ -224,6 +226,26 @@ def test_few_frames_are_alive_at_a_time(
     assert len(made) == 80
     # A window, the frame at hand and the one read ahead.
     assert max(alive) <= 6
+
+
+def test_chunks_of_the_whole_sequence_are_plain_vggt(
+    model: LogVGGT, variables: dict, room: Path, tmp_path: Path, expected: dict
+) -> None:
+    result = reconstruct(
+        room,
+        tmp_path / "out",
+        model=model,
+        variables=variables,
+        chunks=ChunkPlan(COUNT, 3),
+        longer_edge=LONGER_EDGE,
+        num_previews=0,
+        progress=False,
+    )
+    plain = predict_plain(model, variables, expected["images"])
+    cameras = read_cameras(result.folder / "cameras.json")
+    np.testing.assert_allclose([f["extrinsics"] for f in cameras["frames"]], plain.extrinsics, rtol=1e-5, atol=1e-5)
+    depth, _ = read_depth(result.folder / "depth" / "frame-000006.npz")
+    np.testing.assert_allclose(depth, as_stored(plain.depth[6], plain.depth_confidence[6])[0], rtol=1e-3)
 
 
 def test_bad_arguments_are_named(

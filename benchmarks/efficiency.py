@@ -1,0 +1,350 @@
+"""What a stream costs on this device: frames a second by length, time and operations by part, latency, memory.
+
+    python benchmarks/efficiency.py --output runs/efficiency
+    python benchmarks/efficiency.py --checkpoint models/vggt-1b --image-size 392x518 --dtype bfloat16 --output runs/1b
+
+Without a checkpoint the model is that of configs/tiny.py with random parameters; values do not matter to the time.
+Frames are uint8 pictures in host memory and depth goes back to it, both within the time; reading and resizing files is
+not. Depth is decoded for every frame. Every program is compiled and run once before it counts. Tables are printed;
+efficiency.json and efficiency.png go into the output folder. XLA_PYTHON_CLIENT_PREALLOCATE=false is set, so that peak
+memory means something.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+import platform
+import shlex
+import statistics
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from logvggt_jax import LogVGGT, ModelConfig, load_model
+from logvggt_jax.evaluation.efficiency import (
+    PARTS,
+    PartTime,
+    flops_by_part,
+    live_device_bytes,
+    matmul_flops_per_second,
+    peak_device_bytes,
+    peak_host_bytes,
+    sequence_parts,
+    spread,
+    time_part,
+)
+from logvggt_jax.evaluation.plots import efficiency_plot
+from logvggt_jax.inference import StreamSession
+
+MIB = 2**20
+# Distinct pictures; a stream shows them in turn.
+PICTURES = 16
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """One stream: seconds in all, until the first result, of each step; most bytes of arrays alive between frames."""
+
+    seconds: float
+    first_result: float
+    steps: list[float]
+    live_bytes: int
+
+
+def configurations(base: ModelConfig, context: int) -> dict[str, ModelConfig]:
+    """The modes: GCCR once at the end or after every window, the trunk over all frames or limited."""
+
+    def refined(period: int | None, context: int | None) -> ModelConfig:
+        settings = dataclasses.replace(base.refinement, enabled=True, period=period, context=context)
+        return dataclasses.replace(base, refinement=settings)
+
+    return {
+        "full": refined(None, None),
+        "full+context": refined(None, context),
+        "online": refined(base.windows.stride, None),
+        "online+context": refined(base.windows.stride, context),
+    }
+
+
+def stream(model: LogVGGT, variables: Any, pictures: np.ndarray, num_frames: int, *, watch: bool = False) -> Run:
+    """Sends frames through a session; `watch` looks at memory between them, which takes time of its own."""
+    session = StreamSession(model, variables)
+    steps: list[float] = []
+    first_result, live = 0.0, 0
+    started = time.perf_counter()
+    for index in range(num_frames):
+        pushed = time.perf_counter()
+        results = session.push(pictures[index % PICTURES])
+        if results:
+            steps.append(time.perf_counter() - pushed)
+            first_result = first_result or time.perf_counter() - started
+        if watch:
+            live = max(live, live_device_bytes())
+    session.close()
+    session.cameras()
+    return Run(time.perf_counter() - started, first_result, steps, live)
+
+
+def speed(
+    models: dict[str, LogVGGT], variables: Any, pictures: np.ndarray, lengths: list[int], rounds: int
+) -> list[dict[str, Any]]:
+    """Frames a second of every mode at every length, shortest first, so that peaks of memory can be read off."""
+    rows = []
+    for length in sorted(lengths):
+        for mode, model in models.items():
+            warm = stream(model, variables, pictures, length, watch=True)
+            runs = [stream(model, variables, pictures, length) for _ in range(rounds)]
+            rows.append(
+                {
+                    "mode": mode,
+                    "frames": length,
+                    "frames_per_second": [length / run.seconds for run in runs],
+                    "first_result_seconds": statistics.median(run.first_result for run in runs),
+                    "step_seconds": statistics.median(step for run in runs for step in run.steps),
+                    "step_seconds_95": float(np.percentile([step for run in runs for step in run.steps], 95)),
+                    "compilation_seconds": warm.seconds - statistics.median(run.seconds for run in runs),
+                    "live_device_bytes": warm.live_bytes,
+                    "peak_device_bytes": peak_device_bytes(),
+                    "peak_host_bytes": peak_host_bytes(),
+                }
+            )
+    return rows
+
+
+def ratios(models: dict[str, LogVGGT], variables: Any, pictures: np.ndarray, pairs: int, lengths: list[int]) -> Any:
+    """Frames a second at the longest over those at the shortest length; the two take turns."""
+    short, long = min(lengths), max(lengths)
+    found: dict[str, list[float]] = {mode: [] for mode in models}
+    for mode, model in models.items():
+        for _ in range(pairs):
+            rates = [n / stream(model, variables, pictures, n).seconds for n in (short, long)]
+            found[mode].append(rates[1] / rates[0])
+    return {"short": short, "long": long, "ratios": found}
+
+
+def transfer(pictures: np.ndarray, stride: int) -> dict[str, float]:
+    """Milliseconds a frame to the device (uint8 picture) and back (depth and confidence), median of 20."""
+    frames = np.ascontiguousarray(pictures[None, :stride])
+    height, width = frames.shape[2:4]
+    there, back = [], []
+    for _ in range(20):
+        started = time.perf_counter()
+        jax.block_until_ready(jax.device_put(frames))
+        there.append(time.perf_counter() - started)
+        depth = jax.block_until_ready(jnp.zeros((stride, 2, height, width)) + len(back))
+        started = time.perf_counter()
+        np.asarray(depth)
+        back.append(time.perf_counter() - started)
+    return {
+        "to_device_ms": 1e3 * statistics.median(there) / stride,
+        "to_host_ms": 1e3 * statistics.median(back) / stride,
+    }
+
+
+def describe_device() -> str:
+    """The default device by name; of a CPU its model and cores, where the system tells."""
+    device = jax.devices()[0]
+    if device.platform != "cpu":
+        return f"{device.device_kind} ({device.platform}), host with {os.cpu_count()} cores"
+    information = Path("/proc/cpuinfo")
+    lines = information.read_text().splitlines() if information.is_file() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return f"{names[0] if names else platform.machine()}, {os.cpu_count()} cores"
+
+
+def by_part(model: LogVGGT, variables: Any, length: int, image_size: tuple[int, int], rounds: int) -> list[PartTime]:
+    """Times of all programs of a sequence, each one alone."""
+    return [time_part(part, variables, rounds=rounds) for part in sequence_parts(model, length, image_size)]
+
+
+def print_tables(console: Console, report: dict[str, Any]) -> None:
+    """All numbers of the report."""
+    table = Table("mode", "frames", "frames/s", "first result", "step", "step, 95 %", "compilation", title="Speed")
+    for row in report["speed"]:
+        table.add_row(
+            row["mode"],
+            str(row["frames"]),
+            spread(row["frames_per_second"]),
+            f"{row['first_result_seconds'] * 1e3:.1f} ms",
+            f"{row['step_seconds'] * 1e3:.1f} ms",
+            f"{row['step_seconds_95'] * 1e3:.1f} ms",
+            f"{row['compilation_seconds']:.1f} s",
+        )
+    console.print(table)
+    table = Table("mode", "frames", "live on device", "peak on device", "peak on host", title="Memory (MiB)")
+    for row in report["speed"]:
+        peak = row["peak_device_bytes"]
+        table.add_row(
+            row["mode"],
+            str(row["frames"]),
+            f"{row['live_device_bytes'] / MIB:.1f}",
+            "not reported by this device" if peak is None else f"{peak / MIB:.0f}",
+            f"{row['peak_host_bytes'] / MIB:.0f}",
+        )
+    console.print(table)
+    for mode, values in report["pairs"]["ratios"].items():
+        short, long = report["pairs"]["short"], report["pairs"]["long"]
+        console.print(
+            f"{mode}: frames/s at {long} over {short}: median {spread(values)} of {len(values)} interleaved pairs"
+        )
+    for mode, parts in report["parts"].items():
+        total = sum(part["seconds"] for part in parts)
+        operations = sum(part["flops"] for part in parts)
+        table = Table(
+            "part",
+            "time (ms)",
+            "share",
+            "GFLOP a frame",
+            "share",
+            "achieved / peak",
+            "temporaries (MiB)",
+            "compilation (s)",
+            title=f"Parts of {report['part_frames']} frames, {mode}",
+        )
+        for part in parts:
+            achieved = part["flops"] / part["seconds"] / report["matmul_flops_per_second"] if part["seconds"] else 0.0
+            table.add_row(
+                part["name"],
+                f"{part['seconds'] * 1e3:,.1f}",
+                f"{part['seconds'] / total:.2%}",
+                f"{part['flops'] / report['part_frames'] / 1e9:.4f}",
+                f"{part['flops'] / operations:.3%}",
+                f"{achieved:.1%}",
+                f"{part['temporary_bytes'] / MIB:.1f}",
+                f"{part['compilation_seconds']:.1f}",
+            )
+        table.add_row("all", f"{total * 1e3:,.1f}", "", f"{operations / report['part_frames'] / 1e9:.4f}", style="bold")
+        console.print(table)
+    table = Table("mode", *(f"{n} frames" for n in report["lengths"]), "last / first", title="GFLOP a frame")
+    for mode, counts in report["flops_per_frame"].items():
+        values = [counts[str(n)] for n in report["lengths"]]
+        table.add_row(mode, *(f"{value / 1e9:.4f}" for value in values), f"{values[-1] / values[0]:.4f}")
+    console.print(table)
+    rate = report["achieved_flops_per_second"]
+    peak = report["matmul_flops_per_second"]
+    for mode, value in rate.items():
+        console.print(
+            f"{mode}: {value / 1e9:.2f} GFLOP/s of {peak / 1e9:.1f} measured in matrix products, {value / peak:.1%}"
+        )
+    console.print(
+        "host and device: {to_device_ms:.3f} ms a frame there, {to_host_ms:.3f} ms back".format(**report["transfer"])
+    )
+
+
+def measure(options: argparse.Namespace) -> dict[str, Any]:
+    """The whole report, JSON types."""
+    if options.checkpoint is None:
+        from configs import tiny
+
+        base, variables = ModelConfig.from_dict(tiny.get_config().to_dict()["model"]), None
+    else:
+        loaded, variables = load_model(options.checkpoint)
+        base = loaded.config
+    base = dataclasses.replace(base, dtype=options.dtype or base.dtype)
+    if variables is None:
+        variables = LogVGGT(base).init(jax.random.key(0), jnp.zeros((1, 1, *options.image_size, 3), jnp.uint8))
+    variables = jax.device_put(variables)
+    context = options.context or base.windows.size
+    known = {mode: LogVGGT(config) for mode, config in configurations(base, context).items()}
+    models = {mode: known[mode] for mode in options.modes}
+    lengths = sorted(options.lengths)
+    pictures = np.random.default_rng(0).integers(0, 256, (PICTURES, *options.image_size, 3), np.uint8)
+    # Counts first: they need no quiet machine, and their memory is gone before peaks are read.
+    flops = {mode: {n: flops_by_part(model, n, options.image_size) for n in lengths} for mode, model in known.items()}
+    rows = speed(models, variables, pictures, lengths, options.rounds)
+    longest = lengths[-1]
+    parts: dict[str, list[dict[str, Any]]] = {}
+    for mode, model in models.items():
+        times = by_part(model, variables, longest, options.image_size, options.rounds)
+        parts[mode] = [
+            {
+                "name": name,
+                "seconds": sum(t.calls * t.median for t in times if t.name == name),
+                "compilation_seconds": sum(t.compilation for t in times if t.name == name),
+                "temporary_bytes": max((t.temporary_bytes for t in times if t.name == name), default=0),
+                "flops": flops[mode][longest][name],
+            }
+            for name in PARTS
+        ]
+    rates = {row["mode"]: statistics.median(row["frames_per_second"]) for row in rows if row["frames"] == longest}
+    per_frame = {mode: {str(n): sum(c.values()) / n for n, c in counts.items()} for mode, counts in flops.items()}
+    return {
+        "command": shlex.join(["python", *sys.argv]),
+        "device": describe_device(),
+        "jax": jax.__version__,
+        "model": base.to_dict(),
+        "image_size": list(options.image_size),
+        "context": context,
+        "lengths": lengths,
+        "speed": rows,
+        "pairs": ratios(models, variables, pictures, options.pairs, lengths),
+        "part_frames": longest,
+        "parts": parts,
+        "flops_per_frame": per_frame,
+        "matmul_flops_per_second": matmul_flops_per_second(base.dtype),
+        # Of the online mode with an unlimited trunk a stream runs less than `apply`, whose parts are counted: its
+        # trunk sees the frames so far.
+        "achieved_flops_per_second": {
+            mode: rates[mode] * per_frame[mode][str(longest)] for mode in models if mode != "online"
+        },
+        "transfer": transfer(pictures, base.windows.stride),
+    }
+
+
+def _size(text: str) -> tuple[int, int]:
+    height, separator, width = text.partition("x")
+    if not (separator and height.isdecimal() and width.isdecimal()) or int(height) % 14 or int(width) % 14:
+        raise argparse.ArgumentTypeError(f"expected height x width in multiples of 14 such as 56x70, got {text!r}")
+    return int(height), int(width)
+
+
+def main() -> None:
+    """Measures, prints, writes."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--checkpoint", type=Path, help="model folder; default configs/tiny.py's model, random")
+    parser.add_argument("--image-size", type=_size, default=(56, 70), metavar="HxW", help="default 56x70")
+    parser.add_argument("--lengths", type=int, nargs="+", default=[100, 200, 500, 1000], help="frames of the streams")
+    parser.add_argument(
+        "--modes",
+        nargs="+",
+        choices=("full", "full+context", "online", "online+context"),
+        default=["full", "online", "online+context"],
+        help="GCCR once at the end or after every window; +context: the camera head sees --context frames, not all",
+    )
+    parser.add_argument("--context", type=int, help="refinement.context of the limited modes; default the window size")
+    parser.add_argument("--rounds", type=int, default=3, help="streams of every length and mode")
+    parser.add_argument("--pairs", type=int, default=5, help="interleaved streams of the shortest and longest length")
+    parser.add_argument("--dtype", choices=("float32", "bfloat16"), help="compute type instead of the model's own")
+    parser.add_argument("--output", type=Path, default=Path("runs/efficiency"), help="folder of JSON and plot")
+    options = parser.parse_args()
+    console = Console()
+    console.width = max(console.width, 128)
+    report = measure(options)
+    windows = report["model"]["windows"]
+    height, width = report["image_size"]
+    console.print(
+        f"{report['device']}, {report['model']['dtype']}, {width} x {height} pixels, K = {windows['size']}, stride "
+        f"{windows['stride']}, trunk limited to {report['context']} frames where it is, batch 1"
+    )
+    print_tables(console, report)
+    options.output.mkdir(parents=True, exist_ok=True)
+    (options.output / "efficiency.json").write_text(json.dumps(report, indent=1) + "\n")
+    efficiency_plot(options.output / "efficiency.png", report)
+    console.print(f"efficiency.json and efficiency.png are in {options.output}/")
+
+
+if __name__ == "__main__":
+    main()

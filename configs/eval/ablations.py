@@ -1,0 +1,55 @@
+"""Ablations of one checkpoint at the paper's 10 and 200 frames, beside VGGT offline and on chunks.
+
+    python eval.py --config=configs/eval/ablations.py --checkpoint=runs/tiny/model --output=runs/ablations
+
+Every variant is run twice, with the camera head's trunk over all frames and limited to the window's size: over all
+frames it is a global path of its own, which hides what the parts do. Another data set:
+
+    python eval.py --config=configs/eval/ablations.py --config.dataset=seven_scenes --config.split=all \
+        --config.evaluation.stride=1 --data_root=7scenes --checkpoint=runs/tiny/model --output=runs/ablations-7scenes
+"""
+
+from ml_collections import ConfigDict
+
+
+def get_config() -> ConfigDict:
+    config = ConfigDict()
+    config.title = "Ablations"
+    config.dataset = "rooms"
+    config.split = "test"
+    # Rooms of the kind that configs/tiny.py trains on, twice round at stride 1.
+    config.rooms = ConfigDict({"num_rooms": 8, "style": "compass", "num_frames": 400})
+    config.baselines = True
+    # Chunks of the length that the model was trained at.
+    config.references = ConfigDict({"max_frames": 200, "chunk_size": 12, "chunk_overlap": 6})
+    # Names of logvggt_jax/evaluation/variants.py.
+    config.variants = (
+        "full",
+        "no_gccr",
+        "gccr_every_50",
+        "gccr_every_100",
+        "gccr_online",
+        "no_cwa",
+        "no_cwa_no_gccr",
+        "cache_output",
+        "cache_input",
+        "windows_2_1",
+        "windows_4_1",
+        "windows_4_2",
+        "windows_4_3",
+        "windows_8_2",
+        "windows_8_4",
+        "windows_16_8",
+    )
+
+    config.evaluation = evaluation = ConfigDict()
+    # The size that the model was trained at; rooms are rendered at it.
+    evaluation.image_size = (56, 70)
+    evaluation.clip_lengths = (10, 200)
+    evaluation.stride = 2
+    evaluation.clips_per_sequence = 1
+    evaluation.max_points = 10_000
+    evaluation.icp_threshold = 0.1
+    evaluation.seed = 0
+    evaluation.figures = 2
+    return config
