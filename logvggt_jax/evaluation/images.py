@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, Protocol
 
+import cv2
 import numpy as np
 
 from logvggt_jax.data.transforms import PATCH, fit
@@ -158,7 +159,7 @@ def crop_about_principal_point(
     scale = float((target / cropped).max()) + 1e-8
     covering = np.floor(cropped * scale).astype(int)
     image = resize_image(image, (int(covering[1]), int(covering[0])))
-    depth = _resize_nearest(depth, (int(covering[1]), int(covering[0])))
+    depth = cv2.resize(depth, (int(covering[0]), int(covering[1])), interpolation=cv2.INTER_NEAREST)
     margin = (cropped * scale - target) / 2
     x, y = (int(m) for m in np.rint(margin).astype(int).clip(0, covering - target))
     result = intrinsics.copy()
@@ -175,13 +176,6 @@ def resize_image(image: np.ndarray, size: tuple[int, int], *, lanczos: bool = Tr
     shrinks = size[0] * size[1] < image.shape[0] * image.shape[1]
     resampling = pillow.Resampling.LANCZOS if lanczos and shrinks else pillow.Resampling.BICUBIC
     return np.asarray(pillow.fromarray(image).resize((size[1], size[0]), resampling))
-
-
-def _resize_nearest(depth: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    rows, columns = (
-        np.minimum(np.arange(out) * source // out, source - 1) for out, source in zip(size, depth.shape, strict=True)
-    )
-    return depth[rows[:, None], columns]
 
 
 def _pillow() -> Any:
