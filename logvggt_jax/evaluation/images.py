@@ -8,7 +8,7 @@ reconstruction: crop about the principal point; video depth: whole picture; pose
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import cv2
 import numpy as np
@@ -26,7 +26,8 @@ class ImageRule(Protocol):
     predicted depth has to be resized to them.
     """
 
-    keeps_grid: bool
+    @property
+    def keeps_grid(self) -> bool: ...
 
     def __call__(self, frames: Frames) -> Frames: ...
 
@@ -40,7 +41,7 @@ class Fit:
     """Cropped and resized to (H, W) with the principal point in the middle, as in training; see `transforms.fit`."""
 
     size: tuple[int, int]
-    keeps_grid: bool = dataclasses.field(default=True, init=False)
+    keeps_grid: ClassVar[bool] = True
 
     def __call__(self, frames: Frames) -> Frames:
         return fit(frames, self.size)
@@ -57,7 +58,7 @@ class PrincipalPointCrop:
     """
 
     longer_edge: int = _REFERENCE_EDGE
-    keeps_grid: bool = dataclasses.field(default=True, init=False)
+    keeps_grid: ClassVar[bool] = True
 
     def __call__(self, frames: Frames) -> Frames:
         parts = [
@@ -82,7 +83,7 @@ class WholePicture:
     """Longer edge 518, the other rounded and then cut to a multiple of 14; nothing is cropped."""
 
     longer_edge: int = _REFERENCE_EDGE
-    keeps_grid: bool = dataclasses.field(default=False, init=False)
+    keeps_grid: ClassVar[bool] = False
 
     def __call__(self, frames: Frames) -> Frames:
         size = self.size(frames.images.shape[1:3])
@@ -102,7 +103,7 @@ class WidthResize:
     """Width 518, height the nearest multiple of 14; of taller pictures the middle 518 rows. VGGT's loader."""
 
     width: int = _REFERENCE_EDGE
-    keeps_grid: bool = dataclasses.field(default=False, init=False)
+    keeps_grid: ClassVar[bool] = False
 
     def __call__(self, frames: Frames) -> Frames:
         height = self._height(frames.images.shape[1:3])
