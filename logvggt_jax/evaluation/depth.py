@@ -237,21 +237,23 @@ def _ordered_bits(values: np.ndarray) -> np.ndarray:
 
 
 def _least_absolute_scale(prediction: np.ndarray, target: np.ndarray, iterations: int = 10) -> float:
-    def summed(terms: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]) -> float:
-        numerator = denominator = np.float64(0.0)
+    def sums(terms: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]) -> tuple[np.float64, np.float64]:
+        above, below = np.float64(0.0), np.float64(0.0)
         for predicted, true in _blocks(prediction, target):
-            above, below = terms(predicted.astype(np.float64), true.astype(np.float64))
-            numerator, denominator = numerator + above.sum(), denominator + below.sum()
-        return numerator / denominator
-
-    scale = summed(lambda predicted, true: (true, predicted))
+            numerator, denominator = terms(predicted.astype(np.float64), true.astype(np.float64))
+            above, below = above + numerator.sum(), below + denominator.sum()
+        return above, below
 
     def reweighted(predicted: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        weighted = predicted / (np.abs(scale * predicted - true) + 1e-8)
-        return weighted * true, weighted * predicted
+        weights = 1.0 / (np.abs(scale * predicted - true) + 1e-8)
+        return weights * predicted * true, weights * predicted**2
 
+    # A residual near zero weighs up to 1e8, so that the result depends on how these expressions round.
+    true_sum, predicted_sum = sums(lambda predicted, true: (true, predicted))
+    scale = (true_sum / target.size) / (predicted_sum / target.size)
     for _ in range(iterations):
-        scale = summed(reweighted)
+        above, below = sums(reweighted)
+        scale = above / below
     return float(np.maximum(scale, _SMALLEST_SCALE))
 
 

@@ -17,8 +17,8 @@ _CLOUDS = (("7-Scenes", "seven_scenes"), ("NRGBD", "nrgbd"))
 
 IMPOSSIBLE_NOTE = (
     f"{_IMPOSSIBLE} The paper's AUC@30 is above its RRA@30 or RTA@30 here, which no area under per-threshold "
-    "accuracies up to 30 degrees can be. Ours is the mean over 1, 2, … 30 degrees of the fraction of pairs whose larger error is "
-    "below."
+    "accuracies up to 30 degrees can be. Ours is the mean over 1, 2, … 30 degrees of the fraction of pairs whose "
+    "larger error is below."
 )
 INCOMPLETE_NOTE = (
     "[17/18] behind a figure of this run: only so many of the benchmark's sequences are in it; the others are missing, "

@@ -95,9 +95,9 @@ def benchmark_tables(results: Mapping[str, Any]) -> list[Table]:
     for benchmark in results["benchmarks"]:
         entries = [entry for entry in results["summary"] if entry["benchmark"] == benchmark["name"]]
         for section in SECTIONS:
-            groups = [g for g in dict.fromkeys(c.group for c in section.columns) if any(_count(e, g) for e in entries)]
-            asked = [g for g in dict.fromkeys(c.group for c in section.columns) if any(_asked(e, g) for e in entries)]
-            if not groups:
+            groups = sorted({column.group for column in section.columns})
+            asked = [group for group in groups if any(_asked(entry, group) for entry in entries)]
+            if not any(_count(entry, group) for entry in entries for group in asked):
                 continue
             columns = [column for column in section.columns if column.group in asked]
             shown = [entry for entry in entries if any(_count(entry, group) for group in asked)]
