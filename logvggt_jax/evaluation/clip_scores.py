@@ -61,6 +61,15 @@ class ClipScore:
     failures: dict[str, str]
 
 
+def is_measured(method: Method, protocol: Protocol) -> bool:
+    """Whether the protocol measures anything that the method claims."""
+    return bool(
+        (method.depth and protocol.depth)
+        or (method.points and protocol.points)
+        or (method.pose and (protocol.poses or protocol.trajectory))
+    )
+
+
 def prepare_truth(clip: ClipData, points: PointsMeasure | None) -> ClipTruth:
     """The clip's true points, at most `max_points` of those with a valid depth, and their normals."""
     if points is None or clip.depth is None or not np.isfinite(clip.extrinsics).all():

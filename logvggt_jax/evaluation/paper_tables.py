@@ -49,7 +49,10 @@ def paper_results() -> dict[str, Any]:
 
 
 def paper_tables(results: Mapping[str, Any]) -> list[Table]:
-    """All numeric tables of the paper in its order, with a row of each method of `results` in each group."""
+    """All numeric tables of the paper in its order, the rows of `results` below each group.
+
+    The first method has a row in every group, others where anything of theirs was measured.
+    """
     paper = paper_results()
     tables = [
         _table("3D reconstruction (Table 1)", _by_count(paper["rec_7scenes_nrgbd"]["data"], _clouds), results),
@@ -171,9 +174,11 @@ def _table(
             cells = [_paper_cell(data, column) for column in columns]
             marked |= any(_IMPOSSIBLE in cell for cell in cells)
             rows.append([f"{method} (paper)", *label, *cells])
-        for method in results["methods"]:
+        for position, method in enumerate(results["methods"]):
             cells = [_own_cell(results, method["name"], column) for column in columns]
             incomplete |= any("[" in cell for cell in cells)
+            if position and set(cells) == {"-"}:
+                continue  # a baseline that claims nothing of this table
             rows.append([f"{THIS_RUN}{method['name']}", *label, *cells])
     notes = [IMPOSSIBLE_NOTE] * marked + [INCOMPLETE_NOTE] * incomplete
     if title.startswith("Ablation"):

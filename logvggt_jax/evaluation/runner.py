@@ -23,6 +23,7 @@ from logvggt_jax.evaluation.clip_scores import (
     aligned_points,
     benchmark_score,
     clip_score,
+    is_measured,
     prepare_truth,
 )
 from logvggt_jax.evaluation.environment import environment
@@ -103,7 +104,12 @@ def evaluate(
     if len(set(names)) < len(names):
         raise ValueError(f"methods must have unique names, got {', '.join(names)}")
     plan, skipped = plan_clips(benchmarks, max_sequences)
-    keys = {(clip, method.name): _key(clip, method, identity) for clip in plan for method in methods}
+    keys = {
+        (clip, method.name): _key(clip, method, identity)
+        for clip in plan
+        for method in methods
+        if is_measured(method, clip.benchmark.protocol)
+    }
     records = ClipRecords(output / "clips.jsonl", list(keys.values()), environment())
     for stale in ("results.json", "report.md", "report.html"):
         (output / stale).unlink(missing_ok=True)
@@ -118,7 +124,8 @@ def evaluate(
             progress.update(task, description=f"{protocol.name}: {clip.sequence}")
             draws = drawn.get(protocol.name, 0) < figures
             drawn[protocol.name] = drawn.get(protocol.name, 0) + draws
-            pending = [method for method in methods if keys[clip, method.name] not in records]
+            asked = [method for method in methods if (clip, method.name) in keys]
+            pending = [method for method in asked if keys[clip, method.name] not in records]
             if pending:
                 reason = _run_clip(clip, pending, methods[0], records, keys, output / "figures" if draws else None)
                 if reason:
@@ -252,7 +259,8 @@ def _collected(
             }
         )
         for method in methods:
-            done = [records[keys[clip, method.name]] for clip in clips if keys[clip, method.name] in records]
+            asked = [keys[clip, method.name] for clip in clips if (clip, method.name) in keys]
+            done = [records[key] for key in asked if key in records]
             scores = [(record["sequence"], _score(record)) for record in done]
             if done:
                 score = benchmark_score(protocol, method, scores, planned)

@@ -79,7 +79,7 @@ def test_our_rows_stand_in_every_group_in_the_papers_units() -> None:
     pose = tables["Camera pose (Table 3), percent"]
     ours = next(row for row in pose.rows if row[0] == "this run: ours")
     assert ours[1:] == ["-"] * 3 + ["50.00", "25.00", "12.50"] + ["-"] * 3
-    assert next(row for row in pose.rows if row[0] == "this run: baseline")[1:] == ["-"] * 9
+    assert not [row for row in pose.rows if row[0] == "this run: baseline"], "it claims nothing of this table"
     reconstruction = tables["3D reconstruction (Table 1)"]
     assert [row[1] for row in reconstruction.rows if row[0] == "this run: ours"] == ["200", "500", "1000"]
 
