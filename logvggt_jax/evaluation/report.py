@@ -65,7 +65,7 @@ def write_report(results: Mapping[str, Any], output: Path) -> None:
     _draw_ate_against_views(results, output)
     write_text(output / "report.md", _markdown(results, made))
     (output / "tables").mkdir(exist_ok=True)
-    for old in (output / "tables").glob("*.csv"):
+    for old in (output / "tables").glob("[0-9][0-9]-*.csv"):
         old.unlink()
     for number, table in enumerate(made, start=1):
         write_text(output / "tables" / f"{number:02d}-{_slug(table.title)}.csv", _csv(table))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -111,11 +110,11 @@ def evaluate(
         if is_measured(method, clip.benchmark.protocol)
     }
     records = ClipRecords(output / "clips.jsonl", list(keys.values()), environment())
-    for stale in ("results.json", "report.md", "report.html"):
-        (output / stale).unlink(missing_ok=True)
+    stale = [output / name for name in ("results.json", "report.md", "report.html")]
     if not len(records):
-        for stale in ("figures", "tables"):
-            shutil.rmtree(output / stale, ignore_errors=True)
+        stale += (output / "figures").glob("*_frames_*.png")
+    for path in stale:
+        path.unlink(missing_ok=True)
     with records.writing(), progress_display(console) as progress:
         task = progress.add_task("evaluating", total=len(plan))
         drawn: dict[str, int] = {}
