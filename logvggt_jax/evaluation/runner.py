@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -134,6 +134,8 @@ def evaluate(
             reasons = "; ".join(f"{entry['sequence']}: {entry['reason']}" for entry in skipped[:3])
             missing = "; ".join(sorted({benchmark.missing for benchmark in benchmarks if benchmark.missing}))
             raise ValueError(f"no clip could be evaluated ({len(skipped)} skipped; {reasons or missing})")
+        if failed := _all_failed(records, keys.values()):
+            raise ValueError(f"no method could predict any clip; the first says: {failed}")
     results = plain(
         {
             "title": title,
@@ -271,6 +273,12 @@ def _collected(
                 failures += [{**where, "metric": group, "reason": why} for group, why in record["failures"].items()]
                 figures += record["figures"]
     return {"benchmarks": described, "summary": summary, "failures": failures, "figures": figures}
+
+
+def _all_failed(records: ClipRecords, keys: Iterable[str]) -> str:
+    """The first method's reason where nothing was predicted at all, else nothing."""
+    reasons = [records[key]["failures"].get(PREDICTION, "") for key in keys if key in records]
+    return reasons[0] if all(reasons) else ""
 
 
 def _score(record: Mapping[str, Any]) -> ClipScore:

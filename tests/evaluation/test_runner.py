@@ -257,6 +257,14 @@ def test_a_method_that_fails_on_a_clip_is_counted_and_tried_again(
     assert len(calls) == 5
 
 
+def test_a_method_that_fails_everywhere_is_an_error(rooms: Rooms, tmp_path: Path) -> None:
+    def refuse(images: np.ndarray) -> ClipPrediction:
+        raise ValueError("images must be multiples of 16")
+
+    with pytest.raises(ValueError, match="no method could predict any clip; the first says: images must be"):
+        run(rooms, [dataclasses.replace(static_camera(), predict=refuse)], tmp_path)
+
+
 def test_only_an_exhausted_device_counts_as_out_of_memory(rooms: Rooms, tmp_path: Path) -> None:
     method, _ = failing("RESOURCE_EXHAUSTED: Out of memory allocating", at_call=1, error=jax.errors.JaxRuntimeError)
     assert "out of memory on the device" in run(rooms, [method], tmp_path / "a")["failures"][0]["reason"]
