@@ -2,11 +2,14 @@
 
     python eval.py --config=configs/eval/rooms.py --checkpoint=runs/tiny/model --output=runs/eval-rooms
 
+    python eval.py --config=configs/eval/paper.py --checkpoint=vggt/model --data_root=data --output=runs/eval-paper
+
 Any field of the configuration can be changed on the command line: --config.rooms.num_rooms=8.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import shlex
 import sys
 from collections.abc import Sequence
@@ -15,20 +18,23 @@ from pathlib import Path
 from absl import app, flags, logging
 from ml_collections import config_flags
 
-from logvggt_jax.evaluation.baselines import all_baselines
-from logvggt_jax.evaluation.datasets import open_evaluation_set
+from logvggt_jax.evaluation.datasets import open_run
+from logvggt_jax.evaluation.environment import checkpoint_identity
 from logvggt_jax.evaluation.methods import network
 from logvggt_jax.evaluation.references import reference_methods
 from logvggt_jax.evaluation.report import print_report, write_report
-from logvggt_jax.evaluation.runner import EvaluationRun, evaluate
+from logvggt_jax.evaluation.runner import evaluate
+from logvggt_jax.evaluation.settings import read_run
 from logvggt_jax.evaluation.variants import variant_methods
 from logvggt_jax.inference.compilation_cache import enable_compilation_cache
 from logvggt_jax.weights import load_model
 
 _CONFIG = config_flags.DEFINE_config_file("config", None, "what to evaluate: a file of configs/eval", lock_config=True)
 _CHECKPOINT = flags.DEFINE_string("checkpoint", None, "model folder, as training and `logvggt convert` write it")
-_OUTPUT = flags.DEFINE_string("output", None, "folder of the results; those of an earlier run are replaced")
-_DATA_ROOT = flags.DEFINE_string("data_root", None, "folder of the data set, where it is read from disk")
+_OUTPUT = flags.DEFINE_string("output", None, "folder of the results; an interrupted run goes on, others are replaced")
+_DATA_ROOT = flags.DEFINE_string(
+    "data_root", None, "folder of the data set, where it is read from disk; for several, the folder of their folders"
+)
 _CACHE = flags.DEFINE_string("compilation_cache", None, "folder of compiled programs, `none` for none")
 
 
@@ -38,29 +44,33 @@ def main(arguments: Sequence[str]) -> None:
         raise app.UsageError(f"unknown argument {arguments[1]!r}; settings are given as --config.NAME=VALUE")
     output = Path(_OUTPUT.value)
     try:
-        run = EvaluationRun.from_dict(_CONFIG.value.to_dict())
-        image_size, seed = run.evaluation.image_size, run.evaluation.seed
-        dataset, known_set, known = open_evaluation_set(
-            run.dataset, _DATA_ROOT.value, split=run.split, image_size=image_size, rooms=run.rooms
-        )
+        run = read_run(_CONFIG.value.to_dict())
+        benchmarks, baselines = open_run(run, _DATA_ROOT.value)
         enable_compilation_cache(_CACHE.value)
         model, variables = load_model(_CHECKPOINT.value)
         methods = [network(model, variables)]
         if run.references is not None:
             methods += reference_methods(model, variables, run.references)
-        methods += variant_methods(model, variables, run.variants)
-        if run.baselines:
-            methods += all_baselines(model, known_set, image_size, source=known, seed=seed)
-        command = shlex.join(["python", *sys.argv])
-        results = evaluate(dataset, methods, run.evaluation, output, title=run.title, command=command)
-        write_report(results, output / "report.md")
+        methods += [*variant_methods(model, variables, run.variants), *baselines(model)]
+        results = evaluate(
+            benchmarks,
+            methods,
+            output,
+            title=run.title,
+            command=shlex.join(["python", *sys.argv]),
+            configuration=dataclasses.asdict(run),
+            identity=checkpoint_identity(_CHECKPOINT.value),
+            max_sequences=run.max_sequences,
+            figures=run.figures,
+        )
+        write_report(results, output)
     except (ValueError, OSError, ImportError) as error:
         # Errors of settings, data and checkpoints say in one line what to mend; -v 1 shows where they arose.
         if flags.FLAGS.verbosity > 0:
             raise
         sys.exit(f"eval.py: {' '.join(str(error).split())}")
     print_report(results)
-    print(f"\nTables, JSON and figures are in {output}/")
+    print(f"\nTables, JSON and figures are in {output}/; report.html has all of it on one page")
 
 
 def parse_flags(arguments: list[str]) -> list[str]:

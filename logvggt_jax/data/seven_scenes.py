@@ -9,16 +9,18 @@ set does not register: depth has focal length 585, colour 525, and lies 25 mm to
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from logvggt_jax.data.calibration import numbers, pinhole, scaled, world_to_camera
+from logvggt_jax.data.dataset import check_indices
 from logvggt_jax.data.errors import missing_files
-from logvggt_jax.data.folder_dataset import FolderDataset, FrameRecord, Listing
+from logvggt_jax.data.folder_dataset import NO_POSES, FolderDataset, FrameRecord, Listing
 from logvggt_jax.data.image_files import read_depth, read_rgb
 from logvggt_jax.data.listing_index import SourceFiles
+from logvggt_jax.data.sfm_poses import read_sfm_poses
 from logvggt_jax.geometry import compose, unproject
 
 COLOUR_FROM_DEPTH = np.array([-0.025, 0.0, 0.0])  # metres, identity rotation
@@ -47,6 +49,21 @@ class SevenScenes(FolderDataset):
     expects = "<scene>/seq-XX or seq-XX with frame-XXXXXX.color.png (unpack the sequences' zip files)"
     metric = True
     splits = ("train", "test", "all")
+
+    def sfm_extrinsics(self, sequence: str, indices: Sequence[int]) -> np.ndarray | None:
+        """Structure-from-motion poses [T, 4, 4] float32 of frames, world-to-camera of the colour camera.
+
+        Read from files `pgt_sfm*.txt` in the scene's folder, see `sfm_poses`. None where they do not have the sequence;
+        NaN for single frames that they lack. `extrinsics` of `read` are those of the data set itself, which drift by
+        about 1.5 degrees.
+        """
+        names = self.frame_names(sequence)
+        folder = self._places[sequence]
+        poses: dict[str, np.ndarray] = {}
+        for path in sorted(folder.parent.glob("pgt_sfm*.txt")):
+            poses |= read_sfm_poses(path)
+        found = [poses.get(f"{folder.name}/{names[i]}", NO_POSES) for i in check_indices(indices, len(names), sequence)]
+        return np.stack(found).astype(np.float32) if np.isfinite(found).any() else None
 
     def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
         folders: dict[str, Path] = {}

@@ -1,7 +1,7 @@
-"""Metrics and evaluation: depth, poses, trajectories, point clouds; baselines, runner, tables and plots.
+"""Metrics and evaluation: depth, poses, trajectories, point clouds; the paper's benchmarks, runner, tables and plots.
 
-Metrics work on numpy arrays and return fractions, not percent. Running a model over a data set is in `runner`,
-rows to compare with in `baselines`, tables in `report`, pictures in `plots`.
+Metrics work on numpy arrays and return fractions, not percent. Benchmarks are declared in `protocols`, run by `runner`
+with rows from `methods` and `baselines`, and written by `report`; `paper_tables` puts them beside the paper's numbers.
 """
 
 from logvggt_jax.evaluation.depth import depth_metrics

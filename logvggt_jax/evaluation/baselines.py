@@ -83,6 +83,16 @@ def mean_depth_map(statistics: DepthStatistics) -> Method:
     )
 
 
+def unit_depth() -> Method:
+    """Every pixel at depth 1, at any image size; the alignment gives it the clip's scale."""
+
+    def predict(images: np.ndarray) -> ClipPrediction:
+        depth = np.broadcast_to(np.float32(1.0), images.shape[:3])
+        return ClipPrediction(depth, _identities(len(images)), None)
+
+    return Method("constant depth", "nothing", predict, pose=False, points=False)
+
+
 def static_camera() -> Method:
     """All frames at the first camera's pose."""
 

@@ -1,14 +1,51 @@
-"""Data sets as evaluation opens them: rooms at the model's size, everything else from disk."""
+"""Data sets as evaluation opens them: rooms at the model's size, everything else from disk, missing ones named."""
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.data.registry import open_dataset
 from logvggt_jax.data.rooms import Rooms
+from logvggt_jax.evaluation.baselines import all_baselines, static_camera, unit_depth
+from logvggt_jax.evaluation.images import PrincipalPointCrop
+from logvggt_jax.evaluation.methods import Method
+from logvggt_jax.evaluation.protocols import Protocol, ProtocolSettings, chosen_protocols
+from logvggt_jax.evaluation.protocols.clips import clip_protocols
+from logvggt_jax.evaluation.runner import Benchmark
+from logvggt_jax.evaluation.settings import BenchmarkRun, EvaluationRun
+from logvggt_jax.model.logvggt import LogVGGT
+
+
+def open_run(
+    run: EvaluationRun | BenchmarkRun, data_root: str | Path | None
+) -> tuple[list[Benchmark], Callable[[LogVGGT], list[Method]]]:
+    """The benchmarks of a run, and what makes its baselines once the model is known (nothing where it wants none).
+
+    Raises:
+      ValueError, FileNotFoundError: as `open_benchmarks` and `open_evaluation_set`.
+    """
+    if isinstance(run, BenchmarkRun):
+        protocols = chosen_protocols(run.protocol, run.benchmarks)
+        benchmarks = open_benchmarks(protocols, data_root, run.protocol)
+        return benchmarks, lambda _: [unit_depth(), static_camera()] if run.baselines else []
+    clips = run.evaluation
+    dataset, known_set, known = open_evaluation_set(
+        run.dataset,
+        None if data_root is None else str(data_root),
+        split=run.split,
+        image_size=clips.image_size,
+        rooms=run.rooms,
+    )
+    benchmarks = [Benchmark(each, dataset, run.split) for each in clip_protocols(run.dataset, run.split, clips)]
+
+    def baselines(model: LogVGGT) -> list[Method]:
+        return all_baselines(model, known_set, clips.image_size, source=known, seed=clips.seed) if run.baselines else []
+
+    return benchmarks, baselines
 
 
 def open_evaluation_set(
@@ -42,15 +79,65 @@ def open_evaluation_set(
         return dataset, dataset, "frames of the evaluated set itself (knows the test set's mean)"
     if root is not None:
         raise ValueError(f"rooms are rendered, not read: leave --data_root={root} out")
-    height, width = image_size
     options = dict(rooms or {})
+    train = {key: value for key, value in options.items() if key != "num_rooms"}
+    return _rooms(split, image_size, options), _rooms("train", image_size, train), "training rooms"
+
+
+def open_benchmarks(
+    protocols: Sequence[Protocol], data_root: str | Path | None, settings: ProtocolSettings
+) -> list[Benchmark]:
+    """Each protocol with its data, from the folder `data_root`/<data set's name>, or with the reason why it has none.
+
+    Args:
+      protocols: the benchmarks asked for.
+      data_root: folder of one folder a data set (`seven_scenes`, `nrgbd`, `sintel`, …); None where there is none.
+      settings: `longer_edge` and `rooms` are used, for rooms, which are rendered.
+
+    Raises:
+      FileNotFoundError: `data_root` is not a folder, or has none of the data sets that were asked for.
+      ValueError: an unknown option of rooms.
+    """
+    root = None if data_root is None else Path(data_root)
+    if root is not None and not root.is_dir():
+        raise FileNotFoundError(f"{root}: no such folder; --data_root is the folder that holds one folder a data set")
+    opened: dict[tuple[str, tuple[str, ...]], tuple[Dataset | None, str, str]] = {}
+    for protocol in protocols:
+        key = (protocol.dataset, protocol.splits)
+        if key in opened:
+            continue
+        if protocol.dataset == "rooms":
+            size = PrincipalPointCrop(settings.longer_edge).size((3, 4))
+            opened[key] = _rooms(protocol.splits[0], size, settings.rooms), protocol.splits[0], ""
+        elif root is None:
+            opened[key] = None, "", f"{protocol.dataset}: no --data_root was given"
+        else:
+            opened[key] = _first_split(protocol, root / protocol.dataset)
+    benchmarks = [Benchmark(protocol, *opened[protocol.dataset, protocol.splits]) for protocol in protocols]
+    on_disk = sorted({protocol.dataset for protocol in protocols} - {"rooms"})
+    found = any(benchmark.dataset is not None for benchmark in benchmarks if benchmark.protocol.dataset != "rooms")
+    if root is not None and on_disk and not found:
+        reasons = "; ".join(dict.fromkeys(benchmark.missing for benchmark in benchmarks if benchmark.missing))
+        raise FileNotFoundError(f"{root}: holds none of the data sets {', '.join(on_disk)} ({reasons})")
+    return benchmarks
+
+
+def _first_split(protocol: Protocol, folder: Path) -> tuple[Dataset | None, str, str]:
+    if not folder.is_dir():
+        return None, "", f"{folder}: no such folder"
+    reasons: list[str] = []
+    for split in protocol.splits:
+        try:
+            return open_dataset(protocol.dataset, folder, split), split, ""
+        except (ValueError, OSError, ImportError) as error:
+            reasons.append(f"{protocol.dataset}, split {split}: {error}")
+    return None, "", "; ".join(reasons)
+
+
+def _rooms(split: str, image_size: tuple[int, int], options: Mapping[str, Any]) -> Rooms:
+    height, width = image_size
     known = inspect.signature(Rooms).parameters
     for option in options:
         if option not in known or option in ("split", "height", "width"):
             raise ValueError(f"rooms: unknown option {option!r}; known are {', '.join(known)} without split and size")
-    train = {key: value for key, value in options.items() if key != "num_rooms"}
-    return (
-        Rooms(split=split, height=height, width=width, **options),
-        Rooms(split="train", height=height, width=width, **train),
-        "training rooms",
-    )
+    return Rooms(split=split, height=height, width=width, **options)

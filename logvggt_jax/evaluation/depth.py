@@ -5,15 +5,20 @@ Source: the evaluation code of CUT3R and its descendants (`eval/video_depth/tool
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
+
+from logvggt_jax.evaluation.progress import track
+from logvggt_jax.evaluation.scratch import scratch_array
 
 ALIGNMENTS = ("metric", "scale", "median", "lstsq", "scale_shift")
 DEPTH_KEYS = ("abs_rel", "sq_rel", "rmse", "log_rmse", "delta_1.25", "delta_1.25^2", "delta_1.25^3")
 
 _SMALLEST_DEPTH = 1e-5
 _SMALLEST_SCALE = 1e-3
+_BLOCK = 2**20  # pixels
 
 
 def depth_metrics(
@@ -46,7 +51,7 @@ def depth_metrics(
     Raises:
       ValueError: unknown alignment, shapes that differ, a mask that is not boolean.
     """
-    prediction, target = np.asarray(prediction, np.float64), np.asarray(target, np.float64)
+    prediction, target = np.asarray(prediction), np.asarray(target)
     if prediction.shape != target.shape:
         raise ValueError(
             f"depth_metrics: prediction {prediction.shape} and target {target.shape} must agree; "
@@ -56,53 +61,77 @@ def depth_metrics(
         raise ValueError(f"depth_metrics: mask must be bool of shape {target.shape}, got {mask.dtype} {mask.shape}")
     if alignment not in ALIGNMENTS:
         raise ValueError(f"depth_metrics: alignment must be one of {ALIGNMENTS}, got {alignment!r}")
-    valid = target > 0
-    if max_depth is not None:
-        valid &= target < max_depth
-    scored = valid if mask is None else valid & mask
-    if not scored.any():
-        return {**dict.fromkeys(DEPTH_KEYS, 0.0), "valid_pixels": 0.0}
+    return _errors(_valid_pixels(prediction, target, max_depth, mask), alignment, clip)
 
-    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-        scale, shift = align_depth(prediction[valid], target[valid], alignment)
-        predicted, true = scale * prediction[scored] + shift, target[scored]
-        if clip is not None:
-            predicted = np.minimum(predicted, clip)
-        error = predicted - true
-        clamped = np.maximum(predicted, _SMALLEST_DEPTH)
-        ratio = np.maximum(clamped / true, true / clamped)
-        return {
-            "abs_rel": float(np.mean(np.abs(error) / true)),
-            "sq_rel": float(np.mean(error**2 / true)),
-            "rmse": float(np.sqrt(np.mean(error**2))),
-            "log_rmse": float(np.sqrt(np.mean((np.log(clamped) - np.log(true)) ** 2))),
-            "delta_1.25": float(np.mean(ratio < 1.25)),
-            "delta_1.25^2": float(np.mean(ratio < 1.25**2)),
-            "delta_1.25^3": float(np.mean(ratio < 1.25**3)),
-            "valid_pixels": float(true.size),
-        }
+
+def clip_depth_metrics(
+    prediction: np.ndarray,
+    target: np.ndarray,
+    *,
+    alignments: Sequence[str],
+    max_depth: float | None = None,
+    clip: float | None = None,
+) -> dict[str, dict[str, float]]:
+    """`depth_metrics` of a long clip under several alignments, the prediction at any size.
+
+    Args:
+      prediction: [T, h, w], resized frame by frame as `resize_depth` does where its size is not the target's.
+      target: [T, H, W]. Both may be memory maps: one frame is in memory at a time, and of the valid pixels what
+        `scratch_array` keeps there.
+      alignments: some of `ALIGNMENTS`.
+      max_depth: as in `depth_metrics`.
+      clip: as in `depth_metrics`.
+
+    Returns:
+      The errors by alignment.
+    """
+    pixels = _valid_pixels(prediction, target, max_depth, None)
+    return {alignment: _errors(pixels, alignment, clip) for alignment in alignments}
 
 
 def align_depth(prediction: np.ndarray, target: np.ndarray, alignment: str) -> tuple[float, float]:
-    """Scale and shift that carry valid depths `prediction` [N] onto `target` [N]; see `depth_metrics`."""
+    """Scale and shift that carry valid depths `prediction` [N] onto `target` [N]; see `depth_metrics`.
+
+    `lstsq` and `scale_shift` take copies of both, the other alignments a block at a time.
+    """
     if alignment == "metric":
         return 1.0, 0.0
     if alignment == "scale":
         return _least_absolute_scale(prediction, target), 0.0
     if alignment == "median":
         return _median_scale(prediction, target), 0.0
+    prediction, target = np.asarray(prediction, np.float64), np.asarray(target, np.float64)
     if alignment == "lstsq":
         return _least_squares(prediction, target)
     return _adam_scale_shift(prediction, target)
 
 
 def lower_median(values: np.ndarray) -> float:
-    """Median that takes the lower of two middle values, as torch.median; NaN if any value is NaN."""
+    """Median that takes the lower of two middle values, as torch.median; NaN if any value is NaN.
+
+    Values are selected digit by digit (a radix of 16 bits): exact, and a block of them in memory at a time.
+    """
     values = np.ravel(values)
-    if np.isnan(values).any():
-        return float("nan")
-    middle = (values.size - 1) // 2
-    return float(np.partition(values, middle)[middle])
+    if values.dtype not in (np.float32, np.float64):
+        values = values.astype(np.float64)
+    unsigned = np.dtype(f"u{values.dtype.itemsize}").type
+    rank, prefix = (values.size - 1) // 2, 0
+    for shift in range(8 * values.dtype.itemsize - 16, -1, -16):
+        counts = np.zeros(2**16, np.int64)
+        for (block,) in _blocks(values):
+            if np.isnan(block).any():
+                return float("nan")
+            # The leading digits so far (none yet: 0 = 0), then this one.
+            keys = _ordered_bits(block) >> unsigned(shift)
+            digits = (keys & unsigned(0xFFFF))[keys >> unsigned(16) == prefix]
+            counts += np.bincount(digits.astype(np.intp), minlength=2**16)
+        below = np.cumsum(counts)
+        digit = int(np.searchsorted(below, rank, side="right"))
+        rank -= int(below[digit - 1]) if digit else 0
+        prefix = prefix << 16 | digit
+    sign = 1 << (8 * values.dtype.itemsize - 1)
+    bits = prefix ^ sign if prefix & sign else ~prefix & (2 * sign - 1)
+    return float(unsigned(bits).view(values.dtype))
 
 
 def mean_depth_metrics(clips: Sequence[Mapping[str, float]]) -> dict[str, float]:
@@ -128,11 +157,103 @@ def resize_depth(depth: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return np.stack(frames)
 
 
+class _Pixels(NamedTuple):
+    """Depth of the valid pixels of a clip, in order; `scored` bool [N], None for all."""
+
+    prediction: np.ndarray
+    target: np.ndarray
+    scored: np.ndarray | None
+
+
+def _valid_pixels(
+    prediction: np.ndarray, target: np.ndarray, max_depth: float | None, mask: np.ndarray | None
+) -> _Pixels:
+    frames, predicted = (array.reshape(-1, *array.shape[-2:]) for array in (target, prediction))
+    masks = None if mask is None else mask.reshape(frames.shape)
+    count = sum(int(_valid(frame, max_depth).sum()) for frame in frames)
+    pixels = _Pixels(
+        scratch_array((count,), predicted.dtype),
+        scratch_array((count,), frames.dtype),
+        None if masks is None else scratch_array((count,), np.bool_),
+    )
+    start = 0
+    for t, frame in enumerate(track(frames, len(frames), "valid depth")):
+        valid = _valid(frame, max_depth)
+        stop = start + int(valid.sum())
+        shown = predicted[t]
+        if shown.shape != frame.shape:
+            shown = resize_depth(shown[None], frame.shape)[0]
+        pixels.prediction[start:stop], pixels.target[start:stop] = shown[valid], frame[valid]
+        if masks is not None and pixels.scored is not None:
+            pixels.scored[start:stop] = masks[t][valid]
+        start = stop
+    return pixels
+
+
+def _valid(target: np.ndarray, max_depth: float | None) -> np.ndarray:
+    return target > 0 if max_depth is None else (target > 0) & (target < max_depth)
+
+
+def _errors(pixels: _Pixels, alignment: str, clip: float | None) -> dict[str, float]:
+    scored = pixels.target.size if pixels.scored is None else int(pixels.scored.sum())
+    if not scored:
+        return {**dict.fromkeys(DEPTH_KEYS, 0.0), "valid_pixels": 0.0}
+    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+        scale, shift = align_depth(pixels.prediction, pixels.target, alignment)
+        sums = np.zeros(len(DEPTH_KEYS))
+        columns = pixels[:2] if pixels.scored is None else pixels
+        for predicted, true, *kept in _blocks(*columns):
+            if kept:
+                predicted, true = predicted[kept[0]], true[kept[0]]
+            predicted, true = scale * predicted.astype(np.float64) + shift, true.astype(np.float64)
+            if clip is not None:
+                predicted = np.minimum(predicted, clip)
+            error = predicted - true
+            clamped = np.maximum(predicted, _SMALLEST_DEPTH)
+            ratio = np.maximum(clamped / true, true / clamped)
+            sums += [
+                np.sum(np.abs(error) / true),
+                np.sum(error**2 / true),
+                np.sum(error**2),
+                np.sum((np.log(clamped) - np.log(true)) ** 2),
+                *(np.sum(ratio < 1.25**power) for power in (1, 2, 3)),
+            ]
+        means = dict(zip(DEPTH_KEYS, (sums / scored).tolist(), strict=True))
+        for key in ("rmse", "log_rmse"):
+            means[key] = float(np.sqrt(means[key]))
+        return {**means, "valid_pixels": float(scored)}
+
+
+def _blocks(*columns: Any) -> Iterator[tuple[np.ndarray, ...]]:
+    for start in range(0, len(columns[0]), _BLOCK):
+        yield tuple(np.asarray(column[start : start + _BLOCK]) for column in columns)
+
+
+def _ordered_bits(values: np.ndarray) -> np.ndarray:
+    """Unsigned integers in the order of the floating-point values [N]."""
+    bits = values.view(f"u{values.dtype.itemsize}")
+    sign = bits.dtype.type(1 << (8 * values.dtype.itemsize - 1))
+    return np.where(bits & sign, ~bits, bits | sign)
+
+
 def _least_absolute_scale(prediction: np.ndarray, target: np.ndarray, iterations: int = 10) -> float:
-    scale = target.mean() / prediction.mean()
+    def sums(terms: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]) -> tuple[np.float64, np.float64]:
+        above, below = np.float64(0.0), np.float64(0.0)
+        for predicted, true in _blocks(prediction, target):
+            numerator, denominator = terms(predicted.astype(np.float64), true.astype(np.float64))
+            above, below = above + numerator.sum(), below + denominator.sum()
+        return above, below
+
+    def reweighted(predicted: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        weights = 1.0 / (np.abs(scale * predicted - true) + 1e-8)
+        return weights * predicted * true, weights * predicted**2
+
+    # A residual near zero weighs up to 1e8, so that the result depends on how these expressions round.
+    true_sum, predicted_sum = sums(lambda predicted, true: (true, predicted))
+    scale = (true_sum / target.size) / (predicted_sum / target.size)
     for _ in range(iterations):
-        weights = 1.0 / (np.abs(scale * prediction - target) + 1e-8)
-        scale = (weights * prediction * target).sum() / (weights * prediction**2).sum()
+        above, below = sums(reweighted)
+        scale = above / below
     return float(np.maximum(scale, _SMALLEST_SCALE))
 
 

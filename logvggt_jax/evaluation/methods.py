@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
+from logvggt_jax.evaluation.streaming import stream_clip
 from logvggt_jax.model.logvggt import LogVGGT
-from logvggt_jax.types import Predictions
 
 
 class ClipPrediction(NamedTuple):
-    """Prediction of one clip, numpy arrays; any unit of length, any world.
+    """Prediction of one clip, numpy arrays (depth may be a memory map); any unit of length, any world.
 
     Attributes:
       depth: [T, H, W] z-depth; None if the method does not predict any.
@@ -39,7 +38,8 @@ class Method:
     Attributes:
       name: label of the row.
       knows: what the method was given besides the images, in words, for the reader of the table.
-      predict: images [T, H, W, 3] uint8 to the clip's prediction; raises PredictionError where it has none.
+      predict: images [T, H, W, 3] uint8, a memory map where they are many, to the clip's prediction; raises
+        PredictionError where it has none.
       depth: whether depth is measured.
       pose: whether poses are measured.
       points: whether the point cloud is measured.
@@ -59,20 +59,10 @@ class Method:
 def network(
     model: LogVGGT, variables: dict[str, Any], *, name: str = "LoG-VGGT", knows: str = "its training"
 ) -> Method:
-    """The model as a method; its program is compiled once for each clip length."""
-    apply = _compiled(model)
+    """The model as a method: clips of any length are streamed, see `stream_clip`."""
+    on_device = jax.device_put(variables)
 
     def predict(images: np.ndarray) -> ClipPrediction:
-        predictions = apply(variables, images[None])
-        depth, extrinsics, intrinsics = jax.device_get(
-            (predictions.depth[0], predictions.extrinsics[0], predictions.intrinsics[0])
-        )
-        return ClipPrediction(depth, extrinsics, intrinsics)
+        return ClipPrediction(*stream_clip(model, on_device, images))
 
     return Method(name, knows, predict)
-
-
-@functools.lru_cache(maxsize=8)
-def _compiled(model: LogVGGT) -> Callable[..., Predictions]:
-    """One jitted function a model, so that trained and untrained parameters share its programs."""
-    return jax.jit(model.apply)

@@ -1,15 +1,15 @@
-"""Pictures of results: trajectories seen from above and depth beside its truth (matplotlib, no display needed)."""
+"""Pictures of results: trajectories, depth and point clouds beside their truth (matplotlib, no display needed)."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from logvggt_jax.evaluation.depth import align_depth
+from logvggt_jax.evaluation.depth import align_depth, resize_depth
 from logvggt_jax.evaluation.trajectory import align_trajectory
 from logvggt_jax.geometry import camera_centres, invert
 
@@ -57,28 +57,31 @@ def trajectory_plot(path: Path, predicted_extrinsics: np.ndarray, true_extrinsic
 def depth_panel(
     path: Path, images: np.ndarray, target: np.ndarray, prediction: np.ndarray, *, max_frames: int = 4
 ) -> None:
-    """Rows of image, true depth, predicted depth (scaled to the truth by the clip's medians) and relative error.
+    """Rows of image, true depth, predicted depth (scaled to the truth by medians) and relative error.
 
     Args:
       path: PNG file; its folder is created.
-      images: [T, H, W, 3] uint8.
+      images: [T, h, w, 3] uint8.
       target: [T, H, W] metres, 0 = invalid (drawn white).
-      prediction: [T, H, W].
-      max_frames: evenly spaced frames of the clip that are drawn.
+      prediction: [T, h, w], resized to the target where its size is another.
+      max_frames: evenly spaced frames of the clip that are drawn; the medians are those of these frames.
     """
+    chosen = np.unique(np.linspace(0, len(images) - 1, max_frames).round().astype(int))
+    images, target, prediction = images[chosen], target[chosen], prediction[chosen]
+    if prediction.shape != target.shape:
+        prediction = resize_depth(prediction, (target.shape[1], target.shape[2]))
     valid = target > 0
     scale = align_depth(prediction[valid], target[valid], "median")[0] if valid.any() else 1.0
-    chosen = np.unique(np.linspace(0, len(images) - 1, max_frames).round().astype(int))
     limits = (float(target[valid].min()), float(np.percentile(target[valid], 99))) if valid.any() else (0.0, 1.0)
-    aspect = images.shape[1] / images.shape[2]
+    aspect = target.shape[1] / target.shape[2]
     figure, axes = _figure(len(chosen), 4, (9.0, 2.3 * len(chosen) * aspect + 0.6))
     for row, t in enumerate(chosen):
-        masked = np.where(valid[t], target[t], np.nan)
-        error = np.abs(scale * prediction[t] - masked) / masked
+        masked = np.where(valid[row], target[row], np.nan)
+        error = np.abs(scale * prediction[row] - masked) / masked
         shown: list[tuple[str, np.ndarray, dict[str, Any]]] = [
-            (f"frame {t}", images[t], {}),
+            (f"frame {t}", images[row], {}),
             ("true depth", masked, {"vmin": limits[0], "vmax": limits[1], "cmap": "viridis"}),
-            ("predicted", scale * prediction[t], {"vmin": limits[0], "vmax": limits[1], "cmap": "viridis"}),
+            ("predicted", scale * prediction[row], {"vmin": limits[0], "vmax": limits[1], "cmap": "viridis"}),
             ("relative error", error, {"vmin": 0.0, "vmax": 0.5, "cmap": "magma"}),
         ]
         for column, (title, picture, options) in enumerate(shown):
@@ -128,6 +131,71 @@ def efficiency_plot(path: Path, report: Mapping[str, Any]) -> None:
     parts.legend(fontsize=7)
     figure.suptitle(report["device"], fontsize=9)
     _save(figure, path)
+
+
+def point_clouds(path: Path, prediction: np.ndarray, target: np.ndarray, colours: np.ndarray, view: np.ndarray) -> None:
+    """Two clouds side by side, seen from behind and above one camera (orthographic, nearest point in front).
+
+    Args:
+      path: PNG file; its folder is created.
+      prediction: [N, 3] points in the target's world.
+      target: [M, 3].
+      colours: [N, 3] uint8 of the predicted points, and of the true ones where M = N (grey otherwise).
+      view: [4, 4] world-to-camera matrix of that camera.
+    """
+    frame = target @ _viewing_rotation(view).T
+    low, high = np.percentile(frame[:, :2], 1, axis=0), np.percentile(frame[:, :2], 99, axis=0)
+    figure, axes = _figure(1, 2, (10.0, 4.2))
+    grey = colours if len(colours) == len(target) else np.full((len(target), 3), 120, np.uint8)
+    for axis, title, points, shade in (
+        (axes[0], "prediction, aligned", prediction, colours),
+        (axes[1], "truth", target, grey),
+    ):
+        axis.imshow(_rendered(points @ _viewing_rotation(view).T, shade, low, high))
+        axis.set_title(f"{title}, {len(points):,} points", fontsize=9)
+        axis.set_axis_off()
+    _save(figure, path)
+
+
+def ate_against_views(path: Path, curves: Mapping[str, Sequence[tuple[int, float]]], title: str) -> None:
+    """ATE over the number of views.
+
+    Args:
+      path: PNG file; its folder is created.
+      curves: by method, (number of views, ATE in metres).
+      title: of the figure.
+    """
+    figure, (axis,) = _figure(1, 1, (5.5, 4.0))
+    for name, points in curves.items():
+        axis.plot(*zip(*points, strict=True), ".-", label=name)
+    axis.set_xlabel("views")
+    axis.set_ylabel("ATE (m)")
+    axis.set_ylim(bottom=0)
+    axis.set_title(title, fontsize=9)
+    axis.legend(fontsize=8)
+    _save(figure, path)
+
+
+def _viewing_rotation(view: np.ndarray) -> np.ndarray:
+    """Axes of a viewer who looks along the camera, tilted down by 25 degrees."""
+    angle = np.radians(25.0)
+    tilt = np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
+    return tilt @ np.asarray(view, np.float64)[:3, :3]
+
+
+def _rendered(points: np.ndarray, colours: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Picture [H, W, 3] of points in the viewer's axes; white where there is none."""
+    margin = 0.05 * (high - low) + 1e-9
+    low, high = low - margin, high + margin
+    width = 480
+    height = int(np.clip(width * (high[1] - low[1]) / (high[0] - low[0]), 120, 720))
+    picture = np.full((height, width, 3), 255, np.uint8)
+    pixels = np.floor((points[:, :2] - low) / (high - low) * [width, height])
+    inside = ((pixels >= 0) & (pixels < [width, height])).all(1)
+    order = np.argsort(-points[inside, 2], kind="stable")  # the nearest last
+    columns, rows = pixels[inside][order].astype(int).T
+    picture[rows, columns] = colours[inside][order]
+    return picture
 
 
 def _figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, list[Any]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -10,15 +11,19 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays as number_arrays
 
-from logvggt_jax.evaluation import depth_metrics
+from logvggt_jax.evaluation import depth as depth_module
+from logvggt_jax.evaluation import depth_metrics, scratch
 from logvggt_jax.evaluation.depth import (
     DEPTH_KEYS,
     align_depth,
+    clip_depth_metrics,
     lower_median,
     mean_depth_metrics,
     resize_depth,
 )
+from logvggt_jax.evaluation.scratch import scratch_array
 
 REFERENCE_NAMES = {"scale_shift_lad_adam": "scale_shift"}
 CASES = (
@@ -148,6 +153,52 @@ def test_lower_median_takes_the_lower_of_two_middles() -> None:
     assert lower_median(np.array([4.0, 1.0, 3.0, 2.0])) == 2.0
     assert lower_median(np.array([3.0, 1.0, 2.0])) == 2.0
     assert np.isnan(lower_median(np.array([1.0, np.nan, 2.0])))
+
+
+@given(
+    values=number_arrays(
+        st.sampled_from([np.float32, np.float64]), st.integers(1, 60), elements=st.floats(-1e6, 1e6, width=32)
+    )
+)
+@settings(deadline=None, max_examples=60)
+def test_lower_median_selects_what_sorting_does(values: np.ndarray) -> None:
+    assert lower_median(values) == np.sort(values)[(len(values) - 1) // 2]
+
+
+def test_blocks_give_the_errors_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(0)
+    target = rng.uniform(0.5, 5.0, (6, 11, 13)).astype(np.float32)
+    target[rng.random(target.shape) < 0.3] = 0.0
+    prediction = (target + rng.uniform(0.1, 1.0, target.shape)).astype(np.float32)
+    mask = rng.random(target.shape) < 0.5
+    whole = {name: depth_metrics(prediction, target, alignment=name, mask=mask) for name in ("scale", "median")}
+    monkeypatch.setattr(depth_module, "_BLOCK", 17)
+    for name, errors in whole.items():
+        assert depth_metrics(prediction, target, alignment=name, mask=mask) == pytest.approx(errors, rel=1e-6)
+
+
+def test_clips_are_resized_to_the_truth_frame_by_frame() -> None:
+    rng = np.random.default_rng(0)
+    target, prediction = rng.uniform(1, 2, (3, 20, 30)), rng.uniform(1, 2, (3, 10, 15))
+    made = clip_depth_metrics(prediction, target, alignments=("scale", "median"), max_depth=1.8, clip=1.9)
+    for name, errors in made.items():
+        resized = resize_depth(prediction, (20, 30))
+        assert errors == depth_metrics(resized, target, alignment=name, max_depth=1.8, clip=1.9)
+
+
+def test_memory_does_not_grow_with_the_clip(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is not in memory is in a file: `tracemalloc` sees numpy's own arrays and no memory map."""
+    monkeypatch.setattr(scratch, "_IN_MEMORY", 0)
+    monkeypatch.setattr(depth_module, "_BLOCK", 4096)
+    peaks = []
+    for count in (4, 64):
+        target, prediction = scratch_array((count, 60, 80), np.float32), scratch_array((count, 30, 40), np.float32)
+        target[:], prediction[:] = 2.0, 1.0
+        tracemalloc.start()
+        clip_depth_metrics(prediction, target, alignments=("scale", "median"))
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 1.1 * peaks[0]
 
 
 @pytest.mark.parametrize(

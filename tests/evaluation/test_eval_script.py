@@ -33,6 +33,7 @@ def run_eval(*arguments: str) -> subprocess.CompletedProcess[str]:
         (["--config.evaluation.stride=0"], "stride must be at least 1"),
         (["--config=configs/eval/seven_scenes.py", "--data_root=no-data"], "no-data: no such folder"),
         (["--config.references.chunk_overlap=12"], "below the chunk size 12, got 12"),
+        (["--config=configs/eval/paper.py", "--data_root=no-data"], "no-data: no such folder"),
     ],
 )
 def test_wrong_arguments_are_one_line(arguments: list[str], message: str, tmp_path: Path) -> None:
@@ -40,6 +41,22 @@ def test_wrong_arguments_are_one_line(arguments: list[str], message: str, tmp_pa
     result = run_eval("--config=configs/eval/rooms.py", "--checkpoint=c", f"--output={output}", *arguments)
     assert result.returncode == 1
     assert result.stderr.startswith("eval.py: ")
+    assert result.stderr.count("\n") == 1
+    assert message in result.stderr
+    assert not output.exists()
+
+
+@pytest.mark.parametrize(
+    ("argument", "message"),
+    [
+        ("--config.benchmarks=('sintell',)", "no benchmark is named 'sintell'"),
+        ("--config.protocol.longer_edge=71", "longer_edge must be a multiple of 14"),
+    ],
+)
+def test_wrong_settings_of_the_papers_run_are_one_line(argument: str, message: str, tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    result = run_eval("--config=configs/eval/paper.py", "--checkpoint=c", f"--output={output}", argument)
+    assert result.returncode == 1
     assert result.stderr.count("\n") == 1
     assert message in result.stderr
     assert not output.exists()
@@ -94,4 +111,31 @@ def test_an_evaluation_leaves_tables_json_and_figures(
     report = (tmp_path / "out" / "report.md").read_text()
     assert results["command"] in report
     assert results["command"] in result.stdout
-    assert len(list((tmp_path / "out" / "figures").glob("*.png"))) == 2 * 2 * 2
+    assert len(list((tmp_path / "out" / "figures").glob("*.png"))) == 2 * 2 * 3
+
+
+@pytest.mark.slow
+def test_the_papers_benchmarks_run_on_real_frames_and_go_on_after_a_kill(
+    small_config: ModelConfig, small_variables: dict, tmp_path: Path, seven_scenes_dir: Path
+) -> None:
+    save_model(tmp_path / "model", small_config, small_variables["params"])
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "seven_scenes").symlink_to(seven_scenes_dir)
+    options = ["--config=configs/eval/paper.py", "--config.protocol.longer_edge=42", f"--output={tmp_path / 'out'}"]
+    options += [f"--checkpoint={tmp_path / 'model'}", f"--data_root={tmp_path / 'data'}", "--compilation_cache=none"]
+    options += ["--config.protocol.max_points=5000", "--config.protocol.rooms.num_rooms=1"]
+    first = run_eval(*options, "--config.benchmarks=('seven_scenes-reconstruction-*', 'rooms-12', 'bonn-*')")
+    assert first.returncode == 0, first.stderr
+    results = json.loads((tmp_path / "out" / "results.json").read_text())
+    used = {b["name"]: b["frames_used"] for b in results["benchmarks"]}
+    assert [used[f"seven_scenes-reconstruction-{n}"] for n in (200, 500, 1000)] == [[n, n] for n in (200, 500, 1000)]
+    entry = next(e for e in results["summary"] if e["benchmark"] == "seven_scenes-reconstruction-1000")
+    assert entry["clips_points"] == entry["clips_pose"] == entry["clips_sfm/pose"] == 1
+    assert sum(bool(b["missing"]) for b in results["benchmarks"]) == 3
+    lines = tmp_path / "out" / "clips.jsonl"
+    lines.write_text("".join(lines.read_text().splitlines(keepends=True)[:-2]))
+    second = run_eval(*options, "--config.benchmarks=('seven_scenes-reconstruction-*', 'rooms-12', 'bonn-*')")
+    assert second.returncode == 0, second.stderr
+    again = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert again["summary"] == results["summary"]
+    assert len(again["environments"]) == 2

@@ -7,7 +7,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from logvggt_jax.evaluation.plots import depth_panel, efficiency_plot, trajectory_plot
+from logvggt_jax.evaluation.plots import (
+    ate_against_views,
+    depth_panel,
+    efficiency_plot,
+    point_clouds,
+    trajectory_plot,
+)
 
 
 def poses(count: int) -> np.ndarray:
@@ -72,3 +78,29 @@ def test_efficiency_shows_rates_and_parts(tmp_path: Path) -> None:
     one, two = brown_pixels("one.png", 1.0), brown_pixels("two.png", 2.0)
     assert one > 5000
     assert 1.8 < two / one < 2.2
+
+
+def test_both_clouds_are_drawn_in_their_colours_and_the_nearest_points_in_front(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    wall = np.concatenate([rng.uniform(-1, 1, (60_000, 2)), np.full((60_000, 1), 3.0)], axis=1)
+    orange = np.tile(np.array([[230, 130, 40]], np.uint8), (len(wall), 1))
+    point_clouds(tmp_path / "one.png", wall, wall, orange, np.eye(4))
+    assert orange_pixels(tmp_path / "one.png") > 20_000
+    # A black wall before it hides it; it is the nearer one, though it comes first in the list.
+    near = wall - [0.0, 0.0, 1.0]
+    both, colours = np.concatenate([near, wall]), np.concatenate([np.zeros_like(orange), orange])
+    point_clouds(tmp_path / "two.png", both, both, colours, np.eye(4))
+    assert orange_pixels(tmp_path / "two.png") < 0.9 * orange_pixels(tmp_path / "one.png")
+
+
+def test_ate_is_drawn_for_every_method(tmp_path: Path) -> None:
+    ate_against_views(tmp_path / "ate.png", {"a": [(50, 0.1), (100, 0.2)], "b": [(50, 0.3), (100, 0.1)]}, "ATE")
+    assert orange_pixels(tmp_path / "ate.png") > 200
+
+
+def test_depth_of_another_size_is_resized_to_the_truth(tmp_path: Path) -> None:
+    target = np.full((2, 28, 42), 2.0, np.float32)
+    depth_panel(tmp_path / "panel.png", np.zeros((2, 14, 28, 3), np.uint8), target, np.ones((2, 14, 28), np.float32))
+    picture = cv2.imread(str(tmp_path / "panel.png"))
+    last = slice(int(0.76 * picture.shape[1]), int(0.9 * picture.shape[1]))
+    assert (picture[:, last].max(-1) < 20).mean() > 0.3

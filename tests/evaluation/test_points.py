@@ -21,7 +21,7 @@ from logvggt_jax.evaluation.points import (
     sample_indices,
     voxel_chamfer,
 )
-from logvggt_jax.geometry import umeyama
+from logvggt_jax.geometry import quaternion_to_matrix, umeyama
 
 KEYS = {
     "acc_mean": "acc_mean",
@@ -163,6 +163,28 @@ def test_accuracy_and_completeness_swap_with_the_clouds(seed: int, counts: tuple
         assert forth[f"comp_{kind}"] == back[f"acc_{kind}"]
         assert forth[f"nc_{kind}"] == pytest.approx(back[f"nc_{kind}"])
     assert forth["chamfer_sum"] == pytest.approx(2 * forth["chamfer_mean"])
+
+
+@given(seed=st.integers(0, 10_000), scale=st.floats(0.05, 20.0))
+@settings(deadline=None, max_examples=20)
+def test_a_similarity_of_the_prediction_changes_nothing_after_alignment(seed: int, scale: float) -> None:
+    rng = np.random.default_rng(seed)
+    target = rng.uniform(-1, 1, (80, 3))
+    prediction = target + rng.normal(0, 0.05, (80, 3))
+    normals = sphere(rng, 80)
+    rotation = quaternion_to_matrix(rng.normal(size=4))
+    moved = scale * prediction @ rotation.T + rng.normal(size=3)
+    base, other = (
+        point_cloud_metrics(
+            umeyama(points, target).apply(points),
+            target,
+            prediction_normals=normals,
+            target_normals=normals,
+            icp_threshold=None,
+        )
+        for points in (prediction, moved)
+    )
+    assert other == pytest.approx(base, rel=1e-6)
 
 
 def test_icp_turns_given_normals_with_the_points() -> None:

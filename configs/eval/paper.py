@@ -1,0 +1,37 @@
+"""Every table of the paper beside the paper's figures, on the benchmarks that are on disk.
+
+    python eval.py --config=configs/eval/paper.py --checkpoint=runs/h20/model --data_root=data --output=runs/eval-paper
+
+`data` holds one folder a data set, each in its official layout: seven_scenes, nrgbd, sintel, bonn, kitti, scannet, tum,
+co3dv2. What is missing is named and counted. An interrupted evaluation goes on with the same command. Some of it:
+--config.benchmarks="('seven_scenes-reconstruction-*',)". A small model needs its own size:
+--config.protocol.longer_edge=70.
+"""
+
+from ml_collections import ConfigDict, config_dict
+
+
+def get_config() -> ConfigDict:
+    config = ConfigDict()
+    config.title = "LoG-VGGT, the paper's benchmarks"
+    # Patterns of benchmark names; any that matches none is an error that lists them.
+    config.benchmarks = ("*",)
+    config.baselines = True
+    # All sequences; a number takes that many first ones of each benchmark, and the tables say so.
+    config.max_sequences = config_dict.placeholder(int)
+    # Clips of each benchmark that are drawn.
+    config.figures = 1
+
+    # Rows of VGGT itself on the same weights: offline up to max_frames, and on overlapping chunks chained together.
+    config.references = ConfigDict({"max_frames": 200, "chunk_size": 60, "chunk_overlap": 30})
+    # Names of logvggt_jax/evaluation/variants.py, evaluated beside the network.
+    config.variants = ()
+
+    config.protocol = protocol = ConfigDict()
+    protocol.longer_edge = 518
+    # None compares all points, 10 to 50 million a sequence.
+    protocol.max_points = 1_000_000
+    protocol.icp_threshold = 0.1
+    protocol.seed = 0
+    protocol.rooms = ConfigDict({"num_rooms": 24, "style": "compass", "num_frames": 96})
+    return config

@@ -1,0 +1,151 @@
+"""What a benchmark is: frames, images, metrics, and the decisions that its paper leaves to the reader."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from logvggt_jax.evaluation.images import ImageRule
+from logvggt_jax.evaluation.protocols.frame_selection import FrameSelection
+
+
+@dataclasses.dataclass(frozen=True)
+class DepthMeasure:
+    """Depth errors of a clip, pooled over its valid pixels.
+
+    Attributes:
+      max_depth: metres; true depth from here on is not valid. None for no bound.
+      clip: metres; bound put on the aligned prediction. None for none.
+      alignments: all are computed; `scale` (one scale a clip) is what the paper's tables are compared with.
+    """
+
+    max_depth: float | None = None
+    clip: float | None = None
+    alignments: tuple[str, ...] = ("scale", "median")
+
+
+@dataclasses.dataclass(frozen=True)
+class PointsMeasure:
+    """Accuracy, completeness and normal consistency of the cloud of all frames.
+
+    Attributes:
+      crop: pixels; only the middle crop x crop pixels of each frame count. None for all.
+      max_points: points compared, drawn at random, the same for prediction and truth; None for all.
+      icp_threshold: metres; None leaves the ICP out.
+      seed: of the drawn points.
+    """
+
+    crop: int | None = None
+    max_points: int | None = 1_000_000
+    icp_threshold: float | None = 0.1
+    seed: int = 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Protocol:
+    """A benchmark.
+
+    Attributes:
+      name: unique, fit for a file name.
+      title: for tables.
+      dataset: one of `logvggt_jax.data.DATASETS`.
+      splits: the first of these that the folder has is evaluated.
+      frames: clips of a sequence.
+      images: what the network sees.
+      depth: None where depth is not measured.
+      points: None where the cloud is not measured.
+      poses: whether relative poses (RRA, RTA, AUC) are measured.
+      trajectory: whether ATE is measured.
+      sequences: pattern that the whole name of a sequence must match.
+      expected: sequences that the complete benchmark has, None where it depends on the split's list.
+      pooled: pairs of poses are pooled over the sequences of a category (the name's first part), and the mean is
+        over categories; otherwise it is over sequences.
+      decisions: what the paper leaves open, as decided here; printed with the results.
+    """
+
+    name: str
+    title: str
+    dataset: str
+    splits: tuple[str, ...]
+    frames: FrameSelection
+    images: ImageRule
+    depth: DepthMeasure | None = None
+    points: PointsMeasure | None = None
+    poses: bool = False
+    trajectory: bool = False
+    sequences: str = r".*"
+    expected: int | None = None
+    pooled: bool = False
+    decisions: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.points is not None and not self.images.keeps_grid:
+            raise ValueError(f"{self.name}: points need images on whose pixels the true depth lies")
+        if not (self.depth or self.points or self.poses or self.trajectory):
+            raise ValueError(f"{self.name}: nothing is measured")
+
+    @property
+    def needs_depth(self) -> bool:
+        """Whether true depth is read."""
+        return self.depth is not None or self.points is not None
+
+    def takes(self, sequence: str) -> bool:
+        """Whether a sequence of the data set belongs to the benchmark."""
+        return re.fullmatch(self.sequences, sequence) is not None
+
+    def describe(self) -> dict[str, Any]:
+        """All settings that the results depend on, as JSON values."""
+        settings = dataclasses.asdict(self)
+        for part in ("frames", "images"):
+            settings[part] = {"rule": type(getattr(self, part)).__name__, **settings[part]}
+        return settings
+
+
+@dataclasses.dataclass(frozen=True)
+class ProtocolSettings:
+    """What all benchmarks of a run share.
+
+    Attributes:
+      longer_edge: pixels of the network's images, a multiple of 14; 518 is the paper's. The middle crop of
+        reconstruction scales with it.
+      max_points: of `PointsMeasure`.
+      icp_threshold: of `PointsMeasure`.
+      seed: of drawn frames and points.
+      rooms: options of procedural rooms.
+    """
+
+    longer_edge: int = 518
+    max_points: int | None = 1_000_000
+    icp_threshold: float | None = 0.1
+    seed: int = 0
+    rooms: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.longer_edge, int) or self.longer_edge < 28 or self.longer_edge % 14:
+            raise ValueError(f"longer_edge must be a multiple of 14, at least 28, got {self.longer_edge!r}")
+        if self.max_points is not None and (not isinstance(self.max_points, int) or self.max_points < 1):
+            raise ValueError(f"max_points must be a positive whole number or None, got {self.max_points!r}")
+        if self.icp_threshold is not None and not self.icp_threshold > 0:
+            raise ValueError(f"icp_threshold must be positive or None, got {self.icp_threshold}")
+
+    @property
+    def points(self) -> PointsMeasure:
+        """The reconstruction benchmarks' measure: the middle 224 x 224 of 518-pixel images."""
+        crop = 2 * max(1, round(112 * self.longer_edge / 518))
+        return PointsMeasure(crop, self.max_points, self.icp_threshold, self.seed)
+
+    @property
+    def points_decisions(self) -> tuple[str, ...]:
+        """How points are compared, for the report."""
+        points = "all" if self.max_points is None else f"at most {self.max_points:,}"
+        icp = "no ICP" if self.icp_threshold is None else f"rigid ICP within {self.icp_threshold} m"
+        return (
+            "Points are predicted depth unprojected with predicted intrinsics and pose (the paper trains no point "
+            "head), pixels with a true depth in the middle crop of each frame, aligned by one similarity over "
+            f"corresponding pixels, then {icp}; no confidence threshold. Tables made with the other alignment in use "
+            "(median scale and z-shift) cannot be compared with it.",
+            f"{points} points of a sequence are compared, drawn with seed {self.seed}, the same pixels of prediction "
+            "and truth (published code takes all of 10 to 50 million, or 999,999).",
+        )
