@@ -52,10 +52,10 @@ test: lint
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --durations=10 --junitxml=runs/test/report.xml
 	@echo "Test report: runs/test/report.xml"
 
-test-all: lint
+test-all: test
 	$(BIN)/python -m pip install --quiet "libtpu>=0.0.30"
-	$(BIN)/python -m pytest -m "slow or not slow" --durations=20 -rA --junitxml=runs/test-all/report.xml
-	@echo "Test report: runs/test-all/report.xml"
+	$(BIN)/python -m pytest -m slow --durations=20 -rA --junitxml=runs/test-all/report.xml
+	@echo "Test reports: runs/test/report.xml, and of the slow tests runs/test-all/report.xml"
 
 clean:
 	rm -rf $(VENV) runs
