@@ -9,10 +9,12 @@ command line: --config.optimizer.learning_rate=5e-4.
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import jax
 from absl import app, flags, logging
 from ml_collections import config_flags
 
@@ -55,7 +57,12 @@ def main(arguments: Sequence[str]) -> None:
         # Errors of settings, data and checkpoints say in one line what to mend; -v 1 shows where they arose.
         if flags.FLAGS.verbosity > 0:
             raise
-        sys.exit(f"train.py: {' '.join(str(error).split())}")
+        message = f"train.py: {' '.join(str(error).split())}"
+        if jax.process_count() > 1:
+            # At once: the others wait for this process's share of a step, and it would wait for them at the exit.
+            print(f"process {jax.process_index()}: {message}", file=sys.stderr, flush=True)
+            os._exit(1)
+        sys.exit(message)
 
 
 def parse_flags(arguments: list[str]) -> list[str]:

@@ -21,16 +21,17 @@ class BrokenClips:
 
     Attributes:
       count: broken clips so far.
+      clips: all clips so far.
       messages: what was wrong with them, each once, the first hundred.
     """
 
     def __init__(self, max_share: float) -> None:
         self.max_share = max_share
-        self.count = 0
+        self.count = self.clips = 0
         self.messages: list[str] = []
 
     def add(self, messages: Sequence[str], *, clips: int) -> None:
-        """Counts and logs more broken clips; `clips` is the number of all clips so far.
+        """Counts `clips` more clips and logs the broken ones among them.
 
         Raises TooManyBrokenClips if more than `max_share` of them are broken.
         """
@@ -39,20 +40,21 @@ class BrokenClips:
             if message not in self.messages and len(self.messages) < _KEPT:
                 self.messages.append(message)
         self.count += len(messages)
-        if self.count > self.max_share * max(clips, FEWEST_CLIPS):
+        self.clips += clips
+        allowed = self.max_share * max(self.clips, FEWEST_CLIPS)
+        if self.count > allowed:
             raise TooManyBrokenClips(
-                f"{self.count} of {clips} clips were broken, max_broken={self.max_share:g} allows "
-                f"{int(self.max_share * max(clips, FEWEST_CLIPS))}: {'; '.join(self.messages)}; repair or remove "
-                "these files, or raise max_broken"
+                f"{self.count} of {self.clips} clips were broken, max_broken={self.max_share:g} allows "
+                f"{int(allowed)}: {'; '.join(self.messages)}; repair or remove these files, or raise max_broken"
             )
 
     def get_state(self) -> dict[str, Any]:
         """JSON values for `set_state`."""
-        return {"count": self.count, "messages": list(self.messages)}
+        return {"count": self.count, "clips": self.clips, "messages": list(self.messages)}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Goes on counting where `get_state` was called."""
-        self.count, self.messages = int(state["count"]), list(state["messages"])
+        self.count, self.clips, self.messages = int(state["count"]), int(state["clips"]), list(state["messages"])
 
 
 def describe(error: Exception) -> str:

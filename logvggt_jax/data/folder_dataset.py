@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import contextlib
 import io
 import json
 import os
@@ -221,9 +222,12 @@ class FolderDataset(abc.ABC):
 
     def _listing(self, sequence: str) -> Listing:
         check_sequence(sequence, self._places, self.title)
-        if sequence in self._recent:
-            self._recent.move_to_end(sequence)
-            return self._recent[sequence]
+        recent = self._recent.get(sequence)
+        if recent is not None:
+            # Another thread may just have let it go.
+            with contextlib.suppress(KeyError):
+                self._recent.move_to_end(sequence)
+            return recent
         key = f"frames {sequence}"
         payload = self._index.get(key)
         listing = None if payload is None else _unpacked(payload, self.root)

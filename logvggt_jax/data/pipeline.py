@@ -7,6 +7,7 @@ together to batches, so that neither the batches nor what a worker holds in memo
 from __future__ import annotations
 
 import hashlib
+import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -83,7 +84,11 @@ class _ReplaceBroken:
             # Whatever a decoder raises: a run of a week is not to end for one file.
             except Exception as error:
                 broken.append(describe(error))
-        raise ValueError(f"{self.read.name}: {len(broken)} clips in a row are broken: {'; '.join(broken)}")
+        height, width = self.read.size
+        raise ValueError(
+            f"{self.read.name}, pictures for {height} x {width}: {len(broken)} clips in a row are broken: "
+            f"{'; '.join(broken)}"
+        )
 
 
 class _OneSizeABatch:
@@ -151,7 +156,7 @@ class BatchIterator(Iterator[Batch]):
             raise
         self._consumed += self._batch_size
         messages = [message for clip in clips for message in clip.get(_BROKEN, ())]
-        self.broken.add(messages, clips=self._consumed // self._process_count)
+        self.broken.add(messages, clips=len(clips))
         return {name: np.stack([np.asarray(clip[name]) for clip in clips]) for name in _FIELDS}
 
     def __enter__(self) -> BatchIterator:
@@ -302,7 +307,13 @@ def training_batches(
     }
     shares = {name: 1.0 if weights is None else float(weights[name]) for name in datasets}
     sequences = {
-        name: _by_size(name, dataset, _long_enough(name, dataset, samplers[name]), sizes, skip_broken=max_broken > 0)
+        name: _by_size(
+            name,
+            dataset,
+            _long_enough(name, dataset, samplers[name], skip_broken=max_broken > 0),
+            sizes,
+            skip_broken=max_broken > 0,
+        )
         for name, dataset in datasets.items()
     }
 
@@ -352,9 +363,23 @@ def training_batches(
     )
 
 
-def _long_enough(name: str, dataset: Dataset, sampler: Sampler) -> list[str]:
-    """The sequences that hold a clip; ValueError if there are none."""
-    names = [sequence for sequence in dataset.sequences if sampler.fits(dataset, sequence)]
+def _long_enough(name: str, dataset: Dataset, sampler: Sampler, *, skip_broken: bool) -> list[str]:
+    """The sequences that hold a clip; ValueError if there are none.
+
+    With `skip_broken` a sequence that cannot be listed stays: its clips are then broken and counted, and the examples
+    are the same ones when it has been mended.
+    """
+
+    def fits(sequence: str) -> bool:
+        try:
+            return sampler.fits(dataset, sequence)
+        except Exception as error:
+            if not skip_broken:
+                raise
+            logging.warning("%s, %s: cannot be listed: %s", name, sequence, describe(error))
+            return True
+
+    names = [sequence for sequence in dataset.sequences if fits(sequence)]
     if not names:
         raise ValueError(
             f"{name}: none of {len(dataset.sequences)} sequences has {sampler.requirement}: shorten the clips"
@@ -368,7 +393,10 @@ def _long_enough(name: str, dataset: Dataset, sampler: Sampler) -> list[str]:
 def _by_size(
     name: str, dataset: Dataset, sequences: Sequence[str], sizes: Sequence[Size], *, skip_broken: bool
 ) -> list[list[str]]:
-    """For each of `sizes` the sequences whose pictures have the nearest aspect ratio."""
+    """For each of `sizes` the sequences whose pictures have the nearest aspect ratio.
+
+    With `skip_broken` those whose pictures cannot be read have the first size, where their clips will be broken.
+    """
     if len(sizes) == 1:
         return [list(sequences)]
 
@@ -378,16 +406,16 @@ def _by_size(
         except Exception as error:
             if not skip_broken:
                 raise
-            logging.warning("%s, %s: size of the pictures unknown, left out: %s", name, sequence, describe(error))
+            logging.warning("%s, %s: size of the pictures unknown: %s", name, sequence, describe(error))
             return None
 
     parts: dict[Size, list[str]] = {size: [] for size in sizes}
     # The first start opens a picture of every sequence, which takes long over a network; readers keep the sizes.
     with ThreadPoolExecutor(_SIZE_READERS) as executor:
-        for sequence, size in zip(sequences, executor.map(size_of, sequences), strict=True):
-            if size is not None:
-                parts[nearest_size(size, sizes)].append(sequence)
-    if not any(parts.values()):
+        found = list(executor.map(size_of, sequences))
+    for sequence, size in zip(sequences, found, strict=True):
+        parts[sizes[0] if size is None else nearest_size(size, sizes)].append(sequence)
+    if not any(found):
         raise ValueError(f"{name}: no picture of {len(sequences)} sequences can be read; the log names them")
     return list(parts.values())
 
@@ -400,3 +428,7 @@ def _fingerprint(sequences: Sequence[str]) -> str:
 def _start_worker(index: int, count: int) -> None:
     # Workers are there to use the cores; OpenCV would start as many threads again in each of them.
     cv2.setNumThreads(1)
+    # A signal to the whole group is for the process that trains: it needs clips until it has decided to stop, and
+    # ends its workers itself.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)

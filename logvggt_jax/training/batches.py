@@ -13,7 +13,7 @@ from absl import logging
 from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.data.holdouts import check_disjoint, check_held_out
 from logvggt_jax.data.pipeline import BatchIterator, training_batches
-from logvggt_jax.data.registry import open_dataset
+from logvggt_jax.data.registry import DATASETS, open_dataset
 from logvggt_jax.data.room_pool import render_pool
 from logvggt_jax.data.rooms import Rooms
 from logvggt_jax.training.config import DataConfig, SourceConfig, StageConfig
@@ -39,6 +39,10 @@ def open_sources(config: DataConfig, validation: SourceConfig | None = None) -> 
       ValueError: a data set would train on sequences that `config.hold_out` or the `validation` source keeps.
     """
     rules = dict(config.hold_out)
+    if unknown := sorted(rules.keys() - set(DATASETS)):
+        raise ValueError(
+            f"data.hold_out names unknown data sets: {', '.join(unknown)}; known are {', '.join(DATASETS)}"
+        )
     datasets: dict[str, Dataset] = {}
     for source in _present(config):
         dataset = open_source(source)
@@ -46,7 +50,8 @@ def open_sources(config: DataConfig, validation: SourceConfig | None = None) -> 
             check_held_out(
                 source.name, dataset.sequences, rules[source.name], functools.partial(_split_sequences, source)
             )
-        if validation is not None and (validation.name, validation.root) == (source.name, source.root):
+        # Names of sequences do not depend on where a copy of the set lies.
+        if validation is not None and validation.name == source.name:
             check_disjoint(source.name, dataset.sequences, open_source(validation).sequences)
         if isinstance(dataset, Rooms):
             dataset = render_pool(dataset, cache_dir=config.cache_dir, progress=jax.process_index() == 0)

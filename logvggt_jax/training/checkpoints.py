@@ -11,6 +11,7 @@ import jax
 import orbax.checkpoint as ocp
 
 from logvggt_jax.training.config import TrainConfig
+from logvggt_jax.training.processes import any_process
 from logvggt_jax.training.state import TrainState
 from logvggt_jax.weights.checkpoints import check_destination, digests, save_model, verify_digests
 
@@ -61,8 +62,15 @@ class RunCheckpoints:
         step = int(state.step)
         params, rest = _parts(state)
         # First, so that a run that is killed in between goes on from an older checkpoint and writes both again.
+        failure: Exception | None = None
         if jax.process_index() == 0:
-            save_model(self.model_folder, self.config.model, params)
+            try:
+                save_model(self.model_folder, self.config.model, params)
+            except Exception as error:
+                failure = error
+        # The others would wait for the first one in the checkpoint below.
+        if any_process(failure is not None):
+            raise failure or OSError(f"process 0 could not write {self.model_folder}; its output says why")
         meta = {
             "step": step,
             "stage": position.stage,

@@ -21,7 +21,7 @@ from logvggt_jax.training.initialization import initial_parameters
 from logvggt_jax.training.interruption import StopRequest
 from logvggt_jax.training.metrics_log import MetricsLog
 from logvggt_jax.training.optimizer import learning_rate_schedule, make_optimizer
-from logvggt_jax.training.processes import ASK_EVERY, any_process
+from logvggt_jax.training.processes import ASK_EVERY, any_process, check_agreement
 from logvggt_jax.training.progress import Speedometer, duration, progress_line
 from logvggt_jax.training.sharding import check_batch_size, replicated
 from logvggt_jax.training.state import TrainState, initial_state
@@ -60,6 +60,7 @@ def train(config: TrainConfig, workdir: Path, *, mesh: Mesh, resume_step: int | 
     run = _Run(config, workdir, mesh)
     with run.checkpoints, StopRequest() as stop:
         first, position = run.restore(resume_step)
+        check_agreement("the checkpoints", first)
         validation = None if config.validation is None else config.validation.source
         datasets = open_sources(config.data, validation)
         silent = jax.process_index() != 0
@@ -105,9 +106,11 @@ class _Run:
             with stage_batches(datasets, self.config.data, stage, seed=seed) as source:
                 if position is not None and position.stage == index:
                     source.set_state(position.data)
+                # Otherwise they would wait for one another in different programs.
+                check_agreement(f"stage {stage.name!r}: the data", {**source.get_state(), "broken": None})
                 with DeviceBatches(source, self.mesh) as batches:
-                    step = self._train_stage(index, stage, batches, step, end, log, stop)
-            if step < end:
+                    step, ended = self._train_stage(index, stage, batches, step, end, log, stop)
+            if ended:
                 break
         log.say(f"{step}/{self.config.total_steps} steps done; model in {self.checkpoints.model_folder}")
 
@@ -120,8 +123,8 @@ class _Run:
         end: int,
         log: MetricsLog,
         stop: StopRequest,
-    ) -> int:
-        """Steps up to `end`, or fewer if the run is to stop; the number of steps done."""
+    ) -> tuple[int, bool]:
+        """Steps up to `end`, or fewer if the run is to stop; the number of steps done, and whether it is to stop."""
         config = self.config
         in_flight: deque[jax.Array] = deque()
         self.speed.restart()
@@ -146,8 +149,8 @@ class _Run:
                 self.speed.restart()
             if ending is not None:
                 log.say(f"stopping after step {step}: {ending}; run the same command to go on")
-                break
-        return step
+                return step, True
+        return step, False
 
     def _compile(self, stage: StageConfig, batch: Batch, log: MetricsLog) -> None:
         if self.steps.has(batch):

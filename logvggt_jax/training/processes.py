@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
+from typing import Any
+
 import jax
 import numpy as np
 from jax.experimental import multihost_utils
@@ -41,3 +45,20 @@ def any_process(wants: bool) -> bool:
     if jax.process_count() == 1:
         return wants
     return bool(np.any(multihost_utils.process_allgather(np.array(wants))))
+
+
+def check_agreement(what: str, value: Any) -> None:
+    """Raises ValueError on every process unless `value` (JSON types) is the same on all of them.
+
+    All processes have to ask at the same point.
+    """
+    if jax.process_count() == 1:
+        return
+    digest = hashlib.sha256(json.dumps(value, sort_keys=True).encode()).digest()
+    rows = multihost_utils.process_allgather(np.frombuffer(digest, np.uint8))
+    odd = [process for process, row in enumerate(rows) if not np.array_equal(row, rows[0])]
+    if odd:
+        raise ValueError(
+            f"{what} of the processes {odd} differ from those of process 0: let all see the same folders (their logs "
+            "name what was left out)"
+        )

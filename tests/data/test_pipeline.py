@@ -312,9 +312,41 @@ def test_a_set_that_cannot_be_read_at_all_ends_the_run():
 
     with (
         batches({"gone": Gone(8)}, max_broken=0.9) as iterator,
-        pytest.raises(ValueError, match=r"gone: 16 clips in a row are broken: s\d.png"),
+        pytest.raises(ValueError, match=r"gone, pictures for 14 x 28: 16 clips in a row are broken: s\d.png"),
     ):
         next(iterator)
+
+
+def test_broken_clips_are_a_share_of_all_clips_whatever_the_number_of_processes():
+    """Five of five hundred are within one in a hundred, on however few processes the run goes on."""
+    options = {"datasets": {"numbered": Numbered(8)}, "batch_size": 16, "max_broken": 0.006}
+    with batches(**options) as iterator:
+        state = iterator.get_state()
+    state |= {"examples": 16_000, "broken": {"count": 60, "clips": 16_000, "messages": ["gone"]}}
+    with batches(**options, process_index=0, process_count=16) as iterator:
+        iterator.set_state(state)
+        next(iterator)
+        assert iterator.broken.get_state() == {"count": 60, "clips": 16_001, "messages": ["gone"]}
+
+
+def test_a_sequence_that_cannot_be_listed_changes_no_other_clip():
+    class Unlisted(Numbered):
+        def num_frames(self, sequence: str) -> int:
+            if sequence == "s3":
+                raise ValueError("s3/poses.txt: expected 16 numbers")
+            return super().num_frames(sequence)
+
+    with batches(max_broken=0.5) as iterator:
+        intact, state = clips(iterator, 4), iterator.get_state()
+    with batches({"numbered": Unlisted(8)}, max_broken=0.5) as iterator:
+        drawn = clips(iterator, 4)
+        assert {name: value for name, value in iterator.get_state().items() if name != "broken"} == {
+            name: value for name, value in state.items() if name != "broken"
+        }
+        assert iterator.broken.messages == ["s3/poses.txt: expected 16 numbers"]
+    assert [clip for clip in intact if clip[0] != 3] == [b for a, b in zip(intact, drawn, strict=True) if a[0] != 3]
+    with pytest.raises(ValueError, match="s3/poses"):
+        batches({"numbered": Unlisted(8)})
 
 
 def test_an_error_costs_no_clip_of_its_batch():

@@ -41,6 +41,11 @@ def test_validation_sequences_are_not_trained_on() -> None:
         open_sources(data(), rooms("train"))
 
 
+def test_a_rule_for_a_data_set_that_does_not_exist_is_refused() -> None:
+    with pytest.raises(ValueError, match="hold_out names unknown data sets: scan_net; known are co3dv2"):
+        open_sources(data(hold_out=(("scan_net", HoldOut(split="test")),)))
+
+
 def test_missing_data_sets_are_an_error_unless_allowed(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, run_config: TrainConfig
 ) -> None:

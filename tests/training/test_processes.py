@@ -11,8 +11,9 @@ import jax
 import numpy as np
 import pytest
 
+from logvggt_jax.training import processes
 from logvggt_jax.training.metrics_log import read_metrics
-from logvggt_jax.training.processes import any_process, join_processes
+from logvggt_jax.training.processes import any_process, check_agreement, join_processes
 from logvggt_jax.weights.checkpoints import load_model
 
 ROOT = Path(__file__).parents[2]
@@ -42,6 +43,16 @@ def test_one_process_alone_answers_for_itself() -> None:
     assert jax.process_count() == 1
     assert any_process(True)
     assert not any_process(False)
+    check_agreement("anything", {"a": 1})
+
+
+def test_processes_that_differ_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jax, "process_count", lambda: 3)
+    monkeypatch.setattr(
+        processes.multihost_utils, "process_allgather", lambda digest: np.stack([digest, digest + 1, digest])
+    )
+    with pytest.raises(ValueError, match=r"the data of the processes \[1\] differ from those of process 0"):
+        check_agreement("the data", {"a": 1})
 
 
 def test_half_an_address_is_refused() -> None:
