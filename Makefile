@@ -36,7 +36,7 @@ demo: install
 	  --checkpoint=$(DEMO)/training/model --output=$(DEMO)/evaluation
 	@echo
 	@echo "Results in $(DEMO)/:"
-	@echo "  evaluation/report.md           the tables above; results.json has the same numbers"
+	@echo "  evaluation/report.html         the tables above and the figures on one page; report.md and results.json as well"
 	@echo "  evaluation/figures/            trajectories and depth beside the truth"
 	@echo "  reconstruction/points.ply      coloured point cloud of a room that training never saw"
 	@echo "  reconstruction/trajectory.txt  its camera path (TUM format); cameras.json has the intrinsics as well"
