@@ -36,7 +36,7 @@ class BrokenClips:
         Raises TooManyBrokenClips if more than `max_share` of them are broken.
         """
         for message in messages:
-            logging.warning("broken clip, replaced by the next of its data set: %s", message)
+            logging.warning("broken clip, replaced by the next one: %s", message)
             if message not in self.messages and len(self.messages) < _KEPT:
                 self.messages.append(message)
         self.count += len(messages)

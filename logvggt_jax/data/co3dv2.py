@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from logvggt_jax.data.co3d_annotations import FrameAnnotation, frame_annotations, quality_scores
-from logvggt_jax.data.errors import UnequalSizes, missing_files
+from logvggt_jax.data.errors import EmptySplit, UnequalSizes, missing_files
 from logvggt_jax.data.folder_dataset import FolderDataset, FrameRecord, Listing
 from logvggt_jax.data.image_files import read_depth, read_rgb
 from logvggt_jax.data.listing_index import SourceFiles
@@ -85,6 +85,7 @@ class Co3Dv2(FolderDataset):
 
     def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
         places: dict[str, Path] = {}
+        lists_name_any = False
         categories = [
             self.root / name
             for name in files.names(self.root, self.expects)
@@ -98,10 +99,12 @@ class Co3Dv2(FolderDataset):
             }
             listed = self._listed_frames(category, files)
             if listed is not None:
+                lists_name_any |= bool(listed)
                 chosen = set(sequences_present({name for name, _ in listed} & good, chosen, category / "set_lists"))
             places |= {f"{category.name}/{name}": category / name for name in sorted(chosen)}
         if categories and not places and self.split != "all":
-            raise FileNotFoundError(
+            error = EmptySplit if lists_name_any else FileNotFoundError
+            raise error(
                 f"{self.root}: the set lists of {len(categories)} categories name no sequence here for split "
                 f"{self.split!r}; unpack the sequences and lists (the single-sequence subset has none) or choose "
                 "split='all'"

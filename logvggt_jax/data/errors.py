@@ -61,3 +61,9 @@ class EmptySequence(ValueError):
     """A sequence without any frame that counts."""
 
     kind: ClassVar[str] = "empty sequence"
+
+
+class EmptySplit(FileNotFoundError):
+    """A split whose lists are there and name none of the sequences that this copy has."""
+
+    kind: ClassVar[str] = "empty split"

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import signal
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -29,8 +29,9 @@ Size = tuple[int, int]
 
 _FIELDS = ("images", "depth", "intrinsics", "extrinsics")
 _BROKEN = "broken"
-# So many clips of a set in a row are broken only if nearly all are.
+# So many clips in a row are broken only if nearly all of those sequences are.
 _MOST_REPLACEMENTS = 16
+_SHOWN = 16
 _SIZE_READERS = 16
 
 
@@ -69,25 +70,32 @@ class _ClipReader:
 
 
 class _ReplaceBroken:
-    """Reads with `read`; where that fails, the next index of `sequences` (index to name) takes the clip's place."""
+    """Reads from the first of `streams`; where that fails, the clip of the next index takes the clip's place.
 
-    def __init__(self, read: _ClipReader, sequences: grain.MapDataset) -> None:
-        self.read, self.sequences = read, sequences
+    Where many in a row fail, the next stream goes on from the same index.
+
+    Args:
+      streams: (reader, its sequences: index to name) each, all of one size.
+    """
+
+    def __init__(self, streams: Sequence[tuple[_ClipReader, grain.MapDataset]]) -> None:
+        self.streams = tuple(streams)
 
     def __call__(self, index: int, sequence: str) -> dict[str, Any]:
         broken: list[str] = []
-        while len(broken) < _MOST_REPLACEMENTS:
-            position = index + len(broken)
-            try:
-                # Of the clips passed over, later ones are reported in their own turn.
-                return {**self.read(position, self.sequences[position]), _BROKEN: broken[:1]}
-            # Whatever a decoder raises: a run of a week is not to end for one file.
-            except Exception as error:
-                broken.append(describe(error))
-        height, width = self.read.size
+        for read, sequences in self.streams:
+            for position in range(index, index + _MOST_REPLACEMENTS):
+                try:
+                    # Of the clips passed over, later ones are reported in their own turn.
+                    return {**read(position, sequences[position]), _BROKEN: broken[:1]}
+                # Whatever a decoder raises: a run of a week is not to end for one file.
+                except Exception as error:
+                    broken.append(describe(error))
+        names = ", ".join(dict.fromkeys(read.name for read, _ in self.streams))
+        height, width = self.streams[0][0].size
         raise ValueError(
-            f"{self.read.name}, pictures for {height} x {width}: {len(broken)} clips in a row are broken: "
-            f"{'; '.join(broken)}"
+            f"{names}, pictures for {height} x {width}: {len(broken)} clips in a row are broken: "
+            f"{'; '.join(list(dict.fromkeys(broken))[:_SHOWN])}"
         )
 
 
@@ -247,7 +255,8 @@ def training_batches(
     come as often as their sequences do under `weights`.
 
     A clip is broken if it cannot be read, fails `check_frames` or has too little depth. The one of the next index of
-    its data set takes its place, which again depends on seed, index and data alone; it is logged and counted.
+    its data set takes its place; where that set has none of this size that can be read, one of another shape, cut to
+    the size, or of another set. Which one depends again on seed, index and data alone. It is logged and counted.
 
     Workers hand clips over in shared memory: in a container, /dev/shm must hold three clips a worker.
 
@@ -317,22 +326,39 @@ def training_batches(
         for name, dataset in datasets.items()
     }
 
-    def clips(position: int, name: str, size_index: int) -> grain.MapDataset:
-        # Each data set and size draws from its own stream, so that equal numbers do not mean equal choices.
-        own_seed = int(np.random.SeedSequence([seed, position, size_index]).generate_state(1)[0])
-        names = grain.MapDataset.source(sequences[name][size_index]).seed(own_seed).shuffle().repeat()
-        size = sizes[size_index]
-        read = _ClipReader(name, datasets[name], samplers[name], size, own_seed, augmentation, min_valid_depth)
-        reader: Callable[[int, str], Any] = read if max_broken == 0 else _ReplaceBroken(read, names)
-        return names.map_with_index(reader)
+    # Each data set and size draws from its own stream, so that equal numbers do not mean equal choices.
+    own_seeds, names = {}, {}
+    for position, name in enumerate(datasets):
+        for size_index, part in enumerate(sequences[name]):
+            if part:
+                own_seed = int(np.random.SeedSequence([seed, position, size_index]).generate_state(1)[0])
+                own_seeds[name, size_index] = own_seed
+                names[name, size_index] = grain.MapDataset.source(part).seed(own_seed).shuffle().repeat()
+
+    def clips(name: str, size_index: int) -> grain.MapDataset:
+        def stream(name: str, part: int) -> tuple[_ClipReader, grain.MapDataset]:
+            own_seed = own_seeds[name, part]
+            return (
+                _ClipReader(
+                    name, datasets[name], samplers[name], sizes[size_index], own_seed, augmentation, min_valid_depth
+                ),
+                names[name, part],
+            )
+
+        read, own = stream(name, size_index)
+        if max_broken == 0:
+            return own.map_with_index(read)
+        # Where all of its own is broken: of the same set in other shapes, cut to this one, then of the other sets.
+        order = sorted(names, key=lambda key: (key != (name, size_index), key[0] != name))
+        return own.map_with_index(_ReplaceBroken([stream(*key) for key in order]))
 
     examples: list[grain.MapDataset] = []
     size_shares: list[float] = []
     for size_index in range(len(sizes)):
         parts, part_shares = [], []
-        for position, name in enumerate(datasets):
+        for name in datasets:
             if count := len(sequences[name][size_index]):
-                parts.append(clips(position, name, size_index))
+                parts.append(clips(name, size_index))
                 part_shares.append(shares[name] * count / sum(map(len, sequences[name])))
         if parts:
             examples.append(parts[0] if len(parts) == 1 else grain.MapDataset.mix(parts, weights=part_shares))

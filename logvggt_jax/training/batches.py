@@ -11,6 +11,7 @@ import jax
 from absl import logging
 
 from logvggt_jax.data.dataset import Dataset
+from logvggt_jax.data.errors import EmptySplit
 from logvggt_jax.data.holdouts import check_disjoint, check_held_out
 from logvggt_jax.data.pipeline import BatchIterator, training_batches
 from logvggt_jax.data.registry import DATASETS, open_dataset
@@ -60,7 +61,10 @@ def open_sources(config: DataConfig, validation: SourceConfig | None = None) -> 
 
 
 def _split_sequences(source: SourceConfig, split: str) -> Sequence[str]:
-    return open_source(dataclasses.replace(source, split=split)).sequences
+    try:
+        return open_source(dataclasses.replace(source, split=split)).sequences
+    except EmptySplit:  # A partial copy without the sequences that are evaluated on.
+        return ()
 
 
 def _present(config: DataConfig) -> list[SourceConfig]:

@@ -12,6 +12,7 @@ from jax.sharding import Mesh
 from rich.console import Console
 
 from logvggt_jax.data.dataset import Dataset
+from logvggt_jax.data.pipeline import BatchIterator
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.training.batches import open_sources, stage_batches
 from logvggt_jax.training.checkpoints import Position, RunCheckpoints
@@ -98,18 +99,22 @@ class _Run:
     ) -> None:
         """All stages that are not finished."""
         step, end = int(self.state.step), 0
+        left: list[tuple[int, StageConfig, int, BatchIterator]] = []
+        # All of them at once: data that do not fit the last stage are an error of the first minute.
         for index, stage in enumerate(self.config.stages):
             end += stage.steps
             if step >= end:
                 continue
             seed = self.config.seed * len(self.config.stages) + index
-            with stage_batches(datasets, self.config.data, stage, seed=seed) as source:
-                if position is not None and position.stage == index:
-                    source.set_state(position.data)
-                # Otherwise they would wait for one another in different programs.
-                check_agreement(f"stage {stage.name!r}: the data", {**source.get_state(), "broken": None})
-                with DeviceBatches(source, self.mesh) as batches:
-                    step, ended = self._train_stage(index, stage, batches, step, end, log, stop)
+            source = stage_batches(datasets, self.config.data, stage, seed=seed)
+            if position is not None and position.stage == index:
+                source.set_state(position.data)
+            # Otherwise they would wait for one another in different programs.
+            check_agreement(f"stage {stage.name!r}: the data", {**source.get_state(), "broken": None})
+            left.append((index, stage, end, source))
+        for index, stage, end, source in left:
+            with source, DeviceBatches(source, self.mesh) as batches:
+                step, ended = self._train_stage(index, stage, batches, step, end, log, stop)
             if ended:
                 break
         log.say(f"{step}/{self.config.total_steps} steps done; model in {self.checkpoints.model_folder}")

@@ -15,6 +15,7 @@ from room_views import check_views, room_views
 
 from logvggt_jax.data import co3dv2
 from logvggt_jax.data.co3dv2 import Co3Dv2
+from logvggt_jax.data.errors import EmptySplit
 
 LANDSCAPE, PORTRAIT = (48, 64), (64, 48)
 NAME = "apple/110_13051_23361"
@@ -196,6 +197,13 @@ def test_missing_and_damaged_set_lists_are_named(root: Path):
     write_list(root, "apple", "manyview_dev_0", train=[[NAME.split("/")[1], 4, "x"]])
     with pytest.raises(FileNotFoundError, match=r"name no sequence here for split 'train'.*split='all'"):
         Co3Dv2(root, "train")
+    # Lists that name only what this copy does not have are no damage to the copy: nothing of it is held out.
+    write_list(root, "apple", "fewview_dev", test=[["absent", 4, "x"]])
+    with pytest.raises(EmptySplit, match=r"name no sequence here for split 'test'"):
+        Co3Dv2(root, "test")
+    with pytest.raises(FileNotFoundError) as unlisted:
+        Co3Dv2(root, "train")
+    assert not isinstance(unlisted.value, EmptySplit)
     for text in ("{", "{}", '{"test": [["a"]]}', '{"test": [["a", "b", "c"]]}'):
         (root / "apple/set_lists/set_lists_fewview_dev.json").write_text(text)
         with pytest.raises(ValueError, match=r"set_lists_fewview_dev\.json"):

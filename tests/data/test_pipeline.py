@@ -317,6 +317,53 @@ def test_a_set_that_cannot_be_read_at_all_ends_the_run():
         next(iterator)
 
 
+class WithoutUpright(Shaped):
+    """Like `Shaped`; no upright sequence can be read."""
+
+    def read(self, sequence: str, indices) -> Frames:
+        if int(sequence[1:]) % 3 == 0:
+            raise ValueError(f"{sequence}/calibration.txt: missing")
+        return super().read(sequence, indices)
+
+
+def test_a_shape_of_which_all_is_broken_is_replaced_by_the_other_shapes_of_its_set():
+    options = {"sizes": [(14, 28), (28, 14)], "max_broken": 0.9}
+    with batches({"shaped": Shaped(9)}, **options) as iterator:
+        shapes = [next(iterator)["images"].shape[2:4] for _ in range(12)]
+    datasets = {"shaped": WithoutUpright(9)}
+    with batches(datasets, **options) as iterator:
+        drawn = [next(iterator) for _ in range(6)]
+        state = json.loads(json.dumps(iterator.get_state()))
+        drawn += [next(iterator) for _ in range(6)]
+        total = iterator.broken.get_state()
+    upright = [batch for batch in drawn if batch["images"].shape[2:4] == (28, 14)]
+    assert [batch["images"].shape[2:4] for batch in drawn] == shapes and len(upright) > 2
+    # Each broken clip once, and none of them in a batch.
+    assert total["count"] == 4 * len(upright)
+    assert all(int(clip[0, 0, 0, 0]) % 3 for batch in drawn for clip in batch["images"])
+    assert len({clip[:, 0, 0, :2].tobytes() for batch in upright for clip in batch["images"]}) > 4
+    for workers in (0, 2):
+        with batches(datasets, **options, worker_count=workers) as iterator:
+            iterator.set_state(state)
+            for expected in drawn[6:]:
+                batch = next(iterator)
+                assert all(np.array_equal(batch[name], expected[name]) for name in expected)
+            assert iterator.broken.get_state() == total
+
+
+def test_a_set_of_which_all_is_broken_is_replaced_by_the_others_until_too_many_are():
+    class Gone(Numbered):
+        def read(self, sequence: str, indices) -> Frames:
+            raise FileNotFoundError(f"{sequence}.png: no such file")
+
+    options = {"datasets": {"gone": Gone(3), "numbered": Numbered(8)}, "weights": {"gone": 0.1, "numbered": 0.9}}
+    with batches(**options, max_broken=0.2) as iterator:
+        assert {clip[0] for clip in clips(iterator, 10)} == set(range(8))
+        assert 2 < iterator.broken.count < 6 and all("no such file" in text for text in iterator.broken.messages)
+    with batches(**options, max_broken=0.05) as iterator, pytest.raises(TooManyBrokenClips, match=r"s\d.png: no such"):
+        clips(iterator, 200)
+
+
 def test_broken_clips_are_a_share_of_all_clips_whatever_the_number_of_processes():
     """Five of five hundred are within one in a hundred, on however few processes the run goes on."""
     options = {"datasets": {"numbered": Numbered(8)}, "batch_size": 16, "max_broken": 0.006}

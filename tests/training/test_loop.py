@@ -134,6 +134,17 @@ def test_number_of_devices_may_change(
 
 
 @pytest.mark.usefixtures("quick")
+def test_data_that_do_not_fit_the_last_stage_are_an_error_before_the_first(
+    run_config: TrainConfig, tmp_path: Path
+) -> None:
+    *stages, last = run_config.stages
+    longer = dataclasses.replace(last, clip_length=9)  # than the rooms' eight frames
+    with pytest.raises(ValueError, match="rooms: none of 8 sequences has"):
+        train(dataclasses.replace(run_config, stages=(*stages, longer)), tmp_path, mesh=data_mesh(1))
+    assert not _numbers(tmp_path)
+
+
+@pytest.mark.usefixtures("quick")
 def test_time_limit_ends_the_run_with_a_checkpoint(run_config: TrainConfig, tmp_path: Path) -> None:
     limited = dataclasses.replace(run_config, max_minutes=1e-9)
     # The limit belongs to a session, not to the run: each one gets a step further.
