@@ -58,7 +58,7 @@ def get_config() -> ConfigDict:
     }
     config.stages = {
         "stage_1": _stage(steps=2900, clip_length=4, batch_size=8, strides=(1, 6)),
-        "stage_2": _stage(steps=2650, clip_length=12, batch_size=4, strides=(1, 4)),
+        "stage_2": _stage(steps=2200, clip_length=12, batch_size=4, strides=(1, 4)),
     }
     config.optimizer = {
         "learning_rate": 1e-3,
