@@ -23,8 +23,9 @@ from logvggt_jax.evaluation.environment import checkpoint_identity
 from logvggt_jax.evaluation.methods import network
 from logvggt_jax.evaluation.references import reference_methods
 from logvggt_jax.evaluation.report import print_report, write_report
-from logvggt_jax.evaluation.runner import evaluate
-from logvggt_jax.evaluation.settings import read_run
+from logvggt_jax.evaluation.runner import evaluate, write_results
+from logvggt_jax.evaluation.settings import BenchmarkRun, read_run
+from logvggt_jax.evaluation.throughput import measured_timings
 from logvggt_jax.evaluation.variants import variant_methods
 from logvggt_jax.inference.compilation_cache import enable_compilation_cache
 from logvggt_jax.weights import load_model
@@ -48,10 +49,10 @@ def main(arguments: Sequence[str]) -> None:
         benchmarks, baselines = open_run(run, _DATA_ROOT.value)
         enable_compilation_cache(_CACHE.value)
         model, variables = load_model(_CHECKPOINT.value)
-        methods = [network(model, variables)]
-        if run.references is not None:
-            methods += reference_methods(model, variables, run.references)
+        references = [] if run.references is None else reference_methods(model, variables, run.references)
+        methods = [network(model, variables), *references]
         methods += [*variant_methods(model, variables, run.variants), *baselines(model)]
+        identity = checkpoint_identity(_CHECKPOINT.value)
         results = evaluate(
             benchmarks,
             methods,
@@ -59,10 +60,16 @@ def main(arguments: Sequence[str]) -> None:
             title=run.title,
             command=shlex.join(["python", *sys.argv]),
             configuration=dataclasses.asdict(run),
-            identity=checkpoint_identity(_CHECKPOINT.value),
+            identity=identity,
             max_sequences=run.max_sequences,
             figures=run.figures,
         )
+        if isinstance(run, BenchmarkRun) and run.timings is not None:
+            edge = run.protocol.longer_edge
+            results["timings"] = measured_timings(
+                model, variables, references, run.timings, output, longer_edge=edge, identity=identity
+            )
+            write_results(results, output)
         write_report(results, output)
     except (ValueError, OSError, ImportError) as error:
         # Errors of settings, data and checkpoints say in one line what to mend; -v 1 shows where they arose.

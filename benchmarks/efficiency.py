@@ -16,7 +16,6 @@ import argparse
 import dataclasses
 import json
 import os
-import platform
 import shlex
 import statistics
 import sys
@@ -38,7 +37,6 @@ from logvggt_jax.evaluation.efficiency import (
     PARTS,
     PartTime,
     flops_by_part,
-    live_device_bytes,
     matmul_flops_per_second,
     peak_device_bytes,
     peak_host_bytes,
@@ -46,56 +44,11 @@ from logvggt_jax.evaluation.efficiency import (
     spread,
     time_part,
 )
+from logvggt_jax.evaluation.environment import describe_device
 from logvggt_jax.evaluation.plots import efficiency_plot
-from logvggt_jax.inference import StreamSession
+from logvggt_jax.evaluation.throughput import random_pictures, refinement_modes, time_stream
 
 MIB = 2**20
-# Distinct pictures; a stream shows them in turn.
-PICTURES = 16
-
-
-@dataclasses.dataclass(frozen=True)
-class Run:
-    """One stream: seconds in all, until the first result, of each step; most bytes of arrays alive between frames."""
-
-    seconds: float
-    first_result: float
-    steps: list[float]
-    live_bytes: int
-
-
-def configurations(base: ModelConfig, context: int) -> dict[str, ModelConfig]:
-    """The modes: GCCR once at the end or after every window, the trunk over all frames or limited."""
-
-    def refined(period: int | None, context: int | None) -> ModelConfig:
-        settings = dataclasses.replace(base.refinement, enabled=True, period=period, context=context)
-        return dataclasses.replace(base, refinement=settings)
-
-    return {
-        "full": refined(None, None),
-        "full+context": refined(None, context),
-        "online": refined(base.windows.stride, None),
-        "online+context": refined(base.windows.stride, context),
-    }
-
-
-def stream(model: LogVGGT, variables: Any, pictures: np.ndarray, num_frames: int, *, watch: bool = False) -> Run:
-    """Sends frames through a session; `watch` looks at memory between them, which takes time of its own."""
-    session = StreamSession(model, variables)
-    steps: list[float] = []
-    first_result, live = 0.0, 0
-    started = time.perf_counter()
-    for index in range(num_frames):
-        pushed = time.perf_counter()
-        results = session.push(pictures[index % PICTURES])
-        if results:
-            steps.append(time.perf_counter() - pushed)
-            first_result = first_result or time.perf_counter() - started
-        if watch:
-            live = max(live, live_device_bytes())
-    session.close()
-    session.cameras()
-    return Run(time.perf_counter() - started, first_result, steps, live)
 
 
 def speed(
@@ -105,8 +58,8 @@ def speed(
     rows = []
     for length in sorted(lengths):
         for mode, model in models.items():
-            warm = stream(model, variables, pictures, length, watch=True)
-            runs = [stream(model, variables, pictures, length) for _ in range(rounds)]
+            warm = time_stream(model, variables, pictures, length, watch=True)
+            runs = [time_stream(model, variables, pictures, length) for _ in range(rounds)]
             rows.append(
                 {
                     "mode": mode,
@@ -130,7 +83,7 @@ def ratios(models: dict[str, LogVGGT], variables: Any, pictures: np.ndarray, pai
     found: dict[str, list[float]] = {mode: [] for mode in models}
     for mode, model in models.items():
         for _ in range(pairs):
-            rates = [n / stream(model, variables, pictures, n).seconds for n in (short, long)]
+            rates = [n / time_stream(model, variables, pictures, n).seconds for n in (short, long)]
             found[mode].append(rates[1] / rates[0])
     return {"short": short, "long": long, "ratios": found}
 
@@ -152,17 +105,6 @@ def transfer(pictures: np.ndarray, stride: int) -> dict[str, float]:
         "to_device_ms": 1e3 * statistics.median(there) / stride,
         "to_host_ms": 1e3 * statistics.median(back) / stride,
     }
-
-
-def describe_device() -> str:
-    """The default device by name; of a CPU its model and cores, where the system tells."""
-    device = jax.devices()[0]
-    if device.platform != "cpu":
-        return f"{device.device_kind} ({device.platform}), host with {os.cpu_count()} cores"
-    information = Path("/proc/cpuinfo")
-    lines = information.read_text().splitlines() if information.is_file() else []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return f"{names[0] if names else platform.machine()}, {os.cpu_count()} cores"
 
 
 def by_part(model: LogVGGT, variables: Any, length: int, image_size: tuple[int, int], rounds: int) -> list[PartTime]:
@@ -258,10 +200,10 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
         variables = LogVGGT(base).init(jax.random.key(0), jnp.zeros((1, 1, *options.image_size, 3), jnp.uint8))
     variables = jax.device_put(variables)
     context = options.context or base.windows.size
-    known = {mode: LogVGGT(config) for mode, config in configurations(base, context).items()}
+    known = {mode: LogVGGT(config) for mode, config in refinement_modes(base, context).items()}
     models = {mode: known[mode] for mode in options.modes}
     lengths = sorted(options.lengths)
-    pictures = np.random.default_rng(0).integers(0, 256, (PICTURES, *options.image_size, 3), np.uint8)
+    pictures = random_pictures(options.image_size)
     # Counts first: they need no quiet machine, and their memory is gone before peaks are read.
     flops = {mode: {n: flops_by_part(model, n, options.image_size) for n in lengths} for mode, model in known.items()}
     rows = speed(models, variables, pictures, lengths, options.rounds)

@@ -21,7 +21,7 @@ ALLOWED = {
     "weights": {"types", "config", "geometry", "model"},
     "training": {"types", "config", "geometry", "model", "weights", "data", "evaluation"},
     "inference": {"types", "config", "user_cache", "geometry", "model", "weights", "data"},
-    "evaluation": {"types", "config", "geometry", "model", "weights", "data"},
+    "evaluation": {"types", "config", "geometry", "model", "weights", "data", "inference"},
 }
 ENTRY_POINTS = {"__init__", "__main__", "cli"}
 

@@ -27,6 +27,9 @@ def get_config() -> ConfigDict:
     # Names of logvggt_jax/evaluation/variants.py, evaluated beside the network.
     config.variants = ()
 
+    # Sequences that are timed on this device for the tables of cost: --config.timings.lengths="(100, 200)" for fewer.
+    config.timings = ConfigDict({"lengths": (100, 200, 500, 1000), "rounds": 3})
+
     config.protocol = protocol = ConfigDict()
     protocol.longer_edge = 518
     # None compares all points, 10 to 50 million a sequence.

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import importlib.metadata
+import os
+import platform
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -20,6 +22,17 @@ def environment() -> dict[str, Any]:
         "commit": _commit(Path(__file__).parent),
         "device": str(jax.devices()[0].device_kind),
     }
+
+
+def describe_device() -> str:
+    """The default device by name; of a CPU its model and cores, where the system tells."""
+    device = jax.devices()[0]
+    if device.platform != "cpu":
+        return f"{device.device_kind} ({device.platform}), host with {os.cpu_count()} cores"
+    information = Path("/proc/cpuinfo")
+    lines = information.read_text().splitlines() if information.is_file() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return f"{names[0] if names else platform.machine()}, {os.cpu_count()} cores"
 
 
 def checkpoint_identity(path: str | Path) -> str:

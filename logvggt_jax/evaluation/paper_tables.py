@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.resources
 import json
+import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -75,7 +76,7 @@ def paper_tables(results: Mapping[str, Any]) -> list[Table]:
             results,
         ),
     ]
-    return [*tables, *_timings(paper)]
+    return [*tables, *_timings(paper, results.get("timings"))]
 
 
 def _by_count(data: Mapping[str, Any], columns: Any) -> list[tuple[str, Any, list[PaperColumn]]]:
@@ -211,12 +212,47 @@ def _own_cell(results: Mapping[str, Any], method: str, column: PaperColumn) -> s
     return " / ".join(f"{column.factor * number:.{column.decimals}f}" for number in numbers) + share
 
 
-def _timings(paper: Mapping[str, Any]) -> Iterator[Table]:
-    note = ("Times depend on the machine: `python benchmarks/efficiency.py` measures ours by the paper's parts.",)
+def _timings(paper: Mapping[str, Any], measured: Mapping[str, Any] | None) -> Iterator[Table]:
     runtime = paper["runtime_breakdown_1000_frames"]["data"]
-    rows = [[name, f"{v['runtime_ms']:,.0f}", f"{v['share_percent']:.2f} %"] for name, v in runtime.items()]
-    yield Table("Runtime of 1,000 frames (appendix), the paper's", ["component", "runtime (ms)", "share"], rows, note)
+    rows = [
+        [f"{name} (paper)", f"{v['runtime_ms']:,.0f}", f"{v['share_percent']:.2f} %"] for name, v in runtime.items()
+    ]
     fps = paper["fps"]["data"]
     lengths = list(next(iter(fps.values())))
-    rows = [[name, *(f"{values[length]:.1f}" for length in lengths)] for name, values in fps.items()]
-    yield Table("Frames per second (appendix), the paper's", ["method", *lengths], rows, note)
+    speeds = [[f"{name} (paper)", *(f"{values[length]:.1f}" for length in lengths)] for name, values in fps.items()]
+    notes: tuple[str, ...] = ("The paper does not name the hardware behind its times.",)
+    if measured is None:
+        notes += ("This run timed nothing: `timings` of its configuration is None.",)
+    else:
+        notes += (_timing_setting(measured),)
+        total = sum(part["seconds"] for part in measured["parts"])
+        frames = measured["part_frames"]
+        for part in [*measured["parts"], {"name": "total", "seconds": total}]:
+            name = f"{THIS_RUN}{part['name']}" + ("" if frames == 1000 else f", {frames} frames")
+            rows.append([name, f"{1e3 * part['seconds']:,.0f}", f"{part['seconds'] / total:.2%}".replace("%", " %")])
+        lengths += [length for length in map(str, measured["lengths"]) if length not in lengths]
+        speeds = [row + ["-"] * (len(lengths) + 1 - len(row)) for row in speeds]
+        reasons: dict[str, str] = {}
+        for name, rates in measured["frames_per_second"].items():
+            speeds.append([f"{THIS_RUN}{name}", *(_rate(rates.get(length)) for length in lengths)])
+            reasons |= {f"{name}, {n} frames": why for n, why in rates.items() if isinstance(why, str)}
+        notes += tuple(f"No rate of {where}: {why}." for where, why in reasons.items())
+    yield Table("Runtime of 1,000 frames (appendix)", ["component", "runtime (ms)", "share"], rows, notes[:2])
+    yield Table("Frames per second (appendix)", ["method", *lengths], speeds, notes)
+
+
+def _timing_setting(measured: Mapping[str, Any]) -> str:
+    height, width = measured["image_size"]
+    size, stride = measured["windows"]
+    return (
+        f"This run: {measured['device']}, {measured['dtype']}, {width} x {height} pixels, K = {size}, stride {stride}, "
+        f"batch 1; pictures from and depth to host memory within the time, files without; median of "
+        f"{measured['rounds']} rounds with extremes, after one that does not count. The parts of the runtime were "
+        "timed one by one."
+    )
+
+
+def _rate(rates: Sequence[float] | str | None) -> str:
+    if rates is None or isinstance(rates, str):
+        return "-"
+    return f"{statistics.median(rates):.1f} ({min(rates):.1f} to {max(rates):.1f})"

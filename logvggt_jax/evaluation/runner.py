@@ -148,8 +148,13 @@ def evaluate(
             "environments": records.environments,
         }
     )
-    write_text(output / "results.json", json.dumps(results, indent=1) + "\n")
+    write_results(results, output)
     return results
+
+
+def write_results(results: Mapping[str, Any], output: Path) -> None:
+    """results.json, whole or not at all."""
+    write_text(output / "results.json", json.dumps(results, indent=1) + "\n")
 
 
 def plan_clips(

@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 
 from logvggt_jax.evaluation.protocols.protocol import ProtocolSettings
 from logvggt_jax.evaluation.references import ReferenceConfig
+from logvggt_jax.evaluation.throughput import TimingConfig
 
 Settings = TypeVar("Settings")
 
@@ -115,6 +116,7 @@ class BenchmarkRun:
       figures: clips of each benchmark that are drawn, for the first method.
       references: limits of the reference models; None leaves them out.
       variants: names of `logvggt_jax.evaluation.variants.VARIANTS` that are evaluated beside the network.
+      timings: sequences that are timed for the paper's tables of cost; None leaves them out.
     """
 
     title: str
@@ -125,6 +127,7 @@ class BenchmarkRun:
     figures: int = 1
     references: ReferenceConfig | None = None
     variants: tuple[str, ...] = ()
+    timings: TimingConfig | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "benchmarks", tuple(self.benchmarks))
@@ -136,11 +139,13 @@ class BenchmarkRun:
     def from_dict(cls, values: Mapping[str, Any]) -> BenchmarkRun:
         """From a configuration file's mapping; ValueError for an unknown or missing field, naming it."""
         run = _from_mapping(cls, values, "")
+        timings = values.get("timings")
         return dataclasses.replace(
             run,
             protocol=_from_mapping(ProtocolSettings, values["protocol"], "protocol."),
             references=_references(values),
             variants=tuple(run.variants),
+            timings=None if timings is None else _from_mapping(TimingConfig, timings, "timings."),
         )
 
 

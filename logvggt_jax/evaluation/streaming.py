@@ -34,6 +34,20 @@ class StreamedClip(NamedTuple):
     intrinsics: np.ndarray
 
 
+class StreamedWindows(NamedTuple):
+    """What the windows of a clip give, numpy arrays in the order of its frames.
+
+    Attributes:
+      depth: [T, H, W] float32 z-depth; on disk where it is large.
+      camera_tokens: [T, 2C].
+      register_tokens: [T, R, 2C].
+    """
+
+    depth: np.ndarray
+    camera_tokens: np.ndarray
+    register_tokens: np.ndarray
+
+
 @functools.partial(jax.jit, static_argnums=0)
 def _start(model: LogVGGT, variables: Any, frames: jax.Array, mask: jax.Array) -> WindowState:
     return model.start(variables, frames, mask)
@@ -67,17 +81,21 @@ def stream_clip(model: LogVGGT, variables: Any, images: np.ndarray) -> StreamedC
       variables: {"params": …}, on the device.
       images: [T, H, W, 3] uint8, T >= 1; may be a memory map.
     """
-    windows = model.config.windows
-    # Windows know nothing of refinement: models that differ in its mode share their programs.
-    plain = dataclasses.replace(model.config.refinement, enabled=True, period=None, context=None)
-    network = LogVGGT(dataclasses.replace(model.config, refinement=plain))
+    windows = stream_windows(model, variables, images)
+    return StreamedClip(windows.depth, *refined_cameras(model, variables, windows))
+
+
+def stream_windows(model: LogVGGT, variables: Any, images: np.ndarray) -> StreamedWindows:
+    """All windows of a clip, without refinement and cameras; arguments as of `stream_clip`."""
+    size, stride = model.config.windows.size, model.config.windows.stride
+    network = without_refinement(model)
     collector = _Collector(images.shape)
-    held = windows.size - windows.stride
+    held = size - stride
     state = _start(network, variables, *_slice(images, 0, held))
-    firsts = range(held, max(len(images), held + 1), windows.stride)
+    firsts = range(held, max(len(images), held + 1), stride)
     waiting: WindowOutput | None = None
     for first in track(firsts, len(firsts), f"network, {len(images)} frames"):
-        state, output = _step(network, variables, state, *_slice(images, first, windows.stride))
+        state, output = _step(network, variables, state, *_slice(images, first, stride))
         # The device works on this window while the last one's depth is written.
         if waiting is not None:
             collector.take(waiting)
@@ -85,12 +103,38 @@ def stream_clip(model: LogVGGT, variables: Any, images: np.ndarray) -> StreamedC
     assert waiting is not None  # there is at least one step
     collector.take(waiting)
     collector.take(_finish(network, variables, state))
-    return collector.clip(model, variables)
+    return collector.windows()
+
+
+def without_refinement(model: LogVGGT) -> LogVGGT:
+    """The model as windows know it: models that differ in refinement alone share their programs."""
+    plain = dataclasses.replace(model.config.refinement, enabled=True, period=None, context=None)
+    return LogVGGT(dataclasses.replace(model.config, refinement=plain))
+
+
+def refined_cameras(model: LogVGGT, variables: Any, windows: StreamedWindows) -> tuple[np.ndarray, np.ndarray]:
+    """Extrinsics [T, 3, 4] and intrinsics [T, 3, 3] of a clip, in the model's mode of refinement.
+
+    Args:
+      model: that of `windows`, but for its refinement.
+      variables: {"params": …}, on the device.
+      windows: of the whole clip.
+    """
+    count = len(windows.depth)
+    padding = -count % _CHUNK
+    camera, register = (
+        np.pad(tokens, [(0, padding), *[(0, 0)] * (tokens.ndim - 1)])[None]
+        for tokens in (windows.camera_tokens, windows.register_tokens)
+    )
+    mask = (np.arange(count + padding) < count)[None]
+    encodings = np.asarray(_cameras(model, variables, camera, register, mask))[0, :count]
+    # A field of view of zero, which untrained models predict, is an infinite focal length.
+    with np.errstate(divide="ignore"):
+        return decode_poses(encodings, windows.depth.shape[1:])
 
 
 class _Collector:
     def __init__(self, shape: tuple[int, ...]) -> None:
-        self._size = (shape[1], shape[2])
         self._depth = scratch_array(shape[:3], np.float32)
         self._camera: list[np.ndarray] = []
         self._register: list[np.ndarray] = []
@@ -103,18 +147,8 @@ class _Collector:
         self._register.append(np.asarray(output.register_tokens[0])[:valid])
         self._count += valid
 
-    def clip(self, model: LogVGGT, variables: Any) -> StreamedClip:
-        padded = -(-self._count // _CHUNK) * _CHUNK
-        camera, register = (
-            np.pad(np.concatenate(parts), [(0, padded - self._count), *[(0, 0)] * (parts[0].ndim - 1)])[None]
-            for parts in (self._camera, self._register)
-        )
-        mask = (np.arange(padded) < self._count)[None]
-        encodings = np.asarray(_cameras(model, variables, camera, register, mask))[0, : self._count]
-        # A field of view of zero, which untrained models predict, is an infinite focal length.
-        with np.errstate(divide="ignore"):
-            extrinsics, intrinsics = decode_poses(encodings, self._size)
-        return StreamedClip(self._depth, extrinsics, intrinsics)
+    def windows(self) -> StreamedWindows:
+        return StreamedWindows(self._depth, np.concatenate(self._camera), np.concatenate(self._register))
 
 
 def _slice(images: np.ndarray, first: int, count: int) -> tuple[jax.Array, jax.Array]:

@@ -8,14 +8,17 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from logvggt_jax.config import ModelConfig
 from logvggt_jax.evaluation.methods import ClipPrediction, Method
-from logvggt_jax.geometry import decode_poses
+from logvggt_jax.evaluation.streaming import (
+    StreamedWindows,
+    refined_cameras,
+    stream_windows,
+    without_refinement,
+)
 from logvggt_jax.model.logvggt import LogVGGT
-from logvggt_jax.types import WindowOutput
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,34 +113,14 @@ class _LastClip:
         self._variables = variables
         self._images: np.ndarray | None = None
         self._model: LogVGGT | None = None
-        self._output: WindowOutput | None = None
+        self._windows: StreamedWindows | None = None
 
     def predict(self, model: LogVGGT, images: np.ndarray) -> ClipPrediction:
-        """The model's prediction of images [T, H, W, 3]."""
-        # Windows know nothing of refinement.
-        plain = dataclasses.replace(model.config.refinement, enabled=True, period=None, context=None)
-        windows = LogVGGT(dataclasses.replace(model.config, refinement=plain))
-        if self._output is None or self._images is not images or self._model != windows:
-            self._output = None  # before the next is made
-            self._output = _run_windows(windows, self._variables, images)
-            self._images, self._model = images, windows
-        out = self._output
-        encodings = _refine(model, self._variables, out.camera_tokens, out.register_tokens)
-        # A field of view of zero, which untrained models predict, is an infinite focal length.
-        with np.errstate(divide="ignore"):
-            extrinsics, intrinsics = decode_poses(np.asarray(encodings), images.shape[1:3])
-        return ClipPrediction(np.asarray(out.depth[0]), extrinsics, intrinsics)
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _run_windows(model: LogVGGT, variables: dict[str, Any], images: jax.Array) -> WindowOutput:
-    return model.run_windows(variables, images[None])
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _refine(
-    model: LogVGGT, variables: dict[str, Any], camera_tokens: jax.Array, register_tokens: jax.Array
-) -> jax.Array:
-    """Pose encodings [T, 9]."""
-    everything = jnp.ones(camera_tokens.shape[:2], bool)
-    return model.refine_sequence(variables, camera_tokens, register_tokens, everything)[0, :, -1]
+        """The model's prediction of images [T, H, W, 3]; device memory does not grow with T, see `stream_clip`."""
+        plain = without_refinement(model)
+        if self._windows is None or self._images is not images or self._model != plain:
+            self._windows = None  # before the next is made
+            self._windows = stream_windows(plain, self._variables, images)
+            self._images, self._model = images, plain
+        cameras = refined_cameras(model, self._variables, self._windows)
+        return ClipPrediction(self._windows.depth, *cameras)

@@ -124,6 +124,7 @@ def test_the_papers_benchmarks_run_on_real_frames_and_go_on_after_a_kill(
     options = ["--config=configs/eval/paper.py", "--config.protocol.longer_edge=42", f"--output={tmp_path / 'out'}"]
     options += [f"--checkpoint={tmp_path / 'model'}", f"--data_root={tmp_path / 'data'}", "--compilation_cache=none"]
     options += ["--config.protocol.max_points=5000", "--config.protocol.rooms.num_rooms=1"]
+    options += ["--config.timings.lengths=(20, 40)", "--config.timings.rounds=1"]
     first = run_eval(*options, "--config.benchmarks=('seven_scenes-reconstruction-*', 'rooms-12', 'bonn-*')")
     assert first.returncode == 0, first.stderr
     results = json.loads((tmp_path / "out" / "results.json").read_text())
@@ -139,3 +140,4 @@ def test_the_papers_benchmarks_run_on_real_frames_and_go_on_after_a_kill(
     again = json.loads((tmp_path / "out" / "results.json").read_text())
     assert again["summary"] == results["summary"]
     assert len(again["environments"]) == 2
+    assert again["timings"] == results["timings"] and "this run: VGGT on chunks" in second.stdout

@@ -84,6 +84,29 @@ def test_our_rows_stand_in_every_group_in_the_papers_units() -> None:
     assert [row[1] for row in reconstruction.rows if row[0] == "this run: ours"] == ["200", "500", "1000"]
 
 
+def test_our_times_stand_beside_the_papers() -> None:
+    setting = {"device": "a device", "dtype": "float32", "image_size": [56, 70], "windows": [4, 2], "rounds": 3}
+    rates = {"100": [20.0, 22.0, 21.0], "1000": "full attention over 1000 frames exceeds references.max_frames=200"}
+    timings = {
+        **setting,
+        "lengths": [50, 100, 1000],
+        "frames_per_second": {"VGGT offline": {"50": [40.0], **rates}},
+        "part_frames": 1000,
+        "parts": [{"name": "backbone", "seconds": 3.0}, {"name": "GCCR", "seconds": 1.0}],
+    }
+    runtime, speed = paper_tables({**results([]), "timings": timings})[-2:]
+    assert ["this run: GCCR", "1,000", "25.00 %"] in runtime.rows
+    assert ["this run: total", "4,000", "100.00 %"] in runtime.rows
+    assert speed.header == ["method", "100", "200", "500", "1000", "50"]
+    assert speed.rows[-1] == ["this run: VGGT offline", "21.0 (20.0 to 22.0)", "-", "-", "-", "40.0 (40.0 to 40.0)"]
+    assert {len(row) for row in speed.rows} == {6}
+    assert any("a device, float32, 70 x 56 pixels, K = 4, stride 2" in note for note in speed.notes)
+    assert any("1000 frames: full attention over 1000 frames exceeds" in note for note in speed.notes)
+    untimed = paper_tables(results([]))[-1]
+    assert not [row for row in untimed.rows if row[0].startswith(THIS_RUN)]
+    assert any("timed nothing" in note for note in untimed.notes)
+
+
 @pytest.mark.parametrize(
     ("measured", "planned", "cell"), [(18, 18, "0.040"), (17, 18, "0.040 [17/18]"), (1, 1, "0.040 [1/18]")]
 )

@@ -55,8 +55,8 @@ def test_windows_run_once_for_all_refinements(
     small_config: ModelConfig, small_variables: dict, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     runs = []
-    original = module._run_windows
-    monkeypatch.setattr(module, "_run_windows", lambda model, *rest: runs.append(model) or original(model, *rest))
+    original = module.stream_windows
+    monkeypatch.setattr(module, "stream_windows", lambda model, *rest: runs.append(model) or original(model, *rest))
     methods = variant_methods(LogVGGT(small_config), small_variables, ("full", "no_gccr", "no_cwa"))
     for _ in range(2):
         images = IMAGES.copy()
