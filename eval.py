@@ -64,7 +64,7 @@ def main(arguments: Sequence[str]) -> None:
             max_sequences=run.max_sequences,
             figures=run.figures,
         )
-        if isinstance(run, BenchmarkRun) and run.timings is not None:
+        if isinstance(run, BenchmarkRun) and run.timings is not None and run.timings.lengths:
             edge = run.protocol.longer_edge
             results["timings"] = measured_timings(
                 model, variables, references, run.timings, output, longer_edge=edge, identity=identity

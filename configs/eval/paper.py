@@ -27,7 +27,8 @@ def get_config() -> ConfigDict:
     # Names of logvggt_jax/evaluation/variants.py, evaluated beside the network.
     config.variants = ()
 
-    # Sequences that are timed on this device for the tables of cost: --config.timings.lengths="(100, 200)" for fewer.
+    # Sequences that are timed on this device for the tables of cost: --config.timings.lengths="(100, 200)" for fewer,
+    # "()" for none.
     config.timings = ConfigDict({"lengths": (100, 200, 500, 1000), "rounds": 3})
 
     config.protocol = protocol = ConfigDict()

@@ -37,7 +37,7 @@ class TimingConfig:
     """The sequences that are timed.
 
     Attributes:
-      lengths: frames of each.
+      lengths: frames of each; none of them times nothing.
       rounds: times that each is run, after once that does not count.
     """
 
@@ -46,8 +46,8 @@ class TimingConfig:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "lengths", tuple(sorted(self.lengths)))
-        if not self.lengths or any(not isinstance(n, int) or n < 1 for n in self.lengths):
-            raise ValueError(f"timings.lengths must be at least one number of frames, got {self.lengths}")
+        if any(not isinstance(n, int) or n < 1 for n in self.lengths):
+            raise ValueError(f"timings.lengths must be numbers of frames, 1 or more each, got {self.lengths}")
         if not isinstance(self.rounds, int) or self.rounds < 1:
             raise ValueError(f"timings.rounds must be at least 1, got {self.rounds!r}")
 
