@@ -18,16 +18,16 @@ from pathlib import Path
 from absl import app, flags, logging
 from ml_collections import config_flags
 
+from logvggt_jax.compile import enable_compilation_cache
+from logvggt_jax.evaluation.costs.throughput import measured_timings
 from logvggt_jax.evaluation.datasets import open_run
 from logvggt_jax.evaluation.environment import checkpoint_identity
-from logvggt_jax.evaluation.methods import network
-from logvggt_jax.evaluation.references import reference_methods
-from logvggt_jax.evaluation.report import print_report, write_report
+from logvggt_jax.evaluation.methods.method import network
+from logvggt_jax.evaluation.methods.references import reference_methods
+from logvggt_jax.evaluation.methods.variants import variant_methods
+from logvggt_jax.evaluation.report.report import print_report, write_report
 from logvggt_jax.evaluation.runner import evaluate, write_results
 from logvggt_jax.evaluation.settings import BenchmarkRun, read_run
-from logvggt_jax.evaluation.throughput import measured_timings
-from logvggt_jax.evaluation.variants import variant_methods
-from logvggt_jax.inference.compilation_cache import enable_compilation_cache
 from logvggt_jax.weights import load_model
 
 _CONFIG = config_flags.DEFINE_config_file("config", None, "what to evaluate: a file of configs/eval", lock_config=True)

@@ -18,7 +18,7 @@ import jax
 from absl import app, flags, logging
 from ml_collections import config_flags
 
-from logvggt_jax.inference.compilation_cache import enable_compilation_cache
+from logvggt_jax.compile import enable_compilation_cache
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.loop import NonFiniteTraining, train
 from logvggt_jax.training.processes import join_processes

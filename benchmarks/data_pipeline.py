@@ -25,7 +25,7 @@ import numpy as np
 from PIL import Image
 
 from logvggt_jax.data import SevenScenes, training_batches
-from logvggt_jax.data.augmentation import ColourAugmentation
+from logvggt_jax.data.feeding.augmentation import ColourAugmentation
 
 SIZE = (392, 518)
 SEQUENCES, FRAMES = 4, 24

@@ -33,7 +33,7 @@ from rich.console import Console
 from rich.table import Table
 
 from logvggt_jax import LogVGGT, ModelConfig, load_model
-from logvggt_jax.evaluation.efficiency import (
+from logvggt_jax.evaluation.costs.parts import (
     PARTS,
     PartTime,
     flops_by_part,
@@ -44,9 +44,9 @@ from logvggt_jax.evaluation.efficiency import (
     spread,
     time_part,
 )
+from logvggt_jax.evaluation.costs.throughput import random_pictures, refinement_modes, time_stream
 from logvggt_jax.evaluation.environment import describe_device
-from logvggt_jax.evaluation.plots import efficiency_plot
-from logvggt_jax.evaluation.throughput import random_pictures, refinement_modes, time_stream
+from logvggt_jax.evaluation.report.figures import efficiency_plot
 
 MIB = 2**20
 

@@ -12,7 +12,7 @@ of this project.
 from ml_collections import ConfigDict
 from ml_collections.config_dict import placeholder
 
-from logvggt_jax.data.holdouts import PUBLISHED
+from logvggt_jax.data.feeding.holdouts import PUBLISHED
 
 STEPS_PER_EPOCH = 800
 NUM_DEVICES = 16

@@ -13,9 +13,10 @@ if TYPE_CHECKING:
         RefinementConfig,
         WindowConfig,
     )
-    from logvggt_jax.data.transforms import preprocess
+    from logvggt_jax.data.feeding.transforms import preprocess
     from logvggt_jax.model.logvggt import LogVGGT
     from logvggt_jax.model.windows import WindowState
+    from logvggt_jax.streaming import StreamSession
     from logvggt_jax.types import Frames, Predictions, WindowOutput
     from logvggt_jax.weights.checkpoints import from_pretrained, load_model
 else:
@@ -33,11 +34,24 @@ else:
         "data.transforms": ("preprocess",),
         "model.logvggt": ("LogVGGT",),
         "model.windows": ("WindowState",),
+        "streaming": ("StreamSession",),
         "types": ("Frames", "Predictions", "WindowOutput"),
         "weights.checkpoints": ("from_pretrained", "load_model"),
     }
     _MODULES = {name: module for module, names in _NAMES.items() for name in names}
-    _PARTS = ("config", "data", "evaluation", "geometry", "inference", "model", "training", "types", "weights")
+    _PARTS = (
+        "config",
+        "data",
+        "evaluation",
+        "geometry",
+        "metrics",
+        "model",
+        "reconstruction",
+        "streaming",
+        "training",
+        "types",
+        "weights",
+    )
 
     def __getattr__(name):
         from importlib import import_module
@@ -64,6 +78,7 @@ __all__ = [
     "ModelConfig",
     "Predictions",
     "RefinementConfig",
+    "StreamSession",
     "WindowConfig",
     "WindowOutput",
     "WindowState",

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from logvggt_jax.model.chunks import ChunkPlan
+    from logvggt_jax.streaming.chunks import ChunkPlan
 
 BAD_INPUT, FAILURE, INTERRUPTED = 2, 1, 130
 PROBLEMS_FOUND = 1
@@ -58,9 +58,9 @@ def _convert(options: argparse.Namespace) -> None:
 
 
 def _reconstruct(options: argparse.Namespace) -> None:
-    from logvggt_jax.inference.compilation_cache import enable_compilation_cache
-    from logvggt_jax.inference.point_cloud import PointFilter
-    from logvggt_jax.inference.reconstruct import check_request, reconstruct
+    from logvggt_jax.compile import enable_compilation_cache
+    from logvggt_jax.reconstruction.point_cloud import PointFilter
+    from logvggt_jax.reconstruction.reconstruct import check_request, reconstruct
     from logvggt_jax.weights.checkpoints import from_pretrained
 
     selection = {
@@ -95,7 +95,7 @@ def _reconstruct(options: argparse.Namespace) -> None:
 
 def _chunks(options: argparse.Namespace) -> ChunkPlan | None:
     """The chunks of `--mode chunks`; None for windows."""
-    from logvggt_jax.model.chunks import ChunkPlan
+    from logvggt_jax.streaming.chunks import ChunkPlan
 
     given = {"--chunk-size": options.chunk_size, "--chunk-overlap": options.chunk_overlap}
     if options.mode == "chunks":
@@ -108,7 +108,7 @@ def _chunks(options: argparse.Namespace) -> ChunkPlan | None:
 
 
 def _render_room(options: argparse.Namespace) -> None:
-    from logvggt_jax.inference.room_sequence import write_room_sequence
+    from logvggt_jax.reconstruction.room_sequence import write_room_sequence
 
     folder = write_room_sequence(
         options.output,
@@ -122,7 +122,7 @@ def _render_room(options: argparse.Namespace) -> None:
 
 
 def _view(options: argparse.Namespace) -> None:
-    from logvggt_jax.inference.viewer import open_viewer, serve_forever
+    from logvggt_jax.reconstruction.viewer import open_viewer, serve_forever
 
     server = open_viewer(options.folder, port=options.port)
     print(f"open http://{server.get_host()}:{server.get_port()} in a browser; Ctrl-C ends the viewer", flush=True)
@@ -132,8 +132,8 @@ def _view(options: argparse.Namespace) -> None:
 def _info(options: argparse.Namespace) -> None:
     from rich.console import Console
 
-    from logvggt_jax.inference.model_summary import model_summary
     from logvggt_jax.weights.checkpoints import load_model
+    from logvggt_jax.weights.summary import model_summary
 
     model, variables = load_model(options.checkpoint)
     console = Console()
@@ -142,7 +142,7 @@ def _info(options: argparse.Namespace) -> None:
 
 
 def _check_data(options: argparse.Namespace) -> int:
-    from logvggt_jax.data.checks import check_copy
+    from logvggt_jax.data.checks.check import check_copy
 
     report = check_copy(
         options.name,
@@ -158,7 +158,7 @@ def _check_data(options: argparse.Namespace) -> int:
 
 
 def _list_data(_: argparse.Namespace) -> None:
-    from logvggt_jax.data.catalogue import UNPACKING, catalogue
+    from logvggt_jax.data.checks.catalogue import UNPACKING, catalogue
 
     width = min(shutil.get_terminal_size().columns, 120)
     print("\n\n".join(entry.text(width) for entry in catalogue()))

@@ -14,8 +14,8 @@ import pytest
 
 from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.cli import main
+from logvggt_jax.compile import default_cache_folder, enable_compilation_cache
 from logvggt_jax.data import DATASETS
-from logvggt_jax.inference.compilation_cache import default_cache_folder, enable_compilation_cache
 from logvggt_jax.weights.checkpoints import save_model
 
 COMMANDS = ("convert", "reconstruct", "render-room", "view", "info", "data check", "data list")

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import pytest
 
 from logvggt_jax import LogVGGT, ModelConfig
-from logvggt_jax.data.holdouts import PUBLISHED
-from logvggt_jax.data.rooms import Rooms
+from logvggt_jax.data.feeding.holdouts import PUBLISHED
+from logvggt_jax.data.rooms.rooms import Rooms
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.optimizer import learning_rate_schedule, make_optimizer
 from logvggt_jax.training.sharding import check_batch_size, data_mesh

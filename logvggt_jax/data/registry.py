@@ -4,26 +4,26 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from logvggt_jax.data.arkitscenes import ARKitScenes
-from logvggt_jax.data.blendedmvs import BlendedMVS
-from logvggt_jax.data.bonn import Bonn
-from logvggt_jax.data.co3dv2 import Co3Dv2
 from logvggt_jax.data.dataset import Dataset, check_split
-from logvggt_jax.data.folder_dataset import FolderDataset
-from logvggt_jax.data.hypersim import HyperSim
-from logvggt_jax.data.kitti import KITTI
-from logvggt_jax.data.mvs_synth import MVSSynth
-from logvggt_jax.data.nrgbd import NRGBD
-from logvggt_jax.data.pointodyssey import PointOdyssey
-from logvggt_jax.data.replica import Replica
-from logvggt_jax.data.rooms import Rooms
-from logvggt_jax.data.scannet import ScanNet
-from logvggt_jax.data.seven_scenes import SevenScenes
-from logvggt_jax.data.sintel import Sintel
-from logvggt_jax.data.spring import Spring
-from logvggt_jax.data.tum import TUM
-from logvggt_jax.data.virtual_kitti import VirtualKITTI
-from logvggt_jax.data.wildrgbd import WildRGBD
+from logvggt_jax.data.readers.arkitscenes import ARKitScenes
+from logvggt_jax.data.readers.blendedmvs import BlendedMVS
+from logvggt_jax.data.readers.bonn import Bonn
+from logvggt_jax.data.readers.co3dv2 import Co3Dv2
+from logvggt_jax.data.readers.folder_dataset import FolderDataset
+from logvggt_jax.data.readers.hypersim import HyperSim
+from logvggt_jax.data.readers.kitti import KITTI
+from logvggt_jax.data.readers.mvs_synth import MVSSynth
+from logvggt_jax.data.readers.nrgbd import NRGBD
+from logvggt_jax.data.readers.pointodyssey import PointOdyssey
+from logvggt_jax.data.readers.replica import Replica
+from logvggt_jax.data.readers.scannet import ScanNet
+from logvggt_jax.data.readers.seven_scenes import SevenScenes
+from logvggt_jax.data.readers.sintel import Sintel
+from logvggt_jax.data.readers.spring import Spring
+from logvggt_jax.data.readers.tum import TUM
+from logvggt_jax.data.readers.virtual_kitti import VirtualKITTI
+from logvggt_jax.data.readers.wildrgbd import WildRGBD
+from logvggt_jax.data.rooms.rooms import Rooms
 
 _FOR_TRAINING: tuple[type[FolderDataset], ...] = (
     Co3Dv2,

@@ -9,12 +9,12 @@ from typing import Any
 
 from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.data.registry import open_dataset
-from logvggt_jax.data.rooms import Rooms
-from logvggt_jax.evaluation.baselines import all_baselines, static_camera, unit_depth
-from logvggt_jax.evaluation.images import PrincipalPointCrop
-from logvggt_jax.evaluation.methods import Method
+from logvggt_jax.data.rooms.rooms import Rooms
+from logvggt_jax.evaluation.methods.baselines import all_baselines, static_camera, unit_depth
+from logvggt_jax.evaluation.methods.method import Method
 from logvggt_jax.evaluation.protocols import Protocol, ProtocolSettings, chosen_protocols
 from logvggt_jax.evaluation.protocols.clips import clip_protocols
+from logvggt_jax.evaluation.protocols.images import PrincipalPointCrop
 from logvggt_jax.evaluation.runner import Benchmark
 from logvggt_jax.evaluation.settings import BenchmarkRun, EvaluationRun
 from logvggt_jax.model.logvggt import LogVGGT
@@ -63,7 +63,7 @@ def open_evaluation_set(
       root: its folder; None for `rooms`.
       split: `train`, `val`, `test` or `all`.
       image_size: (H, W); rooms are rendered at this size, as they are for training.
-      rooms: further options of `logvggt_jax.data.rooms.Rooms`, for `rooms` alone.
+      rooms: further options of `logvggt_jax.data.rooms.rooms.Rooms`, for `rooms` alone.
 
     Returns:
       Rooms are paired with their training split. Any other set has to lend its own mean, and the name says so.

@@ -14,9 +14,14 @@ import numpy as np
 from rich.console import Console
 
 from logvggt_jax.data.dataset import Dataset
-from logvggt_jax.data.rooms import Rooms
-from logvggt_jax.evaluation.clip_data import load_clip
-from logvggt_jax.evaluation.clip_scores import (
+from logvggt_jax.data.rooms.rooms import Rooms
+from logvggt_jax.evaluation.clips import load_clip
+from logvggt_jax.evaluation.environment import environment
+from logvggt_jax.evaluation.methods.method import ClipPrediction, Method
+from logvggt_jax.evaluation.progress import progress_display
+from logvggt_jax.evaluation.protocols.protocol import Protocol
+from logvggt_jax.evaluation.records import PREDICTION, ClipRecords, plain, record_key, write_text
+from logvggt_jax.evaluation.scores import (
     ClipScore,
     ClipTruth,
     aligned_points,
@@ -25,11 +30,6 @@ from logvggt_jax.evaluation.clip_scores import (
     is_measured,
     prepare_truth,
 )
-from logvggt_jax.evaluation.environment import environment
-from logvggt_jax.evaluation.methods import ClipPrediction, Method
-from logvggt_jax.evaluation.progress import progress_display
-from logvggt_jax.evaluation.protocols.protocol import Protocol
-from logvggt_jax.evaluation.records import PREDICTION, ClipRecords, plain, record_key, write_text
 
 
 @dataclasses.dataclass(frozen=True)
@@ -305,7 +305,7 @@ def _key(clip: Clip, method: Method, identity: str) -> str:
 
 def _draw(folder: Path, clip: Clip, method: Method, prediction: ClipPrediction, truth: ClipTruth) -> list[str]:
     """Draws what the benchmark measures; returns the pictures' paths from the output folder."""
-    from logvggt_jax.evaluation import plots
+    from logvggt_jax.evaluation.report import figures as plots
 
     protocol, data = clip.benchmark.protocol, truth.clip
     stem = f"{protocol.name}_{clip.sequence.replace('/', '_')}_from_{clip.indices[0]}_{len(clip.indices)}_frames"

@@ -6,9 +6,9 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
+from logvggt_jax.evaluation.costs.throughput import TimingConfig
+from logvggt_jax.evaluation.methods.references import ReferenceConfig
 from logvggt_jax.evaluation.protocols.protocol import ProtocolSettings
-from logvggt_jax.evaluation.references import ReferenceConfig
-from logvggt_jax.evaluation.throughput import TimingConfig
 
 Settings = TypeVar("Settings")
 
@@ -69,7 +69,7 @@ class EvaluationRun:
       evaluation: clips and metrics.
       rooms: options of procedural rooms, for `dataset` = `rooms` alone.
       references: limits of the reference models; None leaves them out.
-      variants: names of `logvggt_jax.evaluation.variants.VARIANTS` that are evaluated beside the network.
+      variants: names of `logvggt_jax.evaluation.methods.variants.VARIANTS` that are evaluated beside the network.
     """
 
     title: str
@@ -115,7 +115,7 @@ class BenchmarkRun:
       max_sequences: only that many first sequences of each benchmark; None takes all. The tables say so.
       figures: clips of each benchmark that are drawn, for the first method.
       references: limits of the reference models; None leaves them out.
-      variants: names of `logvggt_jax.evaluation.variants.VARIANTS` that are evaluated beside the network.
+      variants: names of `logvggt_jax.evaluation.methods.variants.VARIANTS` that are evaluated beside the network.
       timings: sequences that are timed for the paper's tables of cost; None leaves them out.
     """
 

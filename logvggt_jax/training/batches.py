@@ -12,11 +12,11 @@ from absl import logging
 
 from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.data.errors import EmptySplit
-from logvggt_jax.data.holdouts import check_disjoint, check_held_out
-from logvggt_jax.data.pipeline import BatchIterator, training_batches
+from logvggt_jax.data.feeding.batches import BatchIterator, training_batches
+from logvggt_jax.data.feeding.holdouts import check_disjoint, check_held_out
 from logvggt_jax.data.registry import DATASETS, open_dataset
-from logvggt_jax.data.room_pool import render_pool
-from logvggt_jax.data.rooms import Rooms
+from logvggt_jax.data.rooms.pool import render_pool
+from logvggt_jax.data.rooms.rooms import Rooms
 from logvggt_jax.training.config import DataConfig, SourceConfig, StageConfig
 
 

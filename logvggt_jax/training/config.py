@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from logvggt_jax.config import ModelConfig
-from logvggt_jax.data.augmentation import ColourAugmentation
-from logvggt_jax.data.holdouts import HoldOut
+from logvggt_jax.data.feeding.augmentation import ColourAugmentation
+from logvggt_jax.data.feeding.holdouts import HoldOut
 
 LOSSES = ("log_vggt", "vggt")
 SCHEDULES = ("cosine", "linear_tail")

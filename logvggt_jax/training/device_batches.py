@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from jax.sharding import Mesh
 
-from logvggt_jax.data.pipeline import BatchIterator
+from logvggt_jax.data.feeding.batches import BatchIterator
 from logvggt_jax.training.sharding import put_batch
 from logvggt_jax.training.step import Batch
 

@@ -12,7 +12,7 @@ from jax.sharding import Mesh
 from rich.console import Console
 
 from logvggt_jax.data.dataset import Dataset
-from logvggt_jax.data.pipeline import BatchIterator
+from logvggt_jax.data.feeding.batches import BatchIterator
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.training.batches import open_sources, stage_batches
 from logvggt_jax.training.checkpoints import Position, RunCheckpoints

@@ -9,9 +9,9 @@ import numpy as np
 from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 
-from logvggt_jax.data.transforms import fit
-from logvggt_jax.evaluation.depth import depth_metrics
-from logvggt_jax.evaluation.pose import pose_accuracy, relative_pose_errors
+from logvggt_jax.data.feeding.transforms import fit
+from logvggt_jax.metrics.depth import depth_metrics
+from logvggt_jax.metrics.pose import pose_accuracy, relative_pose_errors
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.training.batches import open_source
 from logvggt_jax.training.config import ValidationConfig

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from logvggt_jax.data.rooms import Rooms
-from logvggt_jax.data.seven_scenes import SevenScenes
-from logvggt_jax.evaluation.baselines import static_camera, unit_depth
-from logvggt_jax.evaluation.clip_data import load_clip
+from logvggt_jax.data.readers.seven_scenes import SevenScenes
+from logvggt_jax.data.rooms.rooms import Rooms
+from logvggt_jax.evaluation.clips import load_clip
 from logvggt_jax.evaluation.datasets import open_benchmarks
-from logvggt_jax.evaluation.images import PrincipalPointCrop
+from logvggt_jax.evaluation.methods.baselines import static_camera, unit_depth
 from logvggt_jax.evaluation.protocols import ProtocolSettings, chosen_protocols
-from logvggt_jax.evaluation.report import tables, write_report
+from logvggt_jax.evaluation.protocols.images import PrincipalPointCrop
+from logvggt_jax.evaluation.report.report import tables, write_report
 from logvggt_jax.evaluation.runner import evaluate
 
 SETTINGS = ProtocolSettings(longer_edge=70, max_points=500, rooms={"num_rooms": 1, "num_frames": 16})

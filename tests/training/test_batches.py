@@ -10,7 +10,7 @@ from absl import logging
 
 from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.data.errors import EmptySplit
-from logvggt_jax.data.holdouts import HoldOut
+from logvggt_jax.data.feeding.holdouts import HoldOut
 from logvggt_jax.training.batches import open_source, open_sources, stage_batches
 from logvggt_jax.training.config import DataConfig, SourceConfig, TrainConfig
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from logvggt_jax.data.augmentation import ColourAugmentation
-from logvggt_jax.data.holdouts import HoldOut
+from logvggt_jax.data.feeding.augmentation import ColourAugmentation
+from logvggt_jax.data.feeding.holdouts import HoldOut
 from logvggt_jax.training.config import TrainConfig
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from logvggt_jax.evaluation.images import WholePicture
 from logvggt_jax.evaluation.protocols.frame_selection import Leading
+from logvggt_jax.evaluation.protocols.images import WholePicture
 from logvggt_jax.evaluation.protocols.protocol import DepthMeasure, Protocol, ProtocolSettings
 
 

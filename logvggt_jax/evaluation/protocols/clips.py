@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from logvggt_jax.evaluation.images import Fit
 from logvggt_jax.evaluation.protocols.frame_selection import Clips
+from logvggt_jax.evaluation.protocols.images import Fit
 from logvggt_jax.evaluation.protocols.protocol import DepthMeasure, PointsMeasure, Protocol
 from logvggt_jax.evaluation.settings import EvaluationConfig
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from logvggt_jax.evaluation.images import WidthResize
 from logvggt_jax.evaluation.protocols.frame_selection import RandomFrames
+from logvggt_jax.evaluation.protocols.images import WidthResize
 from logvggt_jax.evaluation.protocols.protocol import Protocol, ProtocolSettings
 
 

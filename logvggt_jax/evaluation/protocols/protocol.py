@@ -7,8 +7,8 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from logvggt_jax.evaluation.images import ImageRule
 from logvggt_jax.evaluation.protocols.frame_selection import FrameSelection
+from logvggt_jax.evaluation.protocols.images import ImageRule
 
 
 @dataclasses.dataclass(frozen=True)

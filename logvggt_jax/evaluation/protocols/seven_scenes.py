@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from logvggt_jax.evaluation.images import PrincipalPointCrop
 from logvggt_jax.evaluation.protocols.frame_selection import Leading, Spread
+from logvggt_jax.evaluation.protocols.images import PrincipalPointCrop
 from logvggt_jax.evaluation.protocols.protocol import Protocol, ProtocolSettings
 
 _TEST_SEQUENCES = 18

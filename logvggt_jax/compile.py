@@ -1,0 +1,33 @@
+"""Compiled programs kept between runs, so that only the first run of a shape waits for the compiler."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import jax
+
+from logvggt_jax.files import user_cache_folder
+
+
+def default_cache_folder() -> Path:
+    """`logvggt/xla` in the user's cache folder (`XDG_CACHE_HOME`, else `~/.cache`)."""
+    return user_cache_folder("xla")
+
+
+def enable_compilation_cache(folder: str | None = None) -> Path | None:
+    """Turns JAX's persistent compilation cache on.
+
+    Args:
+      folder: where; `none` leaves the cache off. Default: JAX's own `JAX_COMPILATION_CACHE_DIR` if set, else
+        `default_cache_folder`.
+
+    Returns:
+      The folder, or None for `none`.
+    """
+    if folder == "none":
+        jax.config.update("jax_enable_compilation_cache", False)
+        return None
+    chosen = Path(folder or os.environ.get("JAX_COMPILATION_CACHE_DIR") or default_cache_folder()).expanduser()
+    jax.config.update("jax_compilation_cache_dir", str(chosen))
+    return chosen

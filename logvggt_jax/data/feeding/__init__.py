@@ -1,0 +1,1 @@
+"""From frames to training batches: clips, sizes, colours, mixtures, hold-outs, broken clips."""

@@ -1,0 +1,460 @@
+"""Training batches from data sets, through Grain: shuffled, repeated, sharded by process, resumable.
+
+Example i of a run is a function of the seed, i and the data. Workers read single clips; this process puts them
+together to batches, so that neither the batches nor what a worker holds in memory depend on the other.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import signal
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import cv2
+import grain
+import numpy as np
+from absl import flags, logging
+
+from logvggt_jax.data.dataset import Dataset, check_frames
+from logvggt_jax.data.feeding.augmentation import ColourAugmentation
+from logvggt_jax.data.feeding.broken_clips import BrokenClips, describe
+from logvggt_jax.data.feeding.sampling import Sampler, example_rng, sampler_for
+from logvggt_jax.data.feeding.transforms import fit_each, nearest_size
+
+Batch = dict[str, np.ndarray]
+Size = tuple[int, int]
+
+_FIELDS = ("images", "depth", "intrinsics", "extrinsics")
+_BROKEN = "broken"
+# So many clips in a row are broken only if nearly all of those sequences are.
+_MOST_REPLACEMENTS = 16
+_SHOWN = 16
+_SIZE_READERS = 16
+
+
+class _ClipReader:
+    """Reads example `index` of one data set in one size; a class, so that worker processes can unpickle it."""
+
+    def __init__(
+        self,
+        name: str,
+        dataset: Dataset,
+        sampler: Sampler,
+        size: Size,
+        seed: int,
+        augmentation: ColourAugmentation | None,
+        min_valid_depth: float,
+    ) -> None:
+        self.name, self.dataset, self.sampler, self.size, self.seed = name, dataset, sampler, size, seed
+        self.augmentation, self.min_valid_depth = augmentation, min_valid_depth
+
+    def __call__(self, index: int, sequence: str) -> Batch:
+        rng = example_rng(self.seed, index)
+        indices = [int(i) for i in self.sampler.draw(self.dataset, sequence, rng)]
+        # One frame at a time: a clip of large pictures would take a gigabyte.
+        frames = (self.dataset.read(sequence, [index]) for index in indices)
+        clip = fit_each(frames, len(indices), self.size)
+        where = f"{self.name}, {sequence}, frames {' '.join(map(str, indices))}"
+        check_frames(clip, where)
+        valid = np.count_nonzero(clip.depth > 0) / clip.depth.size
+        if valid < self.min_valid_depth:
+            raise ValueError(
+                f"{where}: {valid:.2%} of the pixels have depth, min_valid_depth={self.min_valid_depth:g} asks for more"
+            )
+        if self.augmentation is not None:
+            self.augmentation(clip.images, rng)
+        return {name: getattr(clip, name) for name in _FIELDS}
+
+
+class _ReplaceBroken:
+    """Reads from the first of `streams`; where that fails, the clip of the next index takes the clip's place.
+
+    Where many in a row fail, the next stream goes on from the same index.
+
+    Args:
+      streams: (reader, its sequences: index to name) each, all of one size.
+    """
+
+    def __init__(self, streams: Sequence[tuple[_ClipReader, grain.MapDataset]]) -> None:
+        self.streams = tuple(streams)
+
+    def __call__(self, index: int, sequence: str) -> dict[str, Any]:
+        broken: list[str] = []
+        for read, sequences in self.streams:
+            for position in range(index, index + _MOST_REPLACEMENTS):
+                try:
+                    # Of the clips passed over, later ones are reported in their own turn.
+                    return {**read(position, sequences[position]), _BROKEN: broken[:1]}
+                # Whatever a decoder raises: a run of a week is not to end for one file.
+                except Exception as error:
+                    broken.append(describe(error))
+        names = ", ".join(dict.fromkeys(read.name for read, _ in self.streams))
+        height, width = self.streams[0][0].size
+        raise ValueError(
+            f"{names}, pictures for {height} x {width}: {len(broken)} clips in a row are broken: "
+            f"{'; '.join(list(dict.fromkeys(broken))[:_SHOWN])}"
+        )
+
+
+class _OneSizeABatch:
+    """Examples of several sizes in such an order that each run of `batch_size` has one size.
+
+    Batch b holds the next examples of size `turns[b]` = (size, how many batches of that size came before).
+    """
+
+    def __init__(self, examples: Sequence[grain.MapDataset], turns: grain.MapDataset, batch_size: int) -> None:
+        self.examples, self.turns, self.batch_size = examples, turns, batch_size
+
+    def __len__(self) -> int:
+        return sys.maxsize
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        batch, place = divmod(index, self.batch_size)
+        size, before = self.turns[batch]
+        return self.examples[size][before * self.batch_size + place]
+
+
+class _Turn:
+    """(size, number of its batch), for Grain's mixing of sizes."""
+
+    def __call__(self, index: int, size: int) -> tuple[int, int]:
+        return size, index
+
+
+class BatchIterator(Iterator[Batch]):
+    """Endless batches whose state is the number of examples consumed and what was broken among them.
+
+    Made by `training_batches`. Close it, or use it in a `with` block, to end its worker processes.
+
+    Attributes:
+      broken: clips of this process that were replaced.
+    """
+
+    def __init__(
+        self,
+        examples: grain.MapDataset,
+        identity: Mapping[str, Any],
+        broken: BrokenClips,
+        *,
+        batch_size: int,
+        process_index: int,
+        process_count: int,
+        worker_count: int,
+        num_threads: int,
+    ) -> None:
+        self.broken = broken
+        self._examples, self._identity = examples, dict(identity)
+        self._batch_size, self._worker_count, self._num_threads = batch_size, worker_count, num_threads
+        self._process_index, self._process_count = process_index, process_count
+        self._consumed = 0
+        self._clips: Iterator[dict[str, Any]] | None = None
+
+    def __next__(self) -> Batch:
+        """The next batch: this process's share of `batch_size` examples."""
+        if self._clips is None:
+            self._clips = self._open()
+        try:
+            clips = [next(self._clips) for _ in range(self._batch_size // self._process_count)]
+        except BaseException:
+            # What was read of this batch is lost with the stream; the next call starts at its first clip.
+            self.close()
+            raise
+        self._consumed += self._batch_size
+        messages = [message for clip in clips for message in clip.get(_BROKEN, ())]
+        self.broken.add(messages, clips=len(clips))
+        return {name: np.stack([np.asarray(clip[name]) for clip in clips]) for name in _FIELDS}
+
+    def __enter__(self) -> BatchIterator:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Ends threads and worker processes; the next `next` starts them again where this left off."""
+        if self._clips is not None:
+            self._clips.close()  # type: ignore[attr-defined]
+            self._clips = None
+
+    def get_state(self) -> dict[str, Any]:
+        """JSON values that `set_state` takes: examples consumed by all processes, and what they were drawn from.
+
+        The number of workers and of processes is not part of it and may change on resume; so may the batch size as
+        long as all clips have one size.
+        """
+        return {"examples": self._consumed, "broken": self.broken.get_state(), **self._identity}
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Continues after the examples that `state` counts.
+
+        Raises ValueError if the state is of another seed, clip or mixture, whose examples would differ.
+        """
+        expected = {"examples", "broken", *self._identity}
+        if set(state) != expected:
+            raise ValueError(
+                f"data state has fields {sorted(state)}, expected {sorted(expected)}: "
+                "it was written by another version or is damaged"
+            )
+        for name, value in self._identity.items():
+            if state[name] != value:
+                raise ValueError(
+                    f"data state was written with {name}={state[name]}, this run has {value}: "
+                    "resume with the same data settings, or start a new run"
+                )
+        self.close()
+        self._consumed = int(state["examples"])
+        self.broken.set_state(state["broken"])
+
+    def _open(self) -> Iterator[dict[str, Any]]:
+        start = self._consumed + self._process_index
+        share = self._examples.slice(slice(start, None, self._process_count))
+        # Grain's default of 500 elements is memory: a clip of 64 frames takes 90 MB.
+        ahead = max(self._num_threads, 1)
+        if not self._worker_count:
+            ahead += self._batch_size // self._process_count
+        stream = share.to_iter_dataset(grain.ReadOptions(num_threads=self._num_threads, prefetch_buffer_size=ahead))
+        if self._worker_count:
+            # Grain reads absl flags when it starts workers, which fails in scripts that do not use absl's app.
+            if not flags.FLAGS.is_parsed():
+                flags.FLAGS.mark_as_parsed()
+            options = grain.MultiprocessingOptions(num_workers=self._worker_count, per_worker_buffer_size=1)
+            stream = stream.mp_prefetch(options, worker_init_fn=_start_worker)
+        return iter(stream)
+
+
+def training_batches(
+    datasets: Mapping[str, Dataset],
+    *,
+    clip_length: int,
+    batch_size: int,
+    sizes: Sequence[Size],
+    seed: int,
+    stride: tuple[int, int] = (1, 1),
+    strides: Mapping[str, tuple[int, int]] | None = None,
+    reverse: float = 0.5,
+    weights: Mapping[str, float] | None = None,
+    augmentation: ColourAugmentation | None = None,
+    min_valid_depth: float = 0.0,
+    max_broken: float = 0.0,
+    process_index: int = 0,
+    process_count: int = 1,
+    worker_count: int = 0,
+    num_threads: int = 2,
+) -> BatchIterator:
+    """Endless batches of clips from a mixture of data sets.
+
+    Each epoch of a data set visits each of its sequences once, in an order reshuffled every epoch, and takes one
+    random clip. Example i of the mixture is a function of (`seed`, i) and the data alone; a batch holds
+    `batch_size` consecutive examples, and process p of n gets those with i mod n = p. Sequences too short for a
+    clip are left out with a warning.
+
+    With several `sizes` a sequence has the one of the nearest aspect ratio. A batch holds clips of one size; sizes
+    come as often as their sequences do under `weights`.
+
+    A clip is broken if it cannot be read, fails `check_frames` or has too little depth. The one of the next index of
+    its data set takes its place; where that set has none of this size that can be read, one of another shape, cut to
+    the size, or of another set. Which one depends again on seed, index and data alone. It is logged and counted.
+
+    Workers hand clips over in shared memory: in a container, /dev/shm must hold three clips a worker.
+
+    Args:
+      datasets: by name; frames are brought to their size by `transforms.fit`.
+      clip_length: frames of a clip, T.
+      batch_size: clips of a batch over all processes; a multiple of `process_count`.
+      sizes: (H, W) each, multiples of 14.
+      seed: not negative.
+      stride: smallest and largest distance between a clip's frames.
+      strides: the same for single data sets, by name. Sets without an order in time have none (`CovisibilityWalk`).
+      reverse: probability of a clip that runs backwards in time.
+      weights: share of examples from each data set, default equal.
+      augmentation: of the images; None leaves them.
+      min_valid_depth: smallest share of a clip's pixels that have depth.
+      max_broken: largest share of broken clips, of a thousand clips at least. 0 raises the first one's error.
+      process_index: of this process, below `process_count`.
+      process_count: processes that train together.
+      worker_count: reading processes; 0 reads in threads of this process.
+      num_threads: reading threads of each process; 0 reads when a clip is asked for.
+
+    Returns:
+      Iterator of {"images" uint8 [B, T, H, W, 3], "depth" float32 [B, T, H, W] z-depth (0 = invalid),
+      "intrinsics" float32 [B, T, 3, 3], "extrinsics" float32 [B, T, 4, 4] world-to-camera}, numpy, with
+      B = batch_size / process_count.
+
+    Raises:
+      ValueError: an argument is out of range, or a data set has no sequence long enough. While iterating:
+        `TooManyBrokenClips`, or with max_broken=0 the error of bad data, named.
+    """
+    if not datasets:
+        raise ValueError("no data sets given: pass a mapping from name to data set")
+    if batch_size < 1 or process_count < 1 or batch_size % process_count:
+        raise ValueError(
+            f"batch_size must be a positive multiple of process_count, got {batch_size} and {process_count}"
+        )
+    if not 0 <= process_index < process_count:
+        raise ValueError(f"process_index must lie in [0, {process_count}), got {process_index}")
+    if seed < 0 or worker_count < 0 or num_threads < 0:
+        raise ValueError(
+            f"seed, worker_count and num_threads must not be negative, got {seed}, {worker_count} and {num_threads}"
+        )
+    if weights is not None and (set(weights) != set(datasets) or min(weights.values()) <= 0):
+        raise ValueError(f"weights must give a positive number for each of {', '.join(datasets)}, got {dict(weights)}")
+    for name, share in {"min_valid_depth": min_valid_depth, "max_broken": max_broken}.items():
+        if not 0 <= share < 1:
+            raise ValueError(f"{name} must lie in [0, 1), got {share}")
+    sizes = [(int(height), int(width)) for height, width in sizes]
+    if not sizes or len(set(sizes)) < len(sizes):
+        raise ValueError(f"sizes must be different (height, width), at least one, got {sizes}")
+    strides = dict(strides or {})
+    if not strides.keys() <= datasets.keys():
+        raise ValueError(f"strides must be of {', '.join(datasets)}, got those of {', '.join(strides)}")
+    samplers = {
+        name: sampler_for(dataset, length=clip_length, stride=strides.get(name, stride), reverse=reverse)
+        for name, dataset in datasets.items()
+    }
+    shares = {name: 1.0 if weights is None else float(weights[name]) for name in datasets}
+    sequences = {
+        name: _by_size(
+            name,
+            dataset,
+            _long_enough(name, dataset, samplers[name], skip_broken=max_broken > 0),
+            sizes,
+            skip_broken=max_broken > 0,
+        )
+        for name, dataset in datasets.items()
+    }
+
+    # Each data set and size draws from its own stream, so that equal numbers do not mean equal choices.
+    own_seeds, names = {}, {}
+    for position, name in enumerate(datasets):
+        for size_index, part in enumerate(sequences[name]):
+            if part:
+                own_seed = int(np.random.SeedSequence([seed, position, size_index]).generate_state(1)[0])
+                own_seeds[name, size_index] = own_seed
+                names[name, size_index] = grain.MapDataset.source(part).seed(own_seed).shuffle().repeat()
+
+    def clips(name: str, size_index: int) -> grain.MapDataset:
+        def stream(name: str, part: int) -> tuple[_ClipReader, grain.MapDataset]:
+            own_seed = own_seeds[name, part]
+            return (
+                _ClipReader(
+                    name, datasets[name], samplers[name], sizes[size_index], own_seed, augmentation, min_valid_depth
+                ),
+                names[name, part],
+            )
+
+        read, own = stream(name, size_index)
+        if max_broken == 0:
+            return own.map_with_index(read)
+        # Where all of its own is broken: of the same set in other shapes, cut to this one, then of the other sets.
+        order = sorted(names, key=lambda key: (key != (name, size_index), key[0] != name))
+        return own.map_with_index(_ReplaceBroken([stream(*key) for key in order]))
+
+    examples: list[grain.MapDataset] = []
+    size_shares: list[float] = []
+    for size_index in range(len(sizes)):
+        parts, part_shares = [], []
+        for name in datasets:
+            if count := len(sequences[name][size_index]):
+                parts.append(clips(name, size_index))
+                part_shares.append(shares[name] * count / sum(map(len, sequences[name])))
+        if parts:
+            examples.append(parts[0] if len(parts) == 1 else grain.MapDataset.mix(parts, weights=part_shares))
+            size_shares.append(sum(part_shares))
+    identity = {
+        "seed": seed,
+        "samplers": {name: repr(sampler) for name, sampler in samplers.items()},
+        "sizes": [list(size) for size in sizes],
+        "sequences": {name: [_fingerprint(part) for part in parts] for name, parts in sequences.items()},
+        "weights": shares,
+        "augmentation": repr(augmentation),
+        "min_valid_depth": float(min_valid_depth),
+    }
+    if len(examples) > 1:
+        turns = [grain.MapDataset.source([size]).repeat().map_with_index(_Turn()) for size in range(len(examples))]
+        schedule = grain.MapDataset.mix(turns, weights=size_shares)
+        examples = [grain.MapDataset.source(_OneSizeABatch(examples, schedule, batch_size))]
+        identity["batch_size"] = batch_size
+    return BatchIterator(
+        examples[0],
+        identity,
+        BrokenClips(max_broken),
+        batch_size=batch_size,
+        process_index=process_index,
+        process_count=process_count,
+        worker_count=worker_count,
+        num_threads=num_threads,
+    )
+
+
+def _long_enough(name: str, dataset: Dataset, sampler: Sampler, *, skip_broken: bool) -> list[str]:
+    """The sequences that hold a clip; ValueError if there are none.
+
+    With `skip_broken` a sequence that cannot be listed stays: its clips are then broken and counted, and the examples
+    are the same ones when it has been mended.
+    """
+
+    def fits(sequence: str) -> bool:
+        try:
+            return sampler.fits(dataset, sequence)
+        except Exception as error:
+            if not skip_broken:
+                raise
+            logging.warning("%s, %s: cannot be listed: %s", name, sequence, describe(error))
+            return True
+
+    names = [sequence for sequence in dataset.sequences if fits(sequence)]
+    if not names:
+        raise ValueError(
+            f"{name}: none of {len(dataset.sequences)} sequences has {sampler.requirement}: shorten the clips"
+        )
+    if len(names) < len(dataset.sequences):
+        short = len(dataset.sequences) - len(names)
+        logging.warning("%s: %d sequences do not have %s, left out", name, short, sampler.requirement)
+    return names
+
+
+def _by_size(
+    name: str, dataset: Dataset, sequences: Sequence[str], sizes: Sequence[Size], *, skip_broken: bool
+) -> list[list[str]]:
+    """For each of `sizes` the sequences whose pictures have the nearest aspect ratio.
+
+    With `skip_broken` those whose pictures cannot be read have the first size, where their clips will be broken.
+    """
+    if len(sizes) == 1:
+        return [list(sequences)]
+
+    def size_of(sequence: str) -> Size | None:
+        try:
+            return dataset.image_size(sequence)
+        except Exception as error:
+            if not skip_broken:
+                raise
+            logging.warning("%s, %s: size of the pictures unknown: %s", name, sequence, describe(error))
+            return None
+
+    parts: dict[Size, list[str]] = {size: [] for size in sizes}
+    # The first start opens a picture of every sequence, which takes long over a network; readers keep the sizes.
+    with ThreadPoolExecutor(_SIZE_READERS) as executor:
+        found = list(executor.map(size_of, sequences))
+    for sequence, size in zip(sequences, found, strict=True):
+        parts[sizes[0] if size is None else nearest_size(size, sizes)].append(sequence)
+    if not any(found):
+        raise ValueError(f"{name}: no picture of {len(sequences)} sequences can be read; the log names them")
+    return list(parts.values())
+
+
+def _fingerprint(sequences: Sequence[str]) -> str:
+    """Number and digest of sequence names: other sequences would make other examples."""
+    return f"{len(sequences)} {hashlib.sha256(chr(10).join(sequences).encode()).hexdigest()[:12]}"
+
+
+def _start_worker(index: int, count: int) -> None:
+    # Workers are there to use the cores; OpenCV would start as many threads again in each of them.
+    cv2.setNumThreads(1)
+    # A signal to the whole group is for the process that trains: it needs clips until it has decided to stop, and
+    # ends its workers itself.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)

@@ -1,0 +1,1 @@
+"""Pictures, numbers and lists in files, read with the damage in them named."""

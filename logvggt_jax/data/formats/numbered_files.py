@@ -1,0 +1,69 @@
+"""Files whose names carry a frame's number: listed in numeric order, with the gaps between kinds reported."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+from logvggt_jax.data.errors import missing_files
+from logvggt_jax.data.formats.listing_index import SourceFiles
+
+_PLACE = re.compile(r"\{[^}]*\}")
+
+
+def numbered_files(files: SourceFiles, folder: Path, template: str) -> dict[int, Path]:
+    """Files of `folder` by number, in numeric order.
+
+    Args:
+      files: reads the folder.
+      folder: all other names in it are passed over.
+      template: format of the names with one number, `frame{:06d}.jpg` or, unpadded, `{}.jpg`.
+
+    Raises:
+      FileNotFoundError: no such folder, or no such file in it.
+    """
+    before, after = _PLACE.split(template)
+    pattern = re.compile(f"{re.escape(before)}([0-9]+){re.escape(after)}")
+    matches = (pattern.fullmatch(name) for name in files.names(folder, f"files like {template.format(0)}"))
+    numbers = (int(match[1]) for match in matches if match and template.format(int(match[1])) == match[0])
+    found = {number: folder / template.format(number) for number in sorted(numbers)}
+    if not found:
+        raise FileNotFoundError(f"{folder}: no files like {template.format(0)}; fetch or unpack the sequence again")
+    return found
+
+
+def numbered_frames(files: SourceFiles, *kinds: tuple[Path, str]) -> dict[int, tuple[Path, ...]]:
+    """Frames that consist of one file of each kind: number to paths, in numeric order.
+
+    Args:
+      files: reads the folders.
+      *kinds: folder and template of each kind, as in `numbered_files`.
+
+    Raises:
+      FileNotFoundError: no such folder, no such file in it, or a frame that lacks a kind; names the missing file.
+    """
+    found = [numbered_files(files, folder, template) for folder, template in kinds]
+    numbers = sorted(set().union(*found))
+    absent = {
+        folder / template.format(number): f"but frame {number} has its other files; fetch it again or remove those"
+        for number in numbers
+        for (folder, template), paths in zip(kinds, found, strict=True)
+        if number not in paths
+    }
+    if absent:
+        raise missing_files(absent)
+    return {number: tuple(paths[number] for paths in found) for number in numbers}
+
+
+def without_gaps(frames: Mapping[int, tuple[Path, ...]]) -> list[tuple[Path, ...]]:
+    """The paths of `numbered_frames`, where frame follows frame as in a pose file that has no numbers.
+
+    Raises FileNotFoundError naming the first missing frame.
+    """
+    first = next(iter(frames))
+    for number in range(first, first + len(frames)):
+        if number not in frames:
+            folder = frames[first][0].parent
+            raise FileNotFoundError(f"{folder}: frame {number} is missing among the others: fetch the sequence again")
+    return list(frames.values())

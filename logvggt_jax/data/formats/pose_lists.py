@@ -1,0 +1,36 @@
+"""Text files that hold the poses of all frames of a sequence as 4x4 matrices."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from logvggt_jax.data.errors import UnequalCounts
+from logvggt_jax.data.formats.calibration import numbers
+from logvggt_jax.data.formats.listing_index import SourceFiles
+
+
+def read_pose_list(files: SourceFiles, path: Path, *, count: int, numbers_per_line: int = 16) -> np.ndarray:
+    """Matrices [count, 4, 4] float64 as stored, row-major; NaN and infinite entries are kept. Empty lines are skipped.
+
+    Args:
+      files: reads the file.
+      path: the pose file.
+      count: frames that need a pose.
+      numbers_per_line: 16, or 4 where a matrix takes four lines.
+
+    Raises:
+      FileNotFoundError: no such file.
+      ValueError: a line with other words or another number of them, or another number of matrices than `count`;
+        names the file and the line.
+    """
+    lines = enumerate(files.text(path, "the poses of the sequence's frames").splitlines(), 1)
+    rows = [numbers(line, f"{path}, line {i}", count=numbers_per_line) for i, line in lines if line.strip()]
+    lines_per_pose = 16 // numbers_per_line
+    if len(rows) != count * lines_per_pose:
+        raise UnequalCounts(
+            f"{path}: expected {count} poses of {lines_per_pose} lines for {count} pictures, got {len(rows)} lines: "
+            "fetch the file and the pictures again"
+        )
+    return np.reshape(rows, (count, 4, 4))

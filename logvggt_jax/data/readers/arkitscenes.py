@@ -1,0 +1,177 @@
+"""ARKitScenes (Baruch et al., NeurIPS Datasets and Benchmarks 2021): tablets' videos of rooms with depth, raw form.
+
+Layout, as the set's download script makes it: `<root>/raw/{Training,Validation}/<video>/` with
+
+- `vga_wide/<video>_<time>.png`, 30 Hz, and `vga_wide_intrinsics/<video>_<time>.pincam`: one line
+  `width height fx fy cx cy`; its time may be 1 ms off the picture's;
+- `lowres_depth/<video>_<time>.png`, 60 Hz: z in millimetres, 0 invalid, coarser than the picture by a fixed factor;
+- `lowres_wide.traj`, about 10 Hz: lines `time ax ay az tx ty tz`, world-to-camera as an axis-angle vector and a
+  translation in metres, OpenCV axes, the world's z up.
+
+Times are seconds with three decimals. The set does not say where a pixel's centre is; calibrations are taken as they
+are. `confidence` tells how much the sensor trusts depth that it nevertheless gives: nothing is masked by it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from logvggt_jax.data.errors import UnequalSizes
+from logvggt_jax.data.formats.calibration import numbers, pinhole
+from logvggt_jax.data.formats.image import read_depth, read_rgb
+from logvggt_jax.data.formats.listing_index import SourceFiles
+from logvggt_jax.data.formats.pose_track import PoseTrack
+from logvggt_jax.data.formats.quarter_turns import turned_extrinsics, turned_intrinsics, turns_to_upright
+from logvggt_jax.data.formats.relative_intrinsics import in_pixels, relative
+from logvggt_jax.data.readers.folder_dataset import NO_POSES, FolderDataset, FrameRecord, Listing
+
+_FOLDS = {"train": ("Training",), "val": ("Validation",), "all": ("Training", "Validation")}
+_VIDEO = re.compile(r"\d+")
+_SHAPE_TOLERANCE = 0.02
+# Intrinsics of a record whose calibration is read with its picture.
+_WITH_THE_PICTURE = np.full((3, 3), np.nan)
+
+
+class ARKitScenes(FolderDataset):
+    """Reader of ARKitScenes' raw videos; sequences are named `Training/41048190`.
+
+    Pictures are stored as the sensor delivers them, in many videos sideways. By default they are handed out upright:
+    a sequence is turned as a whole, by the multiple of 90 degrees after which the cameras' mean upward direction is
+    nearest to the world's, and depth, intrinsics and extrinsics are turned with it. `upright=False` keeps the stored
+    orientation.
+
+    Depth comes in the picture's pixels (nearest neighbour). A frame's pose is the trajectory's within 1 ms of the
+    picture, otherwise interpolated between the neighbours in time: the camera's centre linearly, its rotation along
+    the shortest arc. Pictures without depth (`no depth`), without a calibration within 1 ms (`no calibration`), or
+    outside the trajectory's time (`no pose`) do not count. The splits follow the folders.
+    """
+
+    name = "arkitscenes"
+    title = "ARKitScenes"
+    expects = "raw/Training/<video>/vga_wide (the folder that the set's download script was given)"
+    metric = True
+    splits = ("train", "val", "all")
+
+    def __init__(self, root: str | Path, split: str = "all", *, upright: bool = True) -> None:
+        """As `FolderDataset`; `upright=False` hands pictures out in their stored orientation."""
+        self.upright = upright
+        super().__init__(root, split, variant="" if upright else "stored")
+
+    def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
+        places: dict[str, Path] = {}
+        for fold in _FOLDS[self.split]:
+            folder = self.root / "raw" / fold
+            if files.exists(folder):
+                videos = [name for name in files.names(folder, "videos") if _VIDEO.fullmatch(name)]
+                places |= {f"{fold}/{name}": folder / name for name in videos if (folder / name).is_dir()}
+        return places
+
+    def _list_frames(self, sequence: str, folder: Path, files: SourceFiles) -> Listing:
+        pictures = _by_time(files, folder, "vga_wide", "png")
+        depths = _by_time(files, folder, "lowres_depth", "png")
+        calibrations = _by_time(files, folder, "vga_wide_intrinsics", "pincam")
+        path = folder / "lowres_wide.traj"
+        track = _trajectory(files.text(path, "the video's poses; download it again"), path)
+        frames = []
+        dropped = {"no depth": 0, "no calibration": 0, "no pose": 0}
+        for time in sorted(pictures):
+            near = next((t for t in (time, time - 1, time + 1) if t in calibrations), None)
+            extrinsics = track.at(time)
+            if time not in depths:
+                dropped["no depth"] += 1
+            elif near is None:
+                dropped["no calibration"] += 1
+            elif extrinsics is None:
+                dropped["no pose"] += 1
+            else:
+                frames.append(
+                    FrameRecord(
+                        name=pictures[time].stem,
+                        image=pictures[time],
+                        depth=depths[time],
+                        # Millions of one-line files: opened with their pictures, not to list them.
+                        companion=calibrations[near],
+                        intrinsics=_WITH_THE_PICTURE,
+                        extrinsics=extrinsics,
+                    )
+                )
+        if self.upright and frames:
+            turns = turns_to_upright(np.stack([frame.extrinsics for frame in frames]))
+            frames = [
+                replace(frame, quarter_turns=turns, extrinsics=turned_extrinsics(frame.extrinsics, turns))
+                for frame in frames
+            ]
+        return Listing(frames, {reason: count for reason, count in dropped.items() if count})
+
+    def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        image = read_rgb(record.image)
+        size = image.shape[:2]
+        assert record.companion is not None
+        intrinsics = in_pixels(_calibration(record.companion), size, record.image)
+        intrinsics = turned_intrinsics(intrinsics, size, record.quarter_turns)
+        return image, _at_size(read_depth(record.depth), size, record.depth), intrinsics
+
+
+def _by_time(files: SourceFiles, video: Path, folder: str, suffix: str) -> dict[int, Path]:
+    """Files of one of a video's folders by their time in milliseconds."""
+    names = files.names(video / folder, f"the video's {folder}; download it again")
+    form = re.compile(rf"{video.name}_(\d+\.\d+)\.{suffix}")
+    return {_milliseconds(match[1]): video / folder / match[0] for match in filter(None, map(form.fullmatch, names))}
+
+
+def _milliseconds(seconds: str | float) -> int:
+    return round(1000 * float(seconds))
+
+
+def _trajectory(text: str, path: Path) -> PoseTrack:
+    times, poses = [], []
+    for line, row in enumerate(text.splitlines(), start=1):
+        if not row.strip():
+            continue
+        time, *vectors = numbers(row, f"{path}, line {line}", count=7)
+        if not np.isfinite(time):
+            raise ValueError(f"{path}, line {line}: expected a time in seconds first, got {time}: download it again")
+        times.append(_milliseconds(time))
+        poses.append(_pose(np.array(vectors)))
+    if not times:
+        raise ValueError(f"{path}: no poses; download it again")
+    return PoseTrack(np.array(times), np.stack(poses))
+
+
+def _pose(vectors: np.ndarray) -> np.ndarray:
+    """World-to-camera [4, 4] of an axis-angle vector and a translation [6]; NaN where that is lost."""
+    if not np.isfinite(vectors).all():
+        return NO_POSES
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(vectors[:3])[0], vectors[3:]
+    return pose
+
+
+def _calibration(path: Path) -> np.ndarray:
+    """Intrinsics [3, 3] of a picture of one pixel."""
+    text = SourceFiles().text(path, "the picture's calibration; download the video again")
+    width, height, *values = numbers(text, path, count=6)
+    if not (width >= 1 and height >= 1):
+        raise ValueError(f"{path}: expected a width and height above 0, got {width:g} x {height:g}: download it again")
+    return relative(pinhole(*values), (int(height), int(width)))
+
+
+def _at_size(depth: np.ndarray, size: tuple[int, int], path: Path) -> np.ndarray:
+    """Millimetres uint16 [h, w] as float32 metres in a picture of `size`, by the nearest neighbour."""
+    factors = size[0] / depth.shape[0], size[1] / depth.shape[1]
+    if abs(factors[0] / factors[1] - 1) > _SHAPE_TOLERANCE:
+        raise UnequalSizes(
+            f"{path}: depth of {depth.shape[1]} x {depth.shape[0]} does not have the shape of its picture of "
+            f"{size[1]} x {size[0]}: download both again"
+        )
+    # In whole numbers: OpenCV's nearest neighbours shift by half a pixel or round ties, frequent at 2.5, unevenly.
+    rows, columns = (
+        (2 * np.arange(fine) + 1) * coarse // (2 * fine) for fine, coarse in zip(size, depth.shape, strict=True)
+    )
+    return depth[rows[:, None], columns].astype(np.float32) / np.float32(1000)

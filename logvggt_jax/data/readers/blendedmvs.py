@@ -1,0 +1,168 @@
+"""BlendedMVS, BlendedMVS+ and BlendedMVS++, together BlendedMVG (Yao et al., CVPR 2020): photographs of 502 scenes
+blended with renderings of their meshes.
+
+Layout, as the set's README and MVSNet's describe it: `<root>/<PID>/blended_images/XXXXXXXX.jpg`,
+`cams/XXXXXXXX_cam.txt`, `cams/pair.txt`, `rendered_depth_maps/XXXXXXXX.pfm`, where PID is 24 hexadecimal digits; the
+three sets are unpacked into one root. `XXXXXXXX_masked.jpg` are ignored. The lists `BlendedMVG_training.txt` and
+`validation_list.txt` of the set's repository lie in the root or in `<root>/project_lists`.
+
+Extrinsics are world-to-camera with OpenCV axes, depth is z, both in units of the scene. The release does not say where
+a pixel's centre is; the principal point is taken as it is. Depth is 0 where the mesh has a hole; whole frames may be
+empty.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from logvggt_jax.data.errors import missing_files
+from logvggt_jax.data.formats.calibration import numbers, world_to_camera
+from logvggt_jax.data.formats.image import read_rgb
+from logvggt_jax.data.formats.listing_index import SourceFiles
+from logvggt_jax.data.formats.pfm import read_pfm
+from logvggt_jax.data.formats.split_lists import sequences_present
+from logvggt_jax.data.readers.folder_dataset import FolderDataset, FrameRecord, Listing
+
+_SCENE = re.compile(r"[0-9a-f]{24}")
+_FILES = {
+    "image": ("blended_images", re.compile(r"(\d{8})\.jpg"), "{}.jpg"),
+    "camera": ("cams", re.compile(r"(\d{8})_cam\.txt"), "{}_cam.txt"),
+    "depth": ("rendered_depth_maps", re.compile(r"(\d{8})\.pfm"), "{}.pfm"),
+}
+_LIST_FILES = {"train": "BlendedMVG_training.txt", "val": "validation_list.txt"}
+
+
+class BlendedMVS(FolderDataset):
+    """Reader of BlendedMVS, + and ++; sequences are named by their PID, such as `5bfe5ae0fe0ea555e6a969ca`.
+
+    The frames of a scene are photographs in no temporal order; they keep the order of their numbers, and
+    `covisibility` says which of them see the same. The splits `train` and `val` follow the official lists; scenes that
+    these list and that are not in the root are left out, since the set comes in three parts.
+    """
+
+    name = "blendedmvs"
+    title = "BlendedMVS"
+    expects = "<24 hexadecimal digits>/blended_images (unpack the three sets' zip files into one folder)"
+    metric = False
+    splits = ("train", "val", "all")
+
+    def covisibility(self, sequence: str) -> dict[int, list[tuple[int, float]]]:
+        """For every frame that has some, its neighbours (frame index, score), the best first.
+
+        The scores are those of `cams/pair.txt`: larger where two photographs share more of the scene's points seen
+        under a good angle; they have no unit. At most ten neighbours a frame, and not always both ways. Photographs
+        that do not count as frames are left out.
+
+        Raises:
+          FileNotFoundError: no `pair.txt`.
+          ValueError: it is damaged.
+        """
+        index = {int(name): i for i, name in enumerate(self.frame_names(sequence))}
+        path = self._places[sequence] / "cams" / "pair.txt"
+        neighbours: dict[int, list[tuple[int, float]]] = {}
+        for image, pairs in _pairs(SourceFiles().text(path, "the scene's image pairs; unpack it again"), path):
+            known = [(index[other], score) for other, score in pairs if other in index]
+            if image in index and known:
+                neighbours[index[image]] = sorted(known, key=lambda pair: -pair[1])
+        return neighbours
+
+    def neighbours(self, sequence: str, index: int) -> list[int]:
+        """The neighbours of `covisibility`, the best first: numbers next to each other need not see the same."""
+        return [other for other, _ in self.covisibility(sequence).get(index, [])]
+
+    def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
+        names = files.names(self.root, self.expects)
+        scenes = [name for name in names if _SCENE.fullmatch(name) and (self.root / name).is_dir()]
+        if self.split != "all":
+            scenes = self._listed(scenes, files)
+        return {name: self.root / name for name in scenes}
+
+    def _listed(self, scenes: list[str], files: SourceFiles) -> list[str]:
+        path = self.root / _LIST_FILES[self.split]
+        if not files.exists(path):
+            path = self.root / "project_lists" / path.name
+        text = files.text(path, "the list file of the set's repository, here or in the root; or choose split='all'")
+        listed = text.split()
+        for name in listed:
+            if not _SCENE.fullmatch(name):
+                raise ValueError(f"{path}: expected lines of 24 hexadecimal digits, got {name!r}: restore the file")
+        return sequences_present(listed, scenes, path)
+
+    def _list_frames(self, sequence: str, folder: Path, files: SourceFiles) -> Listing:
+        found: dict[str, set[str]] = {}
+        for kind, (place, pattern, _) in _FILES.items():
+            names = files.names(folder / place, f"the scene's {place}; unpack its zip file again")
+            for match in filter(None, map(pattern.fullmatch, names)):
+                found.setdefault(match[1], set()).add(kind)
+        absent = {
+            folder / place / form.format(name): f"but frame {name} has {', '.join(sorted(kinds))}; fetch it or remove "
+            "the frame"
+            for name, kinds in sorted(found.items())
+            for kind, (place, _, form) in _FILES.items()
+            if kind not in kinds
+        }
+        if absent:
+            raise missing_files(absent)
+        frames, lost = [], 0
+        for name in sorted(found):
+            paths = {kind: folder / place / form.format(name) for kind, (place, _, form) in _FILES.items()}
+            intrinsics, stored = _camera(files.text(paths["camera"], "the frame's camera"), paths["camera"])
+            extrinsics = world_to_camera(stored, paths["camera"], stored="world_to_camera")
+            if extrinsics is None:
+                lost += 1
+                continue
+            frames.append(
+                FrameRecord(
+                    name=name,
+                    image=paths["image"],
+                    depth=paths["depth"],
+                    intrinsics=intrinsics,
+                    extrinsics=extrinsics,
+                )
+            )
+        return Listing(frames, {"no pose": lost} if lost else {})
+
+    def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        depth = read_pfm(record.depth)
+        return read_rgb(record.image), np.where(np.isfinite(depth) & (depth > 0), depth, 0), record.intrinsics
+
+
+def _camera(text: str, path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Intrinsics [3, 3] and stored extrinsics [4, 4] of a camera file.
+
+    The two to four numbers of the depth range at its end are not needed, and wrong in some files.
+    """
+    words = text.split()
+    if len(words) not in (29, 30, 31) or words[0] != "extrinsic" or words[17] != "intrinsic":
+        raise ValueError(
+            f"{path}: expected 'extrinsic', 16 numbers, 'intrinsic', 9 numbers and 2 to 4 for the depth range, "
+            f"got {len(words)} words: fetch the file again"
+        )
+    values = numbers(" ".join(words[1:17] + words[18:27]), path, count=25)
+    return values[16:].reshape(3, 3), values[:16].reshape(4, 4)
+
+
+def _pairs(text: str, path: Path) -> list[tuple[int, list[tuple[int, float]]]]:
+    """Image numbers with their neighbours' numbers and scores."""
+    values = numbers(text, path).tolist()
+    position, pairs = 1, []
+    try:
+        for _ in range(int(values[0])):
+            image, count = int(values[position]), int(values[position + 1])
+            end = position + 2 + 2 * count
+            scores = values[position + 2 : end]
+            pairs.append((image, list(zip(map(int, scores[::2]), scores[1::2], strict=True))))
+            position = end
+        complete = position == len(values)
+    except (IndexError, ValueError):
+        complete = False
+    if not complete:
+        raise ValueError(
+            f"{path}: expected the number of images, then for each its number, how many neighbours, and their numbers "
+            "and scores: fetch the file again"
+        )
+    return pairs

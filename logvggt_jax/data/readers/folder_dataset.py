@@ -1,0 +1,310 @@
+"""What readers of data sets on disk share: sequences and frames listed once, pictures opened when asked for."""
+
+from __future__ import annotations
+
+import abc
+import contextlib
+import io
+import json
+import os
+import zipfile
+import zlib
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from absl import logging
+
+from logvggt_jax.data.dataset import check_indices, check_sequence, check_split
+from logvggt_jax.data.errors import EmptySequence, UnequalSizes
+from logvggt_jax.data.formats.calibration import check_intrinsics
+from logvggt_jax.data.formats.listing_index import ListingIndex, SourceFiles
+from logvggt_jax.types import Frames
+
+NO_POSES = np.full((4, 4), np.nan)
+# Listings kept in memory; a set of twenty thousand sequences would fill it with all of them.
+_RECENT = 64
+_GAPS = (30, 10, 5, 2, 1)
+
+
+@dataclass(frozen=True)
+class FrameRecord:
+    """One frame before its pictures are opened.
+
+    Attributes:
+      name: unique in its sequence.
+      image: colour picture.
+      depth: depth in the set's own encoding.
+      intrinsics: [3, 3] float64, pixels as the set's reader needs them (its `_read_frame` decides).
+      extrinsics: [4, 4] float64, world-to-camera, rigid; NaN in sets without poses.
+      companion: a third file that the frame needs, such as a mask of valid depth or its calibration.
+      depth_scale: factor on the stored depth, where frames differ.
+      quarter_turns: counter-clockwise quarter turns from the stored picture to the one handed out.
+    """
+
+    name: str
+    image: Path
+    depth: Path
+    intrinsics: np.ndarray
+    extrinsics: np.ndarray
+    companion: Path | None = None
+    depth_scale: float = 1.0
+    quarter_turns: int = 0
+
+
+@dataclass(frozen=True)
+class Listing:
+    """The frames of a sequence that count, in time order, and how many were dropped, by reason (`no pose`)."""
+
+    frames: Sequence[FrameRecord]
+    dropped: Mapping[str, int]
+
+
+class FolderDataset(abc.ABC):
+    """A `Dataset` in a folder.
+
+    A reader says in `_find_sequences` which sequences a split has, in `_list_frames` which frames a sequence has, and
+    in `_read_frame` how one frame is decoded. Both listings are kept in an index (see `listing_index`), for which they
+    read folders and text files through `SourceFiles`.
+    """
+
+    name: ClassVar[str]  # as in DATASETS
+    title: ClassVar[str]  # as its owners write it, for messages
+    expects: ClassVar[str]  # what the root folder should hold, for messages
+    metric: ClassVar[bool]
+    splits: ClassVar[tuple[str, ...]]
+
+    def __init__(self, root: str | Path, split: str = "all", *, variant: str = "") -> None:
+        """Lists the sequences; frames are listed when a sequence is first used.
+
+        Args:
+          root: the data set's folder.
+          split: one of `splits`.
+          variant: for readers whose sequences have other frames under other settings; keeps their listings apart.
+
+        Raises:
+          FileNotFoundError: no such folder, nothing of the set in it, or a list file is missing.
+          ValueError: a split that the set does not have, or a damaged list file.
+        """
+        check_split(split)
+        if split not in self.splits:
+            raise ValueError(f"{self.title} has no split {split!r}: choose {', '.join(self.splits)}")
+        self.root, self.split = Path(root), split
+        if not self.root.is_dir():
+            raise FileNotFoundError(f"{self.root}: no such folder; pass the folder that holds {self.expects}")
+        self._index = ListingIndex(f"{self.name}-{variant}" if variant else self.name, self.root)
+        self._recent: OrderedDict[str, Listing] = OrderedDict()
+        self._counts: dict[str, int] = {}
+        self._places = self._listed_sequences()
+        if not self._places:
+            raise FileNotFoundError(f"{self.root}: no sequences of {self.title}; expected {self.expects}")
+        self.sequences: tuple[str, ...] = tuple(self._places)
+
+    def num_frames(self, sequence: str) -> int:
+        """Frames with a picture, depth, a calibration and (where the set has poses) a finite pose."""
+        if sequence not in self._counts:
+            check_sequence(sequence, self._places, self.title)
+            count = self._index.count(f"frames {sequence}")
+            self._counts[sequence] = len(self._listing(sequence).frames) if count is None else count
+        return self._counts[sequence]
+
+    def image_size(self, sequence: str) -> tuple[int, int]:
+        """(H, W) of the pictures handed out, as the first frame has them; kept in the index.
+
+        Where that frame cannot be read, one in the middle and the last one are tried before its error is raised.
+        """
+        records = self._listing(sequence).frames
+        key = f"size {sequence} {records[0].quarter_turns}"
+        payload = self._index.get(key)
+        if payload is not None:
+            height, width = json.loads(payload)
+            return height, width
+        failed: Exception | None = None
+        for position in dict.fromkeys((0, len(records) // 2, len(records) - 1)):
+            try:
+                height, width = self.read(sequence, [position]).images.shape[1:3]
+            except (OSError, ValueError) as error:
+                failed = failed or error
+                continue
+            files = SourceFiles()
+            files.exists(records[position].image)
+            self._index.put(key, json.dumps([height, width]).encode(), 1, files)
+            return height, width
+        assert failed is not None
+        raise failed
+
+    def frame_names(self, sequence: str) -> list[str]:
+        """Names of these frames, in time order."""
+        return [record.name for record in self._listing(sequence).frames]
+
+    def dropped_frames(self, sequence: str) -> dict[str, int]:
+        """Frames of the folder that do not count, by reason."""
+        return dict(self._listing(sequence).dropped)
+
+    def extrinsics(self, sequence: str) -> np.ndarray:
+        """World-to-camera [T, 4, 4] float32 of these frames, as `read` gives them; no picture is opened."""
+        return np.stack([record.extrinsics for record in self._listing(sequence).frames]).astype(np.float32)
+
+    def neighbours(self, sequence: str, index: int) -> list[int]:
+        """Frames that may see what frame `index` sees, those seen from farther away first.
+
+        Here those 30, 10, 5, 2 and 1 later in the video, or as much earlier at its end.
+        """
+        count = self.num_frames(sequence)
+        frames = [index + gap if index + gap < count else index - gap for gap in _GAPS]
+        return [frame for frame in frames if frame >= 0]
+
+    def read(self, sequence: str, indices: Sequence[int]) -> Frames:
+        """Frames `indices`, in the order asked for.
+
+        Raises ValueError or FileNotFoundError naming the file: a missing, truncated or damaged picture, a wrong type,
+        sizes that do not belong together, intrinsics that cannot belong to the picture.
+        """
+        records = self._listing(sequence).frames
+        chosen = [records[i] for i in check_indices(indices, len(records), f"{self.title}, {sequence}")]
+        images: list[np.ndarray] = []
+        depths: list[np.ndarray] = []
+        intrinsics: list[np.ndarray] = []
+        for record in chosen:
+            image, depth, matrix = self._read_frame(record)
+            if record.quarter_turns:
+                image, depth = np.rot90(image, record.quarter_turns), np.rot90(depth, record.quarter_turns)
+            if depth.shape != image.shape[:2]:
+                raise UnequalSizes(
+                    f"{record.depth}: size {depth.shape} differs from {image.shape[:2]} of {record.image.name}: "
+                    "depth must have the picture's size; fetch both again"
+                )
+            if images and image.shape != images[0].shape:
+                raise UnequalSizes(
+                    f"{record.image}: size {image.shape[:2]} differs from {images[0].shape[:2]} of "
+                    f"{chosen[0].image.name}: frames of one sequence must have one size; fetch both again"
+                )
+            check_intrinsics(matrix, image.shape[:2], record.image)
+            images.append(image)
+            depths.append(depth)
+            intrinsics.append(matrix)
+        return Frames(
+            images=np.stack(images),
+            depth=np.stack(depths).astype(np.float32, copy=False),
+            intrinsics=np.stack(intrinsics).astype(np.float32),
+            extrinsics=np.stack([record.extrinsics for record in chosen]).astype(np.float32),
+            metric=self.metric,
+        )
+
+    @abc.abstractmethod
+    def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
+        """Unique names of the split's sequences, in a fixed order, each with its folder."""
+
+    @abc.abstractmethod
+    def _list_frames(self, sequence: str, folder: Path, files: SourceFiles) -> Listing:
+        """The frames of one sequence; raises naming the file for whatever is missing or damaged."""
+
+    @abc.abstractmethod
+    def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Picture [H, W, 3] uint8 RGB, z-depth [H, W] float (0 = invalid), intrinsics [3, 3] float64.
+
+        Before `record.quarter_turns` for picture and depth; the intrinsics are those after it.
+        """
+
+    def _listed_sequences(self) -> dict[str, Path]:
+        key = f"sequences {self.split}"
+        payload = self._index.get(key)
+        if payload is not None:
+            return {name: self.root / place for name, place in json.loads(payload).items()}
+        files = SourceFiles()
+        places = dict(self._find_sequences(files))
+        relative = {name: os.path.relpath(place, self.root) for name, place in places.items()}
+        self._index.put(key, json.dumps(relative).encode(), len(places), files)
+        return places
+
+    def _listing(self, sequence: str) -> Listing:
+        check_sequence(sequence, self._places, self.title)
+        recent = self._recent.get(sequence)
+        if recent is not None:
+            # Another thread may just have let it go.
+            with contextlib.suppress(KeyError):
+                self._recent.move_to_end(sequence)
+            return recent
+        key = f"frames {sequence}"
+        payload = self._index.get(key)
+        listing = None if payload is None else _unpacked(payload, self.root)
+        if listing is None:
+            files = SourceFiles()
+            listing = self._list_frames(sequence, self._places[sequence], files)
+            if not listing.frames:
+                raise EmptySequence(
+                    f"{self._places[sequence]}: no frame of {self.title} counts here "
+                    f"(dropped: {dict(listing.dropped) or 'none'}): fetch the sequence again or remove its folder"
+                )
+            self._index.put(key, _packed(listing, self.root), len(listing.frames), files)
+        self._recent[sequence] = listing
+        if len(self._recent) > _RECENT:
+            self._recent.popitem(last=False)
+        return listing
+
+
+def _packed(listing: Listing, root: Path) -> bytes:
+    """A listing as the bytes of an npz file."""
+    frames = listing.frames
+
+    def paths(attribute: str) -> np.ndarray:
+        values = (getattr(record, attribute) for record in frames)
+        return np.array(["" if path is None else os.path.relpath(path, root) for path in values])
+
+    buffer = io.BytesIO()
+    np.savez(
+        buffer,
+        names=np.array([record.name for record in frames]),
+        images=paths("image"),
+        depths=paths("depth"),
+        companions=paths("companion"),
+        intrinsics=np.stack([record.intrinsics for record in frames]),
+        extrinsics=np.stack([record.extrinsics for record in frames]),
+        depth_scales=np.array([record.depth_scale for record in frames]),
+        quarter_turns=np.array([record.quarter_turns for record in frames]),
+        dropped=np.array(json.dumps(dict(listing.dropped))),
+    )
+    return buffer.getvalue()
+
+
+def _unpacked(payload: bytes, root: Path) -> Listing | None:
+    """The listing that `_packed` stored; None where its bytes are damaged, which SQLite does not notice."""
+    try:
+        with np.load(io.BytesIO(payload), allow_pickle=False) as packed:
+            columns = {name: packed[name] for name in packed.files}
+        dropped = json.loads(str(columns.pop("dropped")))
+    except (ValueError, KeyError, EOFError, OSError, zipfile.BadZipFile, zlib.error) as error:
+        logging.warning("a damaged listing of %s is made anew (%r)", root, error)
+        return None
+    frames = [
+        FrameRecord(
+            name=str(name),
+            image=root / str(image),
+            depth=root / str(depth),
+            companion=root / str(companion) if str(companion) else None,
+            intrinsics=intrinsics,
+            extrinsics=extrinsics,
+            depth_scale=float(depth_scale),
+            quarter_turns=int(quarter_turns),
+        )
+        for name, image, depth, companion, intrinsics, extrinsics, depth_scale, quarter_turns in zip(
+            *(
+                columns[name]
+                for name in (
+                    "names",
+                    "images",
+                    "depths",
+                    "companions",
+                    "intrinsics",
+                    "extrinsics",
+                    "depth_scales",
+                    "quarter_turns",
+                )
+            ),
+            strict=True,
+        )
+    ]
+    return Listing(frames, dropped)

@@ -1,0 +1,90 @@
+"""MVS-Synth (Huang et al., CVPR 2018, "DeepMVS"): 120 sequences of 100 frames from the game GTA V.
+
+Layout, as on the DeepMVS project page: `<root>/GTAV_720/XXXX/{images/XXXX.png, depths/XXXX.exr, poses/XXXX.json}`.
+A pose file holds `extrinsic` (4 x 4 rows, world-to-camera, OpenCV camera, left-handed world) and `f_x, f_y, c_x, c_y`
+in pixels. Depth is z in units of about 0.1 m, infinite in the sky. Of the three sizes published, 720 is read: the
+intrinsics stored with GTAV_540 do not fit its pictures.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from logvggt_jax.data.formats.calibration import pinhole, world_to_camera
+from logvggt_jax.data.formats.exr import read_exr
+from logvggt_jax.data.formats.image import read_rgb
+from logvggt_jax.data.formats.listing_index import SourceFiles
+from logvggt_jax.data.formats.numbered_files import numbered_frames
+from logvggt_jax.data.readers.folder_dataset import FolderDataset, FrameRecord, Listing
+
+# Makes the world right-handed; which axis is flipped changes no relative pose.
+_MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
+_SEQUENCE = re.compile(r"\d{4}")
+_NUMBERS = ("f_x", "f_y", "c_x", "c_y")
+
+
+class MVSSynth(FolderDataset):
+    """Reader of MVS-Synth; sequences are named `0000`.
+
+    Depth and translations stay in the set's own unit, so the set is not metric. Depth that is infinite (sky), NaN or
+    not positive becomes 0. The left-handed world is mirrored at y = 0, which makes the extrinsics rotations; stored
+    extrinsics with determinant +1 are refused. The set has no lists, so the only split is `all`.
+    """
+
+    name = "mvs_synth"
+    title = "MVS-Synth"
+    expects = "GTAV_720/XXXX with images, depths and poses (unpack GTAV_720.tar.gz)"
+    metric = False
+    splits = ("all",)
+
+    def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
+        folder = self.root / "GTAV_720"
+        names = files.names(folder, f"the sequences of {self.title} at 1280 x 720; other sizes are not read")
+        return {name: folder / name for name in names if _SEQUENCE.fullmatch(name) and (folder / name).is_dir()}
+
+    def _list_frames(self, sequence: str, folder: Path, files: SourceFiles) -> Listing:
+        kinds = (("images", "{:04d}.png"), ("depths", "{:04d}.exr"), ("poses", "{:04d}.json"))
+        frames: list[FrameRecord] = []
+        dropped: Counter[str] = Counter()
+        paths = numbered_frames(files, *((folder / kind, template) for kind, template in kinds))
+        for image, depth, pose in paths.values():
+            intrinsics, extrinsics = _camera(files.text(pose, "the frame's camera"), pose)
+            if extrinsics is None:
+                dropped["no pose"] += 1
+            elif not np.isfinite(intrinsics).all():
+                dropped["no intrinsics"] += 1
+            else:
+                frames.append(FrameRecord(image.stem, image, depth, intrinsics, extrinsics))
+        return Listing(frames, dropped)
+
+    def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        depth = read_exr(record.depth)
+        depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0.0))
+        return read_rgb(record.image), depth, record.intrinsics
+
+
+def _camera(text: str, path: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    """Intrinsics [3, 3] and extrinsics [4, 4] (None where not finite) of a pose file, in a right-handed world."""
+    try:
+        stored = json.loads(text)
+        pose = np.array(stored["extrinsic"], np.float64)
+        intrinsics = pinhole(*(float(stored[key]) for key in _NUMBERS))
+    except (ValueError, TypeError, KeyError) as error:
+        raise ValueError(
+            f"{path}: expected JSON with 'extrinsic' and {', '.join(_NUMBERS)}, got {type(error).__name__} "
+            f"({error}): fetch it again"
+        ) from error
+    if pose.shape != (4, 4):
+        raise ValueError(f"{path}: expected an extrinsic of 4 x 4 numbers, got {pose.shape}: fetch it again")
+    if np.isfinite(pose).all() and np.linalg.det(pose) > 0:
+        raise ValueError(
+            f"{path}: expected a left-handed world (determinant -1), got determinant "
+            f"{np.linalg.det(pose):+.3g}: replace it with the data set's original file"
+        )
+    return intrinsics, world_to_camera(pose @ _MIRROR, path, stored="world_to_camera")

@@ -1,0 +1,69 @@
+"""Neural RGB-D (Azinović et al., CVPR 2022): synthetic RGB-D video of rooms with exact depth and poses.
+
+Layout: `<root>/<scene>/images/img<n>.png`, `depth/depth<n>.png`, `focal.txt` and `poses.txt`, from the official
+repository's data set. Numbers are not padded and start at 0. `depth` is uint16 in millimetres, 0 where invalid;
+`depth_filtered` and `depth_with_noise`, which imitate a sensor, and `trainval_poses.txt` are not read. `poses.txt`
+holds four lines a frame, camera-to-world in metres with OpenGL camera axes (x right, y up, z back); `nan` for frames
+without a pose. `focal.txt` is the focal length for 640 x 480; the principal point is (320, 240) there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from logvggt_jax.data.formats.calibration import OPENGL_AXES, numbers, pinhole, scaled, world_to_camera
+from logvggt_jax.data.formats.image import read_depth, read_rgb
+from logvggt_jax.data.formats.listing_index import SourceFiles
+from logvggt_jax.data.formats.numbered_files import numbered_frames, without_gaps
+from logvggt_jax.data.formats.pose_lists import read_pose_list
+from logvggt_jax.data.readers.folder_dataset import FolderDataset, FrameRecord, Listing
+
+_CENTRE, _SIZE = (320.0, 240.0), (480, 640)
+_MAX_DEPTH = 10.0  # metres, valid itself
+
+
+class NRGBD(FolderDataset):
+    """Reader of Neural RGB-D; sequences are named as their scenes, `kitchen`.
+
+    Depth beyond 10 m becomes 0, as in published evaluations. Intrinsics scale with the image. Frames without a pose
+    are dropped.
+    """
+
+    name = "nrgbd"
+    title = "Neural RGB-D"
+    expects = "<scene>/{images,depth,focal.txt,poses.txt}"
+    metric = True
+    splits = ("all",)
+
+    def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
+        folders = {name: self.root / name for name in files.names(self.root, "scenes")}
+        return {
+            name: folder
+            for name, folder in folders.items()
+            if files.exists(folder / "images") or files.exists(folder / "poses.txt")
+        }
+
+    def _list_frames(self, sequence: str, folder: Path, files: SourceFiles) -> Listing:
+        kinds = ((folder / "images", "img{}.png"), (folder / "depth", "depth{}.png"))
+        paths = without_gaps(numbered_frames(files, *kinds))
+        pose_list = folder / "poses.txt"
+        poses = read_pose_list(files, pose_list, count=len(paths), numbers_per_line=4)
+        path = folder / "focal.txt"
+        (focal,) = numbers(files.text(path, "the focal length"), path, count=1)
+        records = []
+        for (image, depth), pose in zip(paths, poses, strict=True):
+            opencv = pose * OPENGL_AXES.diagonal()
+            extrinsics = world_to_camera(opencv, f"{pose_list}, pose of {image.name}", stored="camera_to_world")
+            if extrinsics is not None:
+                records.append(FrameRecord(image.stem, image, depth, pinhole(focal, focal, *_CENTRE), extrinsics))
+        lost = len(paths) - len(records)
+        return Listing(records, {"no pose": lost} if lost else {})
+
+    def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        image = read_rgb(record.image)
+        depth = read_depth(record.depth).astype(np.float32) / np.float32(1000.0)
+        depth[depth > _MAX_DEPTH] = 0.0
+        return image, depth, scaled(record.intrinsics, image.shape[1] / _SIZE[1], image.shape[0] / _SIZE[0])

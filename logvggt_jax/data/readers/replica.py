@@ -1,0 +1,87 @@
+"""Replica (Straub et al., 2019) as rendered for iMAP and NICE-SLAM: RGB-D video of eight rooms and offices.
+
+Layout: `<root>/cam_params.json` and per scene `<root>/<scene>/traj.txt`, `results/frame000000.jpg` and
+`results/depth000000.png`. `cam_params.json` holds `{"camera": {"w", "h", "fx", "fy", "cx", "cy", "scale"}}`; pixel
+centres are at integers. A line of `traj.txt` is one frame's camera-to-world matrix, 16 numbers row-major, metres,
+OpenCV axes. Depth is uint16, `scale` a metre, 0 where invalid. Other renderings of Replica are not read.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from logvggt_jax.data.formats.calibration import pinhole, scaled, world_to_camera
+from logvggt_jax.data.formats.image import read_depth, read_rgb
+from logvggt_jax.data.formats.listing_index import SourceFiles
+from logvggt_jax.data.formats.numbered_files import numbered_frames, without_gaps
+from logvggt_jax.data.formats.pose_lists import read_pose_list
+from logvggt_jax.data.readers.folder_dataset import FolderDataset, FrameRecord, Listing
+
+# The rendering's own, for downloads that lack the file.
+_CAMERA = {"w": 1200.0, "h": 680.0, "fx": 600.0, "fy": 600.0, "cx": 599.5, "cy": 339.5, "scale": 6553.5}
+
+
+class Replica(FolderDataset):
+    """Reader of Replica in the NICE-SLAM rendering; sequences are named `office0`.
+
+    The camera of `cam_params.json` belongs to pictures of the size named there and scales with pictures of another
+    size; without the file it is the rendering's (1200 x 680, focal length 600, 6553.5 a metre).
+    """
+
+    name = "replica"
+    title = "Replica"
+    expects = "cam_params.json and <scene>/{traj.txt,results} (the rendering that NICE-SLAM distributes)"
+    metric = True
+    splits = ("all",)
+
+    def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
+        folders = {name: self.root / name for name in files.names(self.root, "scenes")}
+        return {
+            name: folder
+            for name, folder in folders.items()
+            if files.exists(folder / "results") or files.exists(folder / "traj.txt")
+        }
+
+    def _list_frames(self, sequence: str, folder: Path, files: SourceFiles) -> Listing:
+        camera = _camera(self.root / "cam_params.json", files)
+        results = folder / "results"
+        paths = without_gaps(numbered_frames(files, (results, "frame{:06d}.jpg"), (results, "depth{:06d}.png")))
+        trajectory = folder / "traj.txt"
+        poses = read_pose_list(files, trajectory, count=len(paths))
+        # At 1 x 1 the intrinsics fit pictures of any size.
+        intrinsics = scaled(
+            pinhole(camera["fx"], camera["fy"], camera["cx"], camera["cy"]), 1 / camera["w"], 1 / camera["h"]
+        )
+        records = []
+        for line, ((image, depth), pose) in enumerate(zip(paths, poses, strict=True), 1):
+            extrinsics = world_to_camera(pose, f"{trajectory}, line {line}", stored="camera_to_world")
+            if extrinsics is not None:
+                records.append(
+                    FrameRecord(image.stem, image, depth, intrinsics, extrinsics, depth_scale=1 / camera["scale"])
+                )
+        lost = len(paths) - len(records)
+        return Listing(records, {"no pose": lost} if lost else {})
+
+    def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        image = read_rgb(record.image)
+        depth = (read_depth(record.depth) * record.depth_scale).astype(np.float32)
+        return image, depth, scaled(record.intrinsics, image.shape[1], image.shape[0])
+
+
+def _camera(path: Path, files: SourceFiles) -> Mapping[str, float]:
+    if not files.exists(path):
+        return _CAMERA
+    try:
+        camera = json.loads(files.text(path, "the camera"))["camera"]
+        values = {key: float(camera[key]) for key in _CAMERA}
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(
+            f'{path}: expected {{"camera": {{{", ".join(_CAMERA)}}}}} with numbers ({error!r}): fetch the file again'
+        ) from error
+    if not all(np.isfinite(values[key]) and values[key] > 0 for key in ("w", "h", "scale")):
+        raise ValueError(f"{path}: w, h and scale must be positive, got {values}: fetch the file again")
+    return values

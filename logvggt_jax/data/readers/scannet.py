@@ -1,0 +1,145 @@
+"""ScanNet v2 (Dai et al., CVPR 2017): RGB-D video of indoor scenes.
+
+Layout, as exported by the SensReader of the official repository: `<root>/<part>/<scene>/` with
+`color/<n>.jpg`, `depth/<n>.png`, `pose/<n>.txt` and `intrinsic/intrinsic_depth.txt`. `<part>` is `scans_train`,
+`scans_test` or `scannetv2`, or is left out; scenes are named `scene0000_00`. Numbers are not padded. Depth is uint16 in
+millimetres, 0 where invalid. Poses are camera-to-world in metres, OpenCV axes; a lost frame's entries are `-inf`.
+Intrinsics are 4x4.
+
+Also read, where a scene has no `color`, is the form that published evaluations prepare (MonST3R's script):
+`color_90/frame_0000.jpg`, `depth_90/frame_0000.png` and `pose_90.txt` with 16 numbers a line, and likewise for other
+numbers than 90. These are frames already chosen, every third from the first.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import cv2
+import numpy as np
+from absl import logging
+
+from logvggt_jax.data.errors import UnequalSizes
+from logvggt_jax.data.formats.calibration import numbers, world_to_camera
+from logvggt_jax.data.formats.image import read_depth, read_rgb
+from logvggt_jax.data.formats.listing_index import SourceFiles
+from logvggt_jax.data.formats.numbered_files import numbered_frames, without_gaps
+from logvggt_jax.data.formats.pose_lists import read_pose_list
+from logvggt_jax.data.readers.folder_dataset import FolderDataset, FrameRecord, Listing
+
+_SCENE = re.compile(r"scene\d{4}_\d{2}")
+_PREPARED = re.compile(r"color_(\d+)")
+_PARTS = {"scans_train": "train", "scans_test": "test", "scannetv2": None}
+_ASPECT_TOLERANCE = 0.05  # 1296 x 968 and 640 x 480 differ by 0.004
+
+
+class ScanNet(FolderDataset):
+    """Reader of ScanNet v2; sequences are named `scene0000_00`, in the prepared form `scene0000_00/color_90`.
+
+    Frames are handed out at the depth camera's size with its intrinsics, colour resized to it by area: ScanNet
+    registers depth to colour, so that the two differ by size alone. Frames whose pose is not finite are dropped;
+    scenes whose intrinsics are not finite are left out.
+
+    Splits follow the official list files `scannetv2_{train,val,test}.txt` where one of them lies in `root`. Without
+    them `train` is what lies in `scans_train`, `test` what lies in `scans_test`, and there is no `val`.
+    """
+
+    name = "scannet"
+    title = "ScanNet"
+    expects = "scans_train, scans_test or scannetv2 with scene0000_00/{color,depth,pose,intrinsic} (export the .sens)"
+    metric = True
+    splits = ("train", "val", "test", "all")
+
+    def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
+        places: dict[str, Path] = {}
+        for scene, folder in sorted(self._chosen_scenes(files).items()):
+            if not _is_calibrated(folder, files):
+                logging.warning("%s is left out: its intrinsics are not finite", folder)
+                continue
+            names = files.names(folder, "color, depth, pose and intrinsic")
+            prepared = [name for name in names if _PREPARED.fullmatch(name)]
+            if "color" in names or not prepared:
+                places[scene] = folder
+            else:
+                places |= {f"{scene}/{name}": folder / name for name in prepared}
+        return places
+
+    def _list_frames(self, sequence: str, folder: Path, files: SourceFiles) -> Listing:
+        if match := _PREPARED.fullmatch(folder.name):
+            scene, count = folder.parent, match[1]
+            kinds = ((folder, "frame_{:04d}.jpg"), (scene / f"depth_{count}", "frame_{:04d}.png"))
+            paths = without_gaps(numbered_frames(files, *kinds))
+            pose_list = scene / f"pose_{count}.txt"
+            poses = read_pose_list(files, pose_list, count=len(paths))
+            frames = [(image, depth, pose, pose_list) for (image, depth), pose in zip(paths, poses, strict=True)]
+        else:
+            scene = folder
+            export = numbered_frames(
+                files, (folder / "color", "{}.jpg"), (folder / "depth", "{}.png"), (folder / "pose", "{}.txt")
+            )
+            frames = [(image, depth, _pose(path, files), path) for image, depth, path in export.values()]
+        path = scene / "intrinsic" / "intrinsic_depth.txt"
+        intrinsics = numbers(files.text(path, "the depth camera's intrinsics"), path, count=16).reshape(4, 4)[:3, :3]
+        records = []
+        for image, depth, pose, where in frames:
+            extrinsics = world_to_camera(pose, where, stored="camera_to_world")
+            if extrinsics is not None:
+                records.append(FrameRecord(image.stem, image, depth, intrinsics, extrinsics))
+        lost = len(frames) - len(records)
+        return Listing(records, {"no pose": lost} if lost else {})
+
+    def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        image, raw = read_rgb(record.image), read_depth(record.depth)
+        (height, width), (image_height, image_width) = raw.shape, image.shape[:2]
+        if abs(image_width * height / (image_height * width) - 1) > _ASPECT_TOLERANCE:
+            raise UnequalSizes(
+                f"{record.depth}: {width} x {height} has another aspect ratio than {image_width} x {image_height} of "
+                f"{record.image}: export both again"
+            )
+        if image.shape[:2] != raw.shape:
+            image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+        return image, raw.astype(np.float32) / np.float32(1000.0), record.intrinsics
+
+    def _chosen_scenes(self, files: SourceFiles) -> dict[str, Path]:
+        parts: dict[str, str | None] = {"": None, **_PARTS}
+        lists = {split: self.root / f"scannetv2_{split}.txt" for split in ("train", "val", "test")}
+        listed = [files.exists(path) for path in lists.values()]
+        scenes: dict[str, Path] = {}
+        for part, part_split in parts.items():
+            if self.split != "all" and not any(listed) and part_split != self.split:
+                continue
+            if not files.exists(self.root / part):
+                continue
+            for name in files.names(self.root / part, "scenes"):
+                folder = self.root / part / name
+                if not _SCENE.fullmatch(name) or not folder.is_dir():
+                    continue
+                if name in scenes:
+                    raise ValueError(f"{folder} and {scenes[name]} are the same scene: remove one of them")
+                scenes[name] = folder
+        if self.split == "all":
+            return scenes
+        path = lists[self.split]
+        if not any(listed):
+            if self.split == "val":
+                raise FileNotFoundError(f"{path}: no such file; add the official list or choose another split")
+            return scenes
+        names = files.text(path, "the official list file; add it or choose split='all'").split()
+        for name in names:
+            if name not in scenes:
+                raise FileNotFoundError(
+                    f"{self.root}: no folder of scene {name}, but {path.name} lists it; export it or edit the list"
+                )
+        return {name: scenes[name] for name in names}
+
+
+def _is_calibrated(scene: Path, files: SourceFiles) -> bool:
+    """Whether the intrinsics are finite; a scene without the file passes, so that listing it names the file."""
+    path = scene / "intrinsic" / "intrinsic_depth.txt"
+    return not files.exists(path) or bool(np.isfinite(numbers(files.text(path, "intrinsics"), path)).all())
+
+
+def _pose(path: Path, files: SourceFiles) -> np.ndarray:
+    return numbers(files.text(path, "the frame's pose"), path, count=16).reshape(4, 4)

@@ -1,0 +1,106 @@
+"""MPI Sintel (Butler et al., ECCV 2012) with its depth and camera ground truth: 23 training sequences of a film.
+
+Layout, the archives of pictures and of depth unpacked into one folder: `<root>/training/final/<sequence>/
+frame_XXXX.png`, `training/depth/<sequence>/frame_XXXX.dpt`, `training/camdata_left/<sequence>/frame_XXXX.cam`, numbered
+from 1. All binary values are little-endian. A `.dpt` file is the float32 tag 202021.25, int32 width and height, and
+float32 z-depth row by row. A `.cam` file is the same tag, nine float64 of the intrinsic matrix and twelve of the 3 x 4
+world-to-camera matrix, OpenCV axes, rows first.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from logvggt_jax.data.errors import BrokenPicture
+from logvggt_jax.data.formats.calibration import world_to_camera
+from logvggt_jax.data.formats.image import read_rgb
+from logvggt_jax.data.formats.listing_index import SourceFiles
+from logvggt_jax.data.formats.numbered_files import numbered_frames
+from logvggt_jax.data.readers.folder_dataset import FolderDataset, FrameRecord, Listing
+
+_TAG = np.array(202021.25, "<f4").tobytes()
+_SKY = 1000.0  # metres; the film's sky is a huge number
+_CAMERA_BYTES = 4 + 21 * 8
+
+
+class Sintel(FolderDataset):
+    """Reader of MPI Sintel's training half, pass `final`; sequences are named `alley_2`.
+
+    Depth beyond 1000 m is sky and becomes 0, as does what is not finite or not positive; the limit of 70 m that
+    evaluations use belongs to the metric. The test half has no ground truth, so the splits are `train` and `all`,
+    both of them the training half.
+    """
+
+    name = "sintel"
+    title = "MPI Sintel"
+    expects = "training/final, training/depth and training/camdata_left (unpack both archives into one folder)"
+    metric = True
+    splits = ("train", "all")
+
+    def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
+        folder = self.root / "training" / "final"
+        names = files.names(folder, "the pictures of the pass 'final'")
+        return {name: folder / name for name in names if (folder / name).is_dir()}
+
+    def _list_frames(self, sequence: str, folder: Path, files: SourceFiles) -> Listing:
+        training = self.root / "training"
+        paths = numbered_frames(
+            files,
+            (folder, "frame_{:04d}.png"),
+            (training / "depth" / sequence, "frame_{:04d}.dpt"),
+            (training / "camdata_left" / sequence, "frame_{:04d}.cam"),
+        )
+        frames: list[FrameRecord] = []
+        dropped: Counter[str] = Counter()
+        for image, depth, camera in paths.values():
+            intrinsics, pose = _camera(files.content(camera, "the frame's camera"), camera)
+            extrinsics = world_to_camera(pose, camera, stored="world_to_camera")
+            if extrinsics is None:
+                dropped["no pose"] += 1
+            elif not np.isfinite(intrinsics).all():
+                dropped["no intrinsics"] += 1
+            else:
+                frames.append(FrameRecord(image.stem, image, depth, intrinsics, extrinsics))
+        return Listing(frames, dropped)
+
+    def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        depth = _depth(record.depth)
+        # NaN fails both comparisons.
+        return (
+            read_rgb(record.image),
+            np.where((depth > 0) & (depth <= _SKY), depth, np.float32(0.0)),
+            record.intrinsics,
+        )
+
+
+def _camera(content: bytes, path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Intrinsics [3, 3] and world-to-camera [3, 4], float64, of a `.cam` file."""
+    _check_tag(content, path, ValueError)
+    if len(content) != _CAMERA_BYTES:
+        raise ValueError(f"{path}: expected {_CAMERA_BYTES} bytes, got {len(content)}: fetch it again")
+    values = np.frombuffer(content, "<f8", offset=4).astype(np.float64)
+    return values[:9].reshape(3, 3), values[9:].reshape(3, 4)
+
+
+def _depth(path: Path) -> np.ndarray:
+    """z-depth [H, W] float32 of a `.dpt` file, as stored."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file; fetch it again or remove the frame's other files")
+    content = path.read_bytes()
+    _check_tag(content, path, BrokenPicture)
+    width, height = (int(size) for size in np.frombuffer(content[4:12].ljust(8, b"\0"), "<i4"))
+    expected = 12 + 4 * width * height
+    if width < 1 or height < 1 or len(content) != expected:
+        raise BrokenPicture(
+            f"{path}: expected {expected} bytes for {width} x {height} pixels, got {len(content)}: fetch it again"
+        )
+    return np.frombuffer(content, "<f4", offset=12).astype(np.float32).reshape(height, width)
+
+
+def _check_tag(content: bytes, path: Path, error: type[ValueError]) -> None:
+    if content[:4] != _TAG:
+        raise error(f"{path}: expected the tag 202021.25 in the first four bytes: fetch it again")

@@ -1,0 +1,96 @@
+"""Spring (Mehl et al., CVPR 2023): 37 training sequences, 5,000 frames, of a Blender film in stereo.
+
+Layout: `<root>/train/XXXX/` with `frame_left/frame_left_XXXX.png`, numbered from 1, `disp1_left/disp1_left_XXXX.dsp5`
+and `cam_data/{intrinsics.txt, extrinsics.txt}`. A `.dsp5` file is HDF5 with the array `disparity` at twice the
+picture's width and height, in pixels of the picture. The text files have a row for each frame: `fx fy cx cy` in
+pixels, and sixteen numbers of the world-to-camera matrix of the left camera, rows first, OpenCV axes, metres.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from logvggt_jax.data.errors import UnequalCounts
+from logvggt_jax.data.formats.calibration import numbers, pinhole, world_to_camera
+from logvggt_jax.data.formats.hdf5 import read_hdf5
+from logvggt_jax.data.formats.image import read_rgb
+from logvggt_jax.data.formats.listing_index import SourceFiles
+from logvggt_jax.data.formats.numbered_files import numbered_frames
+from logvggt_jax.data.readers.folder_dataset import FolderDataset, FrameRecord, Listing
+
+_BASELINE = 0.065  # metres between the two cameras
+_SEQUENCE = re.compile(r"\d{4}")
+
+
+class Spring(FolderDataset):
+    """Reader of the left camera of Spring's training half; sequences are named `0001`.
+
+    Depth is fx * 0.065 m over every second value of every second row of the disparity, the values that lie on the
+    picture's pixels. It is 0 where the disparity is NaN or not positive, as in the sky. The test half has neither
+    depth nor extrinsics, so the splits are `train` and `all`, both of them the training half.
+    """
+
+    name = "spring"
+    title = "Spring"
+    expects = "train/XXXX with frame_left, disp1_left and cam_data (unpack these three archives into one folder)"
+    metric = True
+    splits = ("train", "all")
+
+    def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
+        folder = self.root / "train"
+        names = files.names(folder, "the training sequences")
+        return {name: folder / name for name in names if _SEQUENCE.fullmatch(name) and (folder / name).is_dir()}
+
+    def _list_frames(self, sequence: str, folder: Path, files: SourceFiles) -> Listing:
+        paths = numbered_frames(
+            files,
+            (folder / "frame_left", "frame_left_{:04d}.png"),
+            (folder / "disp1_left", "disp1_left_{:04d}.dsp5"),
+        )
+        calibration, poses = folder / "cam_data" / "intrinsics.txt", folder / "cam_data" / "extrinsics.txt"
+        pinholes = _rows(files, calibration, 4, "fx fy cx cy of each frame")
+        matrices = _rows(files, poses, 16, "the world-to-camera matrix of each frame")
+        for path, rows in ((calibration, pinholes), (poses, matrices)):
+            if max(paths) > len(rows):
+                raise UnequalCounts(
+                    f"{path}: expected a row for each of the frames 1 to {max(paths)}, got {len(rows)} rows: "
+                    "fetch the sequence's cam_data again"
+                )
+        if 0 in paths:
+            raise ValueError(f"{paths[0][0]}: frames are numbered from 1: restore the original names")
+        frames: list[FrameRecord] = []
+        dropped: Counter[str] = Counter()
+        for number, (image, disparity) in paths.items():
+            row = number - 1
+            extrinsics = world_to_camera(
+                matrices[row].reshape(4, 4), f"{poses}, row {number}", stored="world_to_camera"
+            )
+            if extrinsics is None:
+                dropped["no pose"] += 1
+            elif not np.isfinite(pinholes[row]).all():
+                dropped["no intrinsics"] += 1
+            else:
+                frames.append(FrameRecord(image.stem, image, disparity, pinhole(*pinholes[row]), extrinsics))
+        return Listing(frames, dropped)
+
+    def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        image = read_rgb(record.image)
+        height, width = image.shape[:2]
+        disparity = read_hdf5(record.depth, "disparity", shape=(2 * height, 2 * width))[::2, ::2].astype(np.float32)
+        # NaN fails the comparison. What is next to nothing is the sky too: its depth is beyond float32.
+        with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+            depth = np.float32(record.intrinsics[0, 0] * _BASELINE) / disparity
+        return image, np.where((disparity > 0) & np.isfinite(depth), depth, np.float32(0.0)), record.intrinsics
+
+
+def _rows(files: SourceFiles, path: Path, columns: int, expected: str) -> np.ndarray:
+    """Rows [N, columns] float64 of a text file."""
+    lines = [line for line in files.text(path, expected).splitlines() if line.strip()]
+    if not lines:
+        raise ValueError(f"{path}: empty; expected {expected}: fetch it again")
+    return np.stack([numbers(line, f"{path}, row {row}", count=columns) for row, line in enumerate(lines, 1)])

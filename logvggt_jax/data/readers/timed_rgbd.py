@@ -1,0 +1,214 @@
+"""What TUM RGB-D and the data sets in its format share: three streams with clocks of their own, associated by time.
+
+`rgb.txt` and `depth.txt` hold lines `time file`, `groundtruth.txt` lines `time tx ty tz qx qy qz qw`, camera-to-world,
+metres and seconds; `#` starts a comment.
+"""
+
+from __future__ import annotations
+
+import abc
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from logvggt_jax.data.errors import BadPose, UnequalCounts, missing_files
+from logvggt_jax.data.formats.calibration import numbers, scaled, world_to_camera
+from logvggt_jax.data.formats.image import read_depth, read_rgb
+from logvggt_jax.data.formats.listing_index import SourceFiles
+from logvggt_jax.data.readers.folder_dataset import NO_POSES, FolderDataset, FrameRecord, Listing
+from logvggt_jax.geometry import quaternion_to_matrix
+
+TOLERANCE = 0.02  # seconds
+_SIZE = (480, 640)  # that the calibrations belong to
+_UNITS_PER_METRE = 5000.0
+_PREPARED = re.compile(r"rgb_(\d+)")
+_TIMED_FILE = re.compile(r"(\d+(?:\.\d+)?)\.png")
+
+
+def associate(first: np.ndarray, second: np.ndarray, tolerance: float = TOLERANCE) -> np.ndarray:
+    """For each time of `first` [n] the index of its partner in `second` [m], or -1; int [n].
+
+    Partners are less than `tolerance` apart. The closest two of all become partners first, then the closest of the
+    rest, as in TUM's own tool: no entry has two partners. Both arrays are in ascending order.
+    """
+    starts = np.searchsorted(second, first - tolerance, side="left")
+    ends = np.searchsorted(second, first + tolerance, side="right")
+    rows = np.repeat(np.arange(len(first)), ends - starts)
+    columns = np.concatenate([np.arange(s, e) for s, e in zip(starts, ends, strict=True)] or [np.empty(0)]).astype(int)
+    gaps = np.abs(first[rows] - second[columns])
+    partners, taken = np.full(len(first), -1), np.zeros(len(second), bool)
+    for pair in np.argsort(gaps, kind="stable"):
+        row, column = rows[pair], columns[pair]
+        if gaps[pair] < tolerance and partners[row] < 0 and not taken[column]:
+            partners[row], taken[column] = column, True
+    return partners
+
+
+class TimedRGBD(FolderDataset):
+    """Reader of data sets in TUM's format, `rgb`, `depth`, `rgb.txt`, `depth.txt` and `groundtruth.txt` a sequence.
+
+    Depth and pose of a picture are those nearest in time, less than 0.02 s away. Pictures without depth or without
+    a pose that near are dropped. Intrinsics are for 640 x 480 and scale with the image. Depth is uint16, 5000 a metre,
+    0 where invalid. Sequences are named as their folders.
+
+    Where a sequence has neither `rgb` nor `rgb.txt`, the form that published evaluations prepare (MonST3R's scripts) is
+    read: `rgb_90`, `depth_90` and `groundtruth_90.txt`, and likewise for other numbers; the sequence is then named
+    `<folder>/rgb_90`. Files are named by their time; picture i belongs to depth i, since those scripts pair by place.
+    Poses are associated by time.
+    """
+
+    metric = True
+    splits = ("all",)
+    folder_pattern: ClassVar[re.Pattern[str]]
+    container: ClassVar[str | None]  # folder below `root` that may hold the sequences
+    prepared_for: ClassVar[str]  # `depth`: poses may be missing from the prepared form; `poses`: depth may be
+
+    @abc.abstractmethod
+    def _intrinsics(self, folder: Path) -> np.ndarray:
+        """Intrinsics [3, 3] at 640 x 480 of the camera that recorded the sequence in `folder`."""
+
+    def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
+        parents = [self.root, *([self.root / self.container] if self.container else [])]
+        folders: dict[str, Path] = {}
+        for parent in filter(files.exists, parents):
+            for name in files.names(parent, "sequences"):
+                if not self.folder_pattern.fullmatch(name) or not (parent / name).is_dir():
+                    continue
+                if name in folders:
+                    raise ValueError(f"{parent / name} and {folders[name]} are the same sequence: remove one of them")
+                folders[name] = parent / name
+        places: dict[str, Path] = {}
+        for name, folder in sorted(folders.items()):
+            held = files.names(folder, "rgb, depth, rgb.txt, depth.txt and groundtruth.txt")
+            if "rgb" in held or "rgb.txt" in held:
+                places[name] = folder
+            else:
+                places |= {f"{name}/{part}": folder / part for part in held if _PREPARED.fullmatch(part)}
+        return places
+
+    def _list_frames(self, sequence: str, folder: Path, files: SourceFiles) -> Listing:
+        if match := _PREPARED.fullmatch(folder.name):
+            return self._list_prepared(folder.parent, match[1], files)
+        times, images = _listed_files(folder / "rgb.txt", files)
+        depth_times, depths = _listed_files(folder / "depth.txt", files)
+        trajectory = _Trajectory(folder / "groundtruth.txt", files)
+        depth_of, pose_of = associate(times, depth_times), associate(times, trajectory.times)
+        dropped = {"no depth": 0, "no pose": 0}
+        records = []
+        for image, depth_index, pose_index in zip(images, depth_of, pose_of, strict=True):
+            extrinsics = trajectory.extrinsics(pose_index) if pose_index >= 0 else None
+            if depth_index < 0:
+                dropped["no depth"] += 1
+            elif extrinsics is None:
+                dropped["no pose"] += 1
+            else:
+                depth = depths[depth_index]
+                records.append(FrameRecord(image.stem, image, depth, self._intrinsics(folder), extrinsics))
+        return Listing(records, {reason: count for reason, count in dropped.items() if count})
+
+    def _list_prepared(self, folder: Path, count: str, files: SourceFiles) -> Listing:
+        times, images = _named_files(folder / f"rgb_{count}", files)
+        depth_folder = folder / f"depth_{count}"
+        if self.prepared_for == "poses" and not files.exists(depth_folder):
+            depths = images  # a picture in depth's place stands for no depth, see _read_frame
+        else:
+            _, depths = _named_files(depth_folder, files)
+        if len(depths) != len(images):
+            raise UnequalCounts(
+                f"{depth_folder}: expected {len(images)} files, as in {folder}/rgb_{count}, got {len(depths)}: "
+                "prepare both again"
+            )
+        trajectory = _Trajectory(folder / f"groundtruth_{count}.txt", files)
+        pose_of = associate(times, trajectory.times)
+        if (pose_of < 0).any() and self.prepared_for == "poses":
+            raise ValueError(
+                f"{trajectory.path}: expected a pose within {TOLERANCE} s of each picture, got none for "
+                f"{images[int(np.argmin(pose_of))].name}: prepare both again"
+            )
+        records, lost = [], 0
+        for image, depth, pose_index in zip(images, depths, pose_of, strict=True):
+            extrinsics = NO_POSES if (pose_of < 0).any() else trajectory.extrinsics(pose_index)
+            if extrinsics is None:
+                lost += 1
+            else:
+                records.append(FrameRecord(image.stem, image, depth, self._intrinsics(folder), extrinsics))
+        return Listing(records, {"no pose": lost} if lost else {})
+
+    def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        image = read_rgb(record.image)
+        if record.depth == record.image:
+            depth = np.zeros(image.shape[:2], np.float32)
+        else:
+            depth = read_depth(record.depth).astype(np.float32) / np.float32(_UNITS_PER_METRE)
+        return image, depth, scaled(record.intrinsics, image.shape[1] / _SIZE[1], image.shape[0] / _SIZE[0])
+
+
+class _Trajectory:
+    """Poses in TUM's format, in order of time."""
+
+    def __init__(self, path: Path, files: SourceFiles) -> None:
+        lines, rows = [], []
+        for line, text in _lines(files.text(path, "the trajectory, lines 'time tx ty tz qx qy qz qw'")):
+            lines.append(line)
+            rows.append(numbers(text, f"{path}, line {line}", count=8))
+        if not rows:
+            raise ValueError(f"{path}: expected lines 'time tx ty tz qx qy qz qw', got none: fetch the file again")
+        values = np.array(rows)
+        order = np.argsort(values[:, 0], kind="stable")
+        self.path = path
+        self._lines, self._poses = np.array(lines)[order], values[order, 1:]
+        self.times = values[order, 0]
+
+    def extrinsics(self, index: int) -> np.ndarray | None:
+        """World-to-camera [4, 4] of pose `index`; None where it is not finite. ValueError for no unit quaternion."""
+        position, quaternion = self._poses[index, :3], self._poses[index, 3:]
+        where = f"{self.path}, line {self._lines[index]}"
+        if not np.isfinite(self._poses[index]).all():
+            return None
+        if abs(np.linalg.norm(quaternion) - 1) > 0.01:
+            raise BadPose(f"{where}: expected a unit quaternion qx qy qz qw, got {quaternion}: fetch the file again")
+        pose = np.concatenate([quaternion_to_matrix(quaternion), position[:, None]], axis=1)
+        return world_to_camera(pose, where, stored="camera_to_world")
+
+
+def _listed_files(path: Path, files: SourceFiles) -> tuple[np.ndarray, list[Path]]:
+    """Times [n] and files of a list `time file`, in order of time; every file is there."""
+    entries: dict[Path, float] = {}
+    for line, text in _lines(files.text(path, "lines 'time file'")):
+        words = text.split()
+        if len(words) != 2:
+            raise ValueError(f"{path}, line {line}: expected 'time file', got {text!r}: fetch the file again")
+        file = path.parent / words[1]
+        if file in entries:
+            raise ValueError(f"{path}, line {line}: {words[1]} is listed twice: fetch the file again")
+        entries[file] = float(numbers(words[0], f"{path}, line {line}")[0])
+    if not entries:
+        raise ValueError(f"{path}: expected lines 'time file', got none: fetch the file again")
+    present = {
+        folder: set(files.names(folder, f"the files that {path.name} lists"))
+        for folder in {file.parent for file in entries}
+    }
+    absent = [file for file in entries if file.name not in present[file.parent]]
+    if absent:
+        raise missing_files(dict.fromkeys(absent, f"but {path.name} lists it; fetch it or edit the list"))
+    ordered = sorted(entries, key=lambda file: entries[file])
+    return np.array([entries[file] for file in ordered]), ordered
+
+
+def _named_files(folder: Path, files: SourceFiles) -> tuple[np.ndarray, list[Path]]:
+    """Times [n] and files of a folder whose files are named by their time, in order of time."""
+    matches = map(_TIMED_FILE.fullmatch, files.names(folder, "pictures named by their time, 1305031102.1753.png"))
+    entries = sorted((float(match[1]), folder / match[0]) for match in matches if match)
+    if not entries:
+        raise FileNotFoundError(f"{folder}: no pictures named by their time, as 1305031102.1753.png; prepare it again")
+    return np.array([time for time, _ in entries]), [file for _, file in entries]
+
+
+def _lines(text: str) -> Iterator[tuple[int, str]]:
+    """Number and content of the lines that hold something besides a comment."""
+    for line, content in enumerate(text.splitlines(), 1):
+        if content := content.split("#")[0].strip():
+            yield line, content

@@ -1,0 +1,115 @@
+"""Virtual KITTI 2 (Cabon et al., 2020), version 2.0.3: five synthetic drives, ten variations, two cameras.
+
+Layout, the archives of pictures, depth and text ground truth unpacked into one folder: `<root>/SceneXX/<variation>/`
+with `frames/rgb/Camera_N/rgb_XXXXX.jpg`, `frames/depth/Camera_N/depth_XXXXX.png`, `intrinsic.txt` and `extrinsic.txt`.
+After a header line, `intrinsic.txt` has rows `frame camera fx fy cx cy` (pixels) and `extrinsic.txt` rows `frame
+camera` and sixteen numbers of the world-to-camera matrix, rows first, OpenCV axes, metres; both cameras' rows are
+interleaved. Depth is 16-bit z in centimetres, 65535 in the sky and beyond 655.35 m.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from logvggt_jax.data.formats.calibration import numbers, pinhole, world_to_camera
+from logvggt_jax.data.formats.image import read_depth, read_rgb
+from logvggt_jax.data.formats.listing_index import SourceFiles
+from logvggt_jax.data.formats.numbered_files import numbered_frames
+from logvggt_jax.data.readers.folder_dataset import FolderDataset, FrameRecord, Listing
+
+_SCENE = re.compile(r"Scene\d{2}")
+_VARIATIONS = (
+    "15-deg-left",
+    "15-deg-right",
+    "30-deg-left",
+    "30-deg-right",
+    "clone",
+    "fog",
+    "morning",
+    "overcast",
+    "rain",
+    "sunset",
+)
+_CAMERAS = ("Camera_0", "Camera_1")
+_TEST_SCENE = "Scene20"
+_SKY = 65535
+
+
+class VirtualKITTI(FolderDataset):
+    """Reader of Virtual KITTI 2; each camera is a sequence of its own, named `Scene01/clone/Camera_0`.
+
+    Depth is 0 where the files have 0 or 65535. The set has no official lists; as in published training code its last
+    scene, Scene20, is the split `test` and the others are `train`.
+    """
+
+    name = "virtual_kitti"
+    title = "Virtual KITTI 2"
+    expects = "SceneXX/<variation>/frames with rgb and depth (unpack rgb, depth and textgt into one folder)"
+    metric = True
+    splits = ("train", "test", "all")
+
+    def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
+        scenes = [name for name in files.names(self.root, "the scenes") if _SCENE.fullmatch(name)]
+        if self.split != "all":
+            scenes = [name for name in scenes if (name == _TEST_SCENE) == (self.split == "test")]
+        return {
+            f"{scene}/{variation}/{camera}": self.root / scene / variation
+            for scene in scenes
+            for variation in files.names(self.root / scene, "the scene's variations")
+            if variation in _VARIATIONS
+            for camera in files.names(self.root / scene / variation / "frames" / "rgb", "folders Camera_0 and Camera_1")
+            if camera in _CAMERAS
+        }
+
+    def _list_frames(self, sequence: str, folder: Path, files: SourceFiles) -> Listing:
+        camera = sequence.rpartition("/")[2]
+        index = int(camera.removeprefix("Camera_"))
+        paths = numbered_frames(
+            files,
+            (folder / "frames" / "rgb" / camera, "rgb_{:05d}.jpg"),
+            (folder / "frames" / "depth" / camera, "depth_{:05d}.png"),
+        )
+        calibration, poses = folder / "intrinsic.txt", folder / "extrinsic.txt"
+        pinholes = _rows(files, calibration, index, columns=4)
+        matrices = _rows(files, poses, index, columns=16)
+        frames: list[FrameRecord] = []
+        dropped: Counter[str] = Counter()
+        for number, (image, depth) in paths.items():
+            for path, rows in ((calibration, pinholes), (poses, matrices)):
+                if number not in rows:
+                    raise ValueError(
+                        f"{path}: no row for frame {number} of {camera}: fetch the text ground truth again"
+                    )
+            where = f"{poses}, frame {number} of {camera}"
+            extrinsics = world_to_camera(matrices[number].reshape(4, 4), where, stored="world_to_camera")
+            if extrinsics is None:
+                dropped["no pose"] += 1
+            elif not np.isfinite(pinholes[number]).all():
+                dropped["no intrinsics"] += 1
+            else:
+                frames.append(FrameRecord(image.stem, image, depth, pinhole(*pinholes[number]), extrinsics))
+        return Listing(frames, dropped)
+
+    def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        raw = read_depth(record.depth)
+        depth = raw.astype(np.float32) / np.float32(100.0)
+        return read_rgb(record.image), np.where(raw != _SKY, depth, np.float32(0.0)), record.intrinsics
+
+
+def _rows(files: SourceFiles, path: Path, camera: int, *, columns: int) -> dict[int, np.ndarray]:
+    """One camera's rows of a text file by frame, each [columns] float64."""
+    rows: dict[int, np.ndarray] = {}
+    header, *lines = files.text(path, "the text ground truth (archive textgt)").splitlines() or [""]
+    if not header.startswith("frame cameraID"):
+        raise ValueError(f"{path}: expected a header 'frame cameraID ...', got {header[:40]!r}: fetch it again")
+    for line_number, line in enumerate(lines, 2):
+        if line.strip():
+            values = numbers(line, f"{path}, line {line_number}", count=2 + columns)
+            if values[1] == camera:
+                rows[int(values[0])] = values[2:]
+    return rows

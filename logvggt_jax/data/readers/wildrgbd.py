@@ -1,0 +1,162 @@
+"""WildRGB-D (Xia et al., CVPR 2024): phone videos with depth around objects of 46 categories.
+
+Layout, as in the set's zip files: `<root>/<category>/scenes/scene_XXX/{rgb,depth,masks}/XXXXX.png`, beside them
+`metadata` (JSON with the picture's width `w` and height `h` and the nine intrinsics `K`, column by column) and
+`cam_poses.txt` (a line a frame: its number and 16 numbers, camera-to-world row by row, OpenCV axes, metres); per
+category the lists `nvs_list.json` and `camera_eval_list.json`. (The set's README writes `scenes_<id>`; its files have
+`scene_<id>`.) Depth is z in millimetres, 0 invalid. `masks` show the object and are not needed.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from logvggt_jax.data.errors import missing_files
+from logvggt_jax.data.formats.calibration import numbers, world_to_camera
+from logvggt_jax.data.formats.image import read_depth, read_rgb
+from logvggt_jax.data.formats.listing_index import SourceFiles
+from logvggt_jax.data.formats.relative_intrinsics import in_pixels, relative
+from logvggt_jax.data.formats.split_lists import sequences_present
+from logvggt_jax.data.readers.folder_dataset import FolderDataset, FrameRecord, Listing
+
+_SCENE = re.compile(r"scene_\d+")
+_FRAME = re.compile(r"(\d+)\.png")
+_LISTED = re.compile(r"scenes/scene_\d+")
+_LIST_FILES = ("nvs_list.json", "camera_eval_list.json")
+# Left out by published training code.
+_EXCLUDED = {"box/scene_257"}
+
+
+class WildRGBD(FolderDataset):
+    """Reader of WildRGB-D; sequences are named `apple/scene_000`.
+
+    The split `train` holds the scenes that both lists of their category train on, `test` all others. Listed scenes
+    that are not in the root are left out, since the set comes in parts; `box/scene_257` is in no split, as in
+    published training code. Frames without a line in `cam_poses.txt` do not count. Pictures and depth may be resized
+    copies: the intrinsics follow their size.
+    """
+
+    name = "wildrgbd"
+    title = "WildRGB-D"
+    expects = "<category>/scenes/scene_XXX/rgb (unpack the categories' zip files)"
+    metric = True
+    splits = ("train", "test", "all")
+
+    def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
+        places: dict[str, Path] = {}
+        for category in files.names(self.root, self.expects):
+            scenes = self.root / category / "scenes"
+            if not files.exists(scenes):
+                continue
+            names = [name for name in files.names(scenes, "scenes") if _SCENE.fullmatch(name)]
+            present = {f"{category}/{name}" for name in names if (scenes / name).is_dir()} - _EXCLUDED
+            if self.split != "all":
+                training = _training_scenes(self.root / category, files)
+                if self.split == "train":
+                    present &= set(sequences_present(training - _EXCLUDED, present, self.root / category))
+                else:
+                    present -= training
+            places |= {name: scenes / name.partition("/")[2] for name in sorted(present, key=_number)}
+        return places
+
+    def _list_frames(self, sequence: str, folder: Path, files: SourceFiles) -> Listing:
+        intrinsics = _intrinsics(files, folder / "metadata")
+        poses = _poses(files, folder / "cam_poses.txt")
+        pictures, depths = (_frames(files, folder / kind) for kind in ("rgb", "depth"))
+        absent = {
+            folder / kind / f"{number:05d}.png": "but the frame has other files or a pose; fetch it or remove them"
+            for number in sorted(pictures.keys() | depths.keys() | poses.keys())
+            for kind, present in (("rgb", pictures), ("depth", depths))
+            if number not in present
+        }
+        if absent:
+            raise missing_files(absent)
+        frames = []
+        for number in sorted(pictures):
+            pose = poses.get(number)
+            if pose is None:
+                continue
+            frames.append(
+                FrameRecord(
+                    name=pictures[number].stem,
+                    image=pictures[number],
+                    depth=depths[number],
+                    intrinsics=intrinsics,
+                    extrinsics=pose,
+                )
+            )
+        lost = len(pictures) - len(frames)
+        return Listing(frames, {"no pose": lost} if lost else {})
+
+    def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        image = read_rgb(record.image)
+        depth = read_depth(record.depth).astype(np.float32) / np.float32(1000)
+        return image, depth, in_pixels(record.intrinsics, image.shape[:2], record.image)
+
+
+def _number(scene: str) -> tuple[str, int]:
+    """Sorts scenes of one category by their number."""
+    category, _, number = scene.rpartition("_")
+    return category, int(number)
+
+
+def _training_scenes(category: Path, files: SourceFiles) -> set[str]:
+    """Names (`apple/scene_000`) that both of a category's lists have under `train`."""
+    listed = []
+    for name in _LIST_FILES:
+        path = category / name
+        content = _json(files.text(path, "the category's list file; fetch it or choose split='all'"), path)
+        train = content.get("train")
+        if not isinstance(train, list) or not all(isinstance(s, str) and _LISTED.fullmatch(s) for s in train):
+            raise ValueError(f"{path}: expected names like 'scenes/scene_000' under 'train': restore the original file")
+        listed.append({f"{category.name}/{scene.partition('/')[2]}" for scene in train})
+    return set.intersection(*listed)
+
+
+def _frames(files: SourceFiles, folder: Path) -> dict[int, Path]:
+    names = files.names(folder, "the scene's frames; unpack its zip file again")
+    return {int(match[1]): folder / match[0] for match in filter(None, map(_FRAME.fullmatch, names))}
+
+
+def _intrinsics(files: SourceFiles, path: Path) -> np.ndarray:
+    """Intrinsics [3, 3] of a picture of one pixel."""
+    content = _json(files.text(path, "the scene's calibration; unpack its zip file again"), path)
+    try:
+        width, height = int(content["w"]), int(content["h"])
+        # Column by column.
+        matrix = np.array(content["K"], np.float64).reshape(3, 3).T
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: expected w, h and the nine numbers K: {error!r}; fetch it again") from error
+    if not (width > 0 and height > 0):
+        raise ValueError(f"{path}: expected a width and height above 0, got {width} x {height}: fetch it again")
+    return relative(matrix, (height, width))
+
+
+def _json(text: str, path: Path) -> dict:
+    try:
+        content = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{path}: not JSON ({error}): fetch it again") from error
+    if not isinstance(content, dict):
+        raise ValueError(f"{path}: expected a JSON object, got {type(content).__name__}: fetch it again")
+    return content
+
+
+def _poses(files: SourceFiles, path: Path) -> dict[int, np.ndarray | None]:
+    """World-to-camera matrices by frame number, None where a pose is not finite."""
+    text = files.text(path, "the scene's poses; unpack its zip file again")
+    poses: dict[int, np.ndarray | None] = {}
+    for line, row in enumerate(text.splitlines(), start=1):
+        if not row.strip():
+            continue
+        where = f"{path}, line {line}"
+        values = numbers(row, where, count=17)
+        if not values[0].is_integer():
+            raise ValueError(f"{where}: expected a frame number first, got {values[0]:g}: fetch the file again")
+        poses[int(values[0])] = world_to_camera(values[1:].reshape(4, 4), where, stored="camera_to_world")
+    return poses

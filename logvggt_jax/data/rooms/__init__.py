@@ -1,0 +1,1 @@
+"""Procedural rooms: layout, trajectories, ray caster, and pools of rendered rooms."""

@@ -1,0 +1,182 @@
+"""Renders a room: every pixel's ray against closed-form surfaces, in numpy.
+
+Rays are scaled so that their camera z is 1; the ray parameter is then the z-depth itself, exact to float32.
+Furniture is tested only inside the image rectangle that bounds it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from logvggt_jax.data.rooms.layout import WAVES, Room, Textures
+
+_NEAR = 0.02  # metres: corners nearer than this make the bounding rectangle the whole image
+_CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
+
+
+class _View:
+    """Rays of one camera and the nearest surface found on each so far."""
+
+    def __init__(self, extrinsics: np.ndarray, intrinsics: np.ndarray, height: int, width: int) -> None:
+        rotation = extrinsics[:3, :3]
+        self.extrinsics, self.intrinsics = extrinsics, intrinsics
+        self.origin = -rotation.T @ extrinsics[:3, 3]
+        x = (np.arange(width) - intrinsics[0, 2]) / intrinsics[0, 0]
+        y = (np.arange(height) - intrinsics[1, 2]) / intrinsics[1, 1]
+        # [3, H, W] in world axes; zero components would make 0 * inf below.
+        columns = (rotation[0][:, None, None] * x).astype(np.float32)
+        rows = (rotation[1][:, None] * y + rotation[2][:, None]).astype(np.float32)
+        self.rays = columns + rows[:, :, None]
+        self.rays[self.rays == 0] = 1e-12
+        self.inverse = 1.0 / self.rays
+        self.depth = np.full((height, width), np.inf, np.float32)
+        self.surface = np.zeros((height, width), np.intp)
+
+    def rectangle(self, corners: np.ndarray) -> tuple[slice, slice] | None:
+        """Rows and columns that the hull of world points [8, 3] can touch; None if it is out of sight."""
+        height, width = self.depth.shape
+        camera = corners @ self.extrinsics[:3, :3].T + self.extrinsics[:3, 3]
+        z = camera[:, 2]
+        if z.max() <= _NEAR:
+            return None
+        if z.min() <= _NEAR:
+            return slice(0, height), slice(0, width)
+        u = camera[:, 0] / z * self.intrinsics[0, 0] + self.intrinsics[0, 2]
+        v = camera[:, 1] / z * self.intrinsics[1, 1] + self.intrinsics[1, 2]
+        left, right = max(int(u.min()), 0), min(int(u.max()) + 1, width - 1)
+        top, bottom = max(int(v.min()), 0), min(int(v.max()) + 1, height - 1)
+        if left > right or top > bottom:
+            return None
+        return slice(top, bottom + 1), slice(left, right + 1)
+
+    def keep_nearest(
+        self, where: tuple[slice, slice], depth: np.ndarray, hit: np.ndarray, surface: np.ndarray | int
+    ) -> None:
+        """Records `surface` (number or array) where `hit` and `depth` beats what is known in the rectangle."""
+        nearest = self.depth[where]
+        hit = hit & (depth > 0) & (depth < nearest)
+        np.copyto(nearest, depth, where=hit)
+        np.copyto(self.surface[where], surface, where=hit)
+
+
+def render(
+    room: Room, extrinsics: np.ndarray, intrinsics: np.ndarray, height: int, width: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Image [H, W, 3] uint8 and z-depth [H, W] float32 in metres of `room`.
+
+    `extrinsics` [4, 4] world-to-camera (OpenCV), camera inside the room; `intrinsics` [3, 3] in pixels with
+    centres at integers. Deterministic: no randomness, no threads, one frame at a time.
+    """
+    view = _cast(room, extrinsics, intrinsics, height, width)
+    return _shade(view, room.textures), view.depth
+
+
+def _cast(room: Room, extrinsics: np.ndarray, intrinsics: np.ndarray, height: int, width: int) -> _View:
+    view = _View(np.asarray(extrinsics, np.float64), np.asarray(intrinsics, np.float64), height, width)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        _cast_room(view, room)
+        _cast_boxes(view, room)
+        _cast_spheres(view, room)
+        _cast_cylinders(view, room)
+    return view
+
+
+def _cast_room(view: _View, room: Room) -> None:
+    half, origin = room.half_size.astype(np.float32), view.origin.astype(np.float32)
+    x, y, z = ((np.copysign(half[a], view.rays[a]) - origin[a]) * view.inverse[a] for a in range(3))
+    np.minimum(np.minimum(x, y), z, out=view.depth)
+    axis = np.where(view.depth == x, 0, np.where(view.depth == y, 1, 2))
+    positive = np.where(axis == 0, view.rays[0] > 0, np.where(axis == 1, view.rays[1] > 0, view.rays[2] > 0))
+    np.add(2 * axis, positive, out=view.surface)
+
+
+def _cast_boxes(view: _View, room: Room) -> None:
+    for index, (centre, half_size, yaw) in enumerate(
+        zip(room.box_centres, room.box_half_sizes, room.box_yaws, strict=True)
+    ):
+        cosine, sine = np.cos(yaw), np.sin(yaw)
+        to_box = np.array([[cosine, 0, -sine], [0, 1, 0], [sine, 0, cosine]])
+        where = view.rectangle(centre + (_CORNERS * half_size) @ to_box)
+        if where is None:
+            continue
+        origin = (to_box @ (view.origin - centre)).astype(np.float32)
+        half, cosine, sine = half_size.astype(np.float32), np.float32(cosine), np.float32(sine)
+        dx, dy, dz = (view.rays[a][where] for a in range(3))
+        rays = (cosine * dx - sine * dz, dy, sine * dx + cosine * dz)
+        near, far = [], []
+        for axis in range(3):
+            inverse = view.inverse[1][where] if axis == 1 else 1.0 / rays[axis]
+            middle, reach = -origin[axis] * inverse, half[axis] * np.abs(inverse)
+            near.append(middle - reach)
+            far.append(middle + reach)
+        enter = np.maximum(np.maximum(near[0], near[1]), near[2])
+        leave = np.minimum(np.minimum(far[0], far[1]), far[2])
+        entered = np.where(enter == near[0], 0, np.where(enter == near[1], 1, 2))
+        # A ray enters by the positive face where it runs in the negative direction.
+        positive = np.where(entered == 0, rays[0] < 0, np.where(entered == 1, rays[1] < 0, rays[2] < 0))
+        view.keep_nearest(where, enter, enter <= leave, 6 + 6 * index + 2 * entered + positive)
+
+
+def _cast_spheres(view: _View, room: Room) -> None:
+    first = 6 + 6 * len(room.box_centres)
+    for index, (centre, radius) in enumerate(zip(room.sphere_centres, room.sphere_radii, strict=True)):
+        where = view.rectangle(centre + _CORNERS * radius)
+        if where is None:
+            continue
+        ox, oy, oz = (view.origin - centre).astype(np.float32)
+        dx, dy, dz = (view.rays[a][where] for a in range(3))
+        squared = dx * dx + dy * dy + dz * dz
+        middle = -(dx * ox + dy * oy + dz * oz) / squared
+        # Distance of the ray from the centre at its nearest point: no cancellation of large squares.
+        mx, my, mz = ox + middle * dx, oy + middle * dy, oz + middle * dz
+        chord = (np.float32(radius * radius) - (mx * mx + my * my + mz * mz)) / squared
+        view.keep_nearest(where, middle - np.sqrt(chord), chord > 0, first + index)
+
+
+def _cast_cylinders(view: _View, room: Room) -> None:
+    first = 6 + 6 * len(room.box_centres) + len(room.sphere_centres)
+    cylinders = zip(room.cylinder_centres, room.cylinder_radii, room.cylinder_half_heights, strict=True)
+    for index, (centre, radius, half_height) in enumerate(cylinders):
+        where = view.rectangle(centre + _CORNERS * [radius, half_height, radius])
+        if where is None:
+            continue
+        ox, oy, oz = (view.origin - centre).astype(np.float32)
+        dx, dz = view.rays[0][where], view.rays[2][where]
+        squared = dx * dx + dz * dz
+        middle = -(dx * ox + dz * oz) / squared
+        mx, mz = ox + middle * dx, oz + middle * dz
+        chord = (np.float32(radius * radius) - (mx * mx + mz * mz)) / squared
+        half_chord = np.sqrt(chord)
+        inverse = view.inverse[1][where]
+        level, reach = -oy * inverse, np.float32(half_height) * np.abs(inverse)
+        side, cap = middle - half_chord, level - reach
+        enter, leave = np.maximum(side, cap), np.minimum(middle + half_chord, level + reach)
+        surface = first + 2 * index + (cap > side)
+        view.keep_nearest(where, enter, (chord > 0) & (enter <= leave), surface)
+
+
+def _shade(view: _View, textures: Textures) -> np.ndarray:
+    depth, surface = view.depth.ravel(), view.surface.ravel()
+    points = [np.float32(view.origin[a]) + depth * view.rays[a].ravel() for a in range(3)]
+
+    def affine(slopes: np.ndarray, offset: np.ndarray) -> np.ndarray:
+        total = offset[surface]
+        for axis in range(3):
+            total += slopes[axis][surface] * points[axis]
+        return total
+
+    waves = [np.sin(affine(textures.frequency[k], textures.phase[k])) for k in range(WAVES)]
+    noise = (waves[0] + waves[1] + waves[2] + waves[3]) * np.float32(0.25)
+    # An edge is never sharper than a pixel is wide, and a pattern finer than pixels fades out.
+    pixel = depth * np.float32(1.0 / view.intrinsics[0, 0])
+    softness = np.maximum(textures.edge[surface], textures.pattern_frequency[surface] * pixel)
+    pattern = np.clip(waves[4] * waves[5] / softness, -1.0, 1.0)
+    weight = textures.pattern_weight[surface]
+    mix = np.float32(0.5) + np.float32(0.5) * (noise + weight * (pattern - noise))
+    brightness = affine(textures.shade[:3], textures.shade[3]) * np.float32(255.0)
+    image = np.empty((*depth.shape, 3), np.uint8)
+    for channel in range(3):
+        first = textures.colour[0, channel][surface]
+        colour = first + mix * (textures.colour[1, channel][surface] - first)
+        image[:, channel] = np.clip(colour * brightness + np.float32(0.5), 0.0, 255.0)
+    return image.reshape(*view.depth.shape, 3)

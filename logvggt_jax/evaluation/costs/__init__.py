@@ -1,0 +1,1 @@
+"""What a sequence costs: operations, time, memory."""

@@ -1,0 +1,218 @@
+"""What a stream costs: the parts of the model, their operations, time, compilation and memory."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import resource
+import statistics
+import sys
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from logvggt_jax.evaluation.costs.operations import count_flops
+from logvggt_jax.model.logvggt import LogVGGT
+from logvggt_jax.model.refinement import num_triggers
+from logvggt_jax.model.windows import num_windows
+
+PARTS = ("encoder", "backbone", "dense head", "GCCR", "camera head")
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """A program that a sequence runs `calls` times.
+
+    Attributes:
+      name: one of `PARTS`; several programs may have one name.
+      function: of the variables and `arguments`.
+      arguments: abstract ones, `jax.ShapeDtypeStruct` and pytrees of them, with a batch of one.
+      calls: in the whole sequence.
+    """
+
+    name: str
+    function: Callable[..., Any]
+    arguments: tuple[Any, ...]
+    calls: int
+
+
+@dataclasses.dataclass(frozen=True)
+class PartTime:
+    """Seconds of a part: to compile it, and of one call (median and extremes of the rounds)."""
+
+    name: str
+    calls: int
+    compilation: float
+    median: float
+    fastest: float
+    slowest: float
+    temporary_bytes: int
+
+
+@functools.lru_cache(maxsize=8)
+def abstract_variables(model: LogVGGT) -> Any:
+    """Shapes of the model's parameters; nothing is allocated."""
+    patch = model.config.encoder.patch_size
+    return jax.eval_shape(model.init, jax.random.key(0), jax.ShapeDtypeStruct((1, 1, patch, patch, 3), jnp.uint8))
+
+
+def sequence_parts(model: LogVGGT, num_frames: int, image_size: tuple[int, int]) -> list[Part]:
+    """Everything that a sequence of `num_frames` frames runs, as `LogVGGT.apply` does.
+
+    Args:
+      model: its refinement decides what runs how often.
+      num_frames: T.
+      image_size: (H, W).
+    """
+    config = model.config
+    stride, overlap = config.windows.stride, config.windows.size - config.windows.stride
+    windows = num_windows(num_frames, config.windows.size, stride)
+    variables = abstract_variables(model)
+
+    def images(count: int) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct((1, count, *image_size, 3), jnp.uint8)
+
+    def mask(count: int) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct((1, count), bool)
+
+    state = jax.eval_shape(model.start, variables, images(overlap))
+    window = jax.eval_shape(model.encode, variables, images(config.windows.size))
+    tokens = jax.eval_shape(model.attend_window, variables, state, window, mask(config.windows.size))
+
+    def dense(count: int, calls: int) -> Part:
+        key, special = tokens
+        key = jax.ShapeDtypeStruct((*key.shape[:2], count, *key.shape[3:]), key.dtype)
+        special = jax.ShapeDtypeStruct((1, count, *special.shape[2:]), special.dtype)
+        decode = functools.partial(model.decode_dense, image_size=image_size)
+        return Part("dense head", decode, (key, special, mask(count)), calls)
+
+    parts = [
+        Part("encoder", model.encode, (images(overlap),), 1),
+        Part("encoder", model.encode, (images(stride),), windows),
+        Part("backbone", model.attend_window, (state, window, mask(config.windows.size)), windows),
+        dense(stride, windows),
+        dense(overlap, 1),
+    ]
+    return parts + _refinement_parts(model, num_frames)
+
+
+def _refinement_parts(model: LogVGGT, num_frames: int) -> list[Part]:
+    settings, width = model.config.refinement, 2 * model.config.encoder.embed_dim
+    stride, registers = model.config.windows.stride, model.config.aggregator.num_registers
+    period = num_frames if settings.period is None else min(settings.period, num_frames)
+    triggers = num_triggers(num_frames, period)
+
+    def camera(count: int) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct((1, count, width), jnp.float32)
+
+    def mask(count: int) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct((1, count), bool)
+
+    parts = []
+    if settings.enabled:
+        variables = abstract_variables(model)
+        register_tokens = jax.ShapeDtypeStruct((1, num_frames, registers, width), jnp.float32)
+        projected = jax.eval_shape(model.project_registers, variables, register_tokens)
+        parts.append(Part("GCCR", model.project_registers, (register_tokens,), 1))
+        parts.append(Part("GCCR", model.attend_registers, (camera(period), projected, mask(num_frames)), triggers))
+    if settings.context is None:
+        # A trigger decodes all frames, also those to come, which are masked: one shape for all triggers.
+        seen = num_frames if triggers == 1 else triggers * period + stride
+        parts.append(Part("camera head", model.decode_cameras, (camera(seen), mask(seen)), triggers))
+    else:
+        seen = 1 + settings.context
+        groups = triggers * -(-period // stride)
+        parts.append(Part("camera head", model.decode_cameras, (camera(seen), mask(seen)), groups))
+    return parts
+
+
+def flops_by_part(model: LogVGGT, num_frames: int, image_size: tuple[int, int]) -> dict[str, float]:
+    """Operations of a whole sequence by part, a multiply-add counted as two; shapes alone, nothing is allocated.
+
+    Attention is counted in its XLA form, of whose products the other kernels do no fewer.
+    """
+    model = LogVGGT(dataclasses.replace(model.config, attention="xla"))
+    variables = abstract_variables(model)
+    counts = dict.fromkeys(PARTS, 0.0)
+    for part in sequence_parts(model, num_frames, image_size):
+        counts[part.name] += part.calls * count_flops(part.function, variables, *part.arguments)
+    return counts
+
+
+def time_part(part: Part, variables: Any, *, rounds: int = 3, least_seconds: float = 0.2) -> PartTime:
+    """Compiles a part and times its calls.
+
+    Args:
+      part: of `sequence_parts`.
+      variables: {"params": …} on the device.
+      rounds: of as many calls as take `least_seconds`.
+      least_seconds: of one round.
+    """
+    # Values do not matter to the time, but masks have to let everything through.
+    arguments = jax.tree.map(lambda x: jnp.ones(x.shape, x.dtype), part.arguments)
+    started = time.perf_counter()
+    program = jax.jit(part.function).lower(variables, *arguments).compile()
+    compilation = time.perf_counter() - started
+    jax.block_until_ready(program(variables, *arguments))
+    seconds = []
+    for _ in range(rounds):
+        calls, started = 0, time.perf_counter()
+        while calls == 0 or time.perf_counter() - started < least_seconds:
+            jax.block_until_ready(program(variables, *arguments))
+            calls += 1
+        seconds.append((time.perf_counter() - started) / calls)
+    memory = program.memory_analysis()
+    return PartTime(
+        name=part.name,
+        calls=part.calls,
+        compilation=compilation,
+        median=statistics.median(seconds),
+        fastest=min(seconds),
+        slowest=max(seconds),
+        temporary_bytes=0 if memory is None else int(memory.temp_size_in_bytes),
+    )
+
+
+def matmul_flops_per_second(dtype: str, *, size: int | None = None, rounds: int = 5) -> float:
+    """The fastest of some large matrix products on the default device: a peak that programs can be held against.
+
+    Args:
+      dtype: of the factors.
+      size: side of the square matrices; None takes 1536 on CPUs and 8192 elsewhere.
+      rounds: products that are timed.
+    """
+    side = size or (1536 if jax.default_backend() == "cpu" else 8192)
+    factor = jnp.ones((side, side), dtype)
+    product = jax.jit(lambda x: x @ x)
+    jax.block_until_ready(product(factor))
+    seconds = []
+    for _ in range(rounds):
+        started = time.perf_counter()
+        jax.block_until_ready(product(factor))
+        seconds.append(time.perf_counter() - started)
+    return 2 * side**3 / min(seconds)
+
+
+def peak_device_bytes() -> int | None:
+    """Most bytes in use on the default device so far; None where the back end does not say (CPU)."""
+    statistics_ = jax.devices()[0].memory_stats() or {}
+    return statistics_.get("peak_bytes_in_use")
+
+
+def live_device_bytes() -> int:
+    """Bytes of all arrays alive now, temporaries of running programs aside."""
+    return sum(array.nbytes for array in jax.live_arrays())
+
+
+def peak_host_bytes() -> int:
+    """Most physical memory that this process has had so far."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
+
+
+def spread(values: Sequence[float]) -> str:
+    """Median and extremes as text."""
+    return f"{statistics.median(values):.3f} ({min(values):.3f} to {max(values):.3f})"

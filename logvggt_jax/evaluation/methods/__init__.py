@@ -1,0 +1,1 @@
+"""The rows of the tables: the model, references on the same weights, baselines, ablations."""

@@ -1,0 +1,152 @@
+"""Answers that need no learning, to be printed beside every result."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from logvggt_jax.data.dataset import Dataset
+from logvggt_jax.data.feeding.transforms import fit
+from logvggt_jax.evaluation.methods.method import ClipPrediction, Method, network
+from logvggt_jax.model.logvggt import LogVGGT
+
+
+@dataclasses.dataclass(frozen=True)
+class DepthStatistics:
+    """What the depth baselines know.
+
+    Attributes:
+      mean_depth: mean over all valid pixels.
+      mean_map: [H, W] mean over the valid frames of each pixel; `mean_depth` where none is valid.
+      intrinsics: [3, 3] mean, pixels of [H, W].
+      source: the frames that these are means of, in words.
+    """
+
+    mean_depth: float
+    mean_map: np.ndarray
+    intrinsics: np.ndarray
+    source: str
+
+
+def depth_statistics(
+    dataset: Dataset,
+    image_size: tuple[int, int],
+    *,
+    source: str,
+    max_sequences: int = 64,
+    max_frames: int = 256,
+) -> DepthStatistics:
+    """Mean depth, mean depth map and mean intrinsics of evenly spaced frames.
+
+    Args:
+      dataset: a `logvggt_jax.data` data set.
+      image_size: (H, W) that the frames are fitted to.
+      source: name of these frames in the table.
+      max_sequences: that many evenly spaced sequences at most.
+      max_frames: that many frames at most, the same number of evenly spaced ones from each sequence.
+
+    Raises:
+      ValueError: no frame has a valid depth.
+    """
+    depth_sum, valid_count = np.zeros(image_size), np.zeros(image_size)
+    intrinsics: list[np.ndarray] = []
+    sequences = list(dataset.sequences)
+    chosen = _evenly(len(sequences), max_sequences)
+    for s in chosen:
+        # One frame at a time: hundreds at a data set's own size are gigabytes.
+        for index in _evenly(dataset.num_frames(sequences[s]), max(1, max_frames // len(chosen))):
+            frames = fit(dataset.read(sequences[s], [index]), image_size)
+            valid = frames.depth[0] > 0
+            depth_sum += np.where(valid, frames.depth[0], 0.0)
+            valid_count += valid
+            intrinsics.append(frames.intrinsics[0])
+    if not valid_count.any():
+        raise ValueError(f"depth_statistics: {source} have no valid depth; baselines need some")
+    mean_depth = float(depth_sum.sum() / valid_count.sum())
+    mean_map = np.where(valid_count > 0, depth_sum / np.maximum(valid_count, 1), mean_depth)
+    return DepthStatistics(mean_depth, mean_map, np.mean(intrinsics, axis=0), source)
+
+
+def constant_depth(statistics: DepthStatistics) -> Method:
+    """Every pixel at the mean depth, seen by a camera that never moves."""
+    depth = np.full_like(statistics.mean_map, statistics.mean_depth)
+    return _fixed_depth("constant depth", "mean depth and mean intrinsics", depth, statistics)
+
+
+def mean_depth_map(statistics: DepthStatistics) -> Method:
+    """Every pixel at its own mean depth, seen by a camera that never moves."""
+    return _fixed_depth(
+        "mean depth map", "mean depth of each pixel and mean intrinsics", statistics.mean_map, statistics
+    )
+
+
+def unit_depth() -> Method:
+    """Every pixel at depth 1, at any image size; the alignment gives it the clip's scale."""
+
+    def predict(images: np.ndarray) -> ClipPrediction:
+        depth = np.broadcast_to(np.float32(1.0), images.shape[:3])
+        return ClipPrediction(depth, _identities(len(images)), None)
+
+    return Method("constant depth", "nothing", predict, pose=False, points=False)
+
+
+def static_camera() -> Method:
+    """All frames at the first camera's pose."""
+
+    def predict(images: np.ndarray) -> ClipPrediction:
+        return ClipPrediction(None, _identities(len(images)), None)
+
+    return Method("static camera", "nothing", predict, depth=False, points=False, static=True)
+
+
+def untrained(model: LogVGGT, image_size: tuple[int, int], *, seed: int = 0) -> Method:
+    """The same network with random parameters."""
+    variables = model.init(jax.random.key(seed), jnp.zeros((1, 1, *image_size, 3), jnp.uint8))
+    return network(model, variables, name="untrained network", knows=f"nothing (random parameters, seed {seed})")
+
+
+def all_baselines(
+    model: LogVGGT, dataset: Dataset, image_size: tuple[int, int], *, source: str, seed: int = 0
+) -> list[Method]:
+    """Constant depth, mean depth map, static camera and the untrained network.
+
+    Args:
+      model: its configuration is that of the untrained network.
+      dataset: whose frames the depth baselines take their means of.
+      image_size: (H, W) of the model's input.
+      source: name of these frames in the table.
+      seed: of the random parameters.
+    """
+    statistics = depth_statistics(dataset, image_size, source=source)
+    return [
+        constant_depth(statistics),
+        mean_depth_map(statistics),
+        static_camera(),
+        untrained(model, image_size, seed=seed),
+    ]
+
+
+def _fixed_depth(name: str, knows: str, depth: np.ndarray, statistics: DepthStatistics) -> Method:
+    def predict(images: np.ndarray) -> ClipPrediction:
+        frames = len(images)
+        return ClipPrediction(
+            np.broadcast_to(depth, (frames, *depth.shape)),
+            _identities(frames),
+            np.broadcast_to(statistics.intrinsics, (frames, 3, 3)),
+        )
+
+    knows = f"{knows} of {statistics.source}; static camera"
+    return Method(name, knows, predict, pose=False)
+
+
+def _identities(count: int) -> np.ndarray:
+    return np.tile(np.eye(4), (count, 1, 1))
+
+
+def _evenly(count: int, at_most: int) -> list[int]:
+    if count <= at_most:
+        return list(range(count))
+    return [int(i) for i in np.linspace(0, count - 1, at_most).round()]

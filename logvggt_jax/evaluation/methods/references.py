@@ -1,0 +1,108 @@
+"""Reference rows on the same backbone and weights: VGGT offline, and plain VGGT on chained chunks."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import numpy as np
+
+from logvggt_jax.evaluation.methods.method import ClipPrediction, Method, PredictionError
+from logvggt_jax.model.logvggt import LogVGGT
+from logvggt_jax.streaming.chunks import ChunkChain, ChunkPlan
+from logvggt_jax.streaming.offline import predict_plain
+
+
+@dataclasses.dataclass(frozen=True)
+class ReferenceConfig:
+    """Limits of the reference models.
+
+    Attributes:
+      max_frames: longest clip that VGGT offline takes, whose memory and time grow with the square of the frames;
+        longer ones count as failed for it. None for no limit.
+      chunk_size: frames of a chunk.
+      chunk_overlap: frames that neighbouring chunks share.
+    """
+
+    max_frames: int | None = 200
+    chunk_size: int = 60
+    chunk_overlap: int = 30
+
+    def __post_init__(self) -> None:
+        limit = self.max_frames
+        if limit is not None and (isinstance(limit, bool) or not isinstance(limit, int) or limit < 1):
+            raise ValueError(f"references.max_frames must be at least 1 frame or None, got {limit!r}")
+        self.plan()
+
+    def plan(self) -> ChunkPlan:
+        """The chunks; ValueError for impossible ones."""
+        return ChunkPlan(self.chunk_size, self.chunk_overlap)
+
+
+def reference_methods(model: LogVGGT, variables: dict[str, Any], config: ReferenceConfig) -> list[Method]:
+    """VGGT offline and plain VGGT on chunks.
+
+    Args:
+      model: whose parts are used; its windows are not.
+      variables: {"params": …}.
+      config: limits.
+    """
+    variables = jax.device_put(variables)
+    return [
+        offline_vggt(model, variables, max_frames=config.max_frames),
+        chunked_vggt(model, variables, config.plan()),
+    ]
+
+
+def offline_vggt(model: LogVGGT, variables: dict[str, Any], *, max_frames: int | None = None) -> Method:
+    """All frames at once with full global attention.
+
+    Its `predict` raises PredictionError for a clip longer than `max_frames`, or one that the device's memory does
+    not hold.
+    """
+
+    def predict(images: np.ndarray) -> ClipPrediction:
+        count, height, width = images.shape[:3]
+        if max_frames is not None and count > max_frames:
+            raise PredictionError(
+                f"full attention over {count} frames exceeds references.max_frames={max_frames}; raise it if memory "
+                "and time allow"
+            )
+        try:
+            prediction = predict_plain(model, variables, images)
+        except jax.errors.JaxRuntimeError as error:
+            if "RESOURCE_EXHAUSTED" not in str(error):
+                raise
+            raise PredictionError(
+                f"full attention over {count} frames of {height} x {width} pixels does not fit the memory of "
+                f"{jax.devices()[0].device_kind}; set references.max_frames below {count}"
+            ) from error
+        return ClipPrediction(prediction.depth, prediction.extrinsics, prediction.intrinsics)
+
+    return Method("VGGT offline", "its training; all frames in one window of full global attention", predict)
+
+
+def chunked_vggt(model: LogVGGT, variables: dict[str, Any], plan: ChunkPlan) -> Method:
+    """Plain VGGT on overlapping chunks, chained by robust similarities.
+
+    Its `predict` raises PredictionError where neighbouring chunks cannot be aligned.
+    """
+
+    def predict(images: np.ndarray) -> ClipPrediction:
+        chain = ChunkChain(functools.partial(predict_plain, model, variables), plan)
+        try:
+            chunks = [chunk for image in images if (chunk := chain.push(image)) is not None]
+            last = chain.close()
+        except ValueError as error:
+            raise PredictionError(str(error)) from error
+        chunks += [] if last is None else [last]
+        fields = ("depth", "extrinsics", "intrinsics")
+        return ClipPrediction(*(np.concatenate([getattr(chunk, name) for chunk in chunks]) for name in fields))
+
+    knows = (
+        f"its training; windows of {plan.size} frames, {plan.overlap} shared with the next, without memory, chained by "
+        "robust similarities"
+    )
+    return Method("VGGT on chunks", knows, predict)

@@ -1,0 +1,315 @@
+"""What is measured on one clip, and how a benchmark's score is made of clips."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from logvggt_jax.evaluation.clips import ClipData
+from logvggt_jax.evaluation.methods.method import ClipPrediction, Method
+from logvggt_jax.evaluation.progress import track
+from logvggt_jax.evaluation.protocols.protocol import DepthMeasure, PointsMeasure, Protocol
+from logvggt_jax.geometry import camera_centres, invert, umeyama, unproject
+from logvggt_jax.metrics.depth import DEPTH_KEYS, clip_depth_metrics, mean_depth_metrics
+from logvggt_jax.metrics.points import estimate_normals, point_cloud_metrics, sample_indices
+from logvggt_jax.metrics.pose import pose_accuracy, relative_pose_errors
+from logvggt_jax.metrics.trajectory import rms_radius, trajectory_errors
+
+POINT_KEYS = (
+    "acc_mean",
+    "acc_median",
+    "comp_mean",
+    "comp_median",
+    "nc_mean",
+    "nc_median",
+    "chamfer_sum",
+    "chamfer_mean",
+)
+ACCURACY_KEYS = ("rra@5", "rra@30", "rta@30", "auc@30")
+POSE_KEYS = (*ACCURACY_KEYS, "rotation_error", "identity_rotation_error")
+TRAJECTORY_KEYS = ("ate", "ate_ratio", "rpe_translation", "rpe_rotation")
+# Errors against a second set of true poses carry this before their names.
+SFM = "sfm/"
+
+
+@dataclasses.dataclass(frozen=True)
+class ClipTruth:
+    """Ground truth of one clip, prepared once for all methods.
+
+    Attributes:
+      clip: the clip.
+      indices: [N] flat indices into [T, H, W] of the pixels whose points are compared; the same for prediction and
+        truth. None where points are not measured.
+      points: [N, 3] in the data set's world.
+      normals: [N, 3].
+    """
+
+    clip: ClipData
+    indices: np.ndarray | None = None
+    points: np.ndarray | None = None
+    normals: np.ndarray | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class ClipScore:
+    """Metrics of one method on one clip, and why the missing ones are missing, by group of metrics."""
+
+    metrics: dict[str, float]
+    failures: dict[str, str]
+
+
+def is_measured(method: Method, protocol: Protocol) -> bool:
+    """Whether the protocol measures anything that the method claims."""
+    return bool(
+        (method.depth and protocol.depth)
+        or (method.points and protocol.points)
+        or (method.pose and (protocol.poses or protocol.trajectory))
+    )
+
+
+def prepare_truth(clip: ClipData, points: PointsMeasure | None) -> ClipTruth:
+    """The clip's true points, at most `max_points` of those with a valid depth, and their normals."""
+    if points is None or clip.depth is None or not np.isfinite(clip.extrinsics).all():
+        return ClipTruth(clip)
+    indices = valid_indices(clip.depth, points)
+    if not indices.size:
+        return ClipTruth(clip)
+    cloud = points_at(clip.depth, clip.intrinsics, clip.extrinsics, indices)
+    return ClipTruth(clip, indices, cloud, estimate_normals(cloud))
+
+
+def clip_score(method: Method, prediction: ClipPrediction, truth: ClipTruth, protocol: Protocol) -> ClipScore:
+    """All metrics that the protocol asks for and the method claims.
+
+    A group of metrics that cannot be computed (nothing valid, no pose, a trajectory without alignment, a prediction
+    that is not finite) is left out and its reason returned; nothing is replaced by a number.
+    """
+    groups: list[tuple[str, Callable[[], dict[str, float]]]] = []
+    depth, points = protocol.depth, protocol.points
+    if depth is not None and method.depth:
+        groups.append(("depth", lambda: _depth(prediction, truth.clip, depth)))
+    for prefix, true in (("", truth.clip.extrinsics), (SFM, truth.clip.sfm_extrinsics)):
+        if true is None or not method.pose:
+            continue
+        if protocol.poses:
+            groups.append((f"{prefix}pose", functools.partial(_pose, prediction, true)))
+        if protocol.trajectory:
+            groups.append((f"{prefix}trajectory", functools.partial(_trajectory, prediction, true, method.static)))
+    if points is not None and method.points:
+        groups.append(("points", lambda: _points(prediction, truth, points.icp_threshold)))
+    metrics: dict[str, float] = {}
+    failures: dict[str, str] = {}
+    for name, measure in groups:
+        prefix = SFM if name.startswith(SFM) else ""
+        try:
+            metrics |= {prefix + key: value for key, value in measure().items()}
+        except ValueError as error:
+            failures[name] = str(error)
+    return ClipScore(metrics, failures)
+
+
+def benchmark_score(
+    protocol: Protocol, method: Method, scores: Sequence[tuple[str, ClipScore]], planned: int
+) -> dict[str, float]:
+    """Means over clips; metrics without any clip are absent.
+
+    Depth is weighted by valid pixels, all else plain, but relative poses of a `pooled` protocol: their pairs are
+    pooled within a category, and the mean is over categories. `rotation_ratio` is the mean rotation error over the
+    mean that no motion at all would have.
+
+    Args:
+      protocol: the benchmark.
+      method: the method.
+      scores: sequence and score of every clip that was predicted.
+      planned: clips that the benchmark asked for, among them those that could not be read or predicted.
+
+    Returns:
+      The means; `clips`, the planned number, and `clips_measured`, of how many anything is known; and `clips_depth`,
+      `clips_pose`, `clips_trajectory`, `clips_points` (and with `sfm/`), how many of them are in each mean, for the
+      groups that method and protocol measure.
+    """
+    result: dict[str, float] = {"clips": planned, "clips_measured": sum(bool(score.metrics) for _, score in scores)}
+    if protocol.depth is not None and method.depth:
+        result |= _depth_means([score.metrics for _, score in scores], protocol.depth)
+    for prefix in ("", SFM):
+        if protocol.poses and method.pose:
+            result |= _pose_means(scores, prefix, protocol.pooled)
+        if protocol.trajectory and method.pose:
+            result |= _plain_means(scores, f"{prefix}trajectory", [prefix + key for key in TRAJECTORY_KEYS])
+        for group in ("pose", "trajectory"):
+            if prefix and not result.get(f"clips_{prefix}{group}"):
+                result.pop(f"clips_{prefix}{group}", None)
+    if protocol.points is not None and method.points:
+        result |= _plain_means(scores, "points", POINT_KEYS)
+    return result
+
+
+def valid_indices(depth: np.ndarray, points: PointsMeasure) -> np.ndarray:
+    """Sorted flat indices [N] into [T, H, W] of the pixels whose points are compared.
+
+    One frame at a time is searched, so that memory grows with the points drawn and not with the clip.
+    """
+    crop = _middle(depth.shape[1:], points.crop)
+    counts = np.array([int((frame[crop] > 0).sum()) for frame in depth])
+    ranks = sample_indices(int(counts.sum()), points.max_points, points.seed)
+    borders = np.concatenate([[0], np.cumsum(counts)])
+    edges = np.searchsorted(ranks, borders)
+    grid = np.arange(depth[0].size).reshape(depth.shape[1:])[crop]
+    chosen = [
+        grid[frame[crop] > 0][ranks[edges[t] : edges[t + 1]] - borders[t]] + t * frame.size
+        for t, frame in enumerate(depth)
+    ]
+    return np.concatenate(chosen)
+
+
+def points_at(depth: np.ndarray, intrinsics: np.ndarray, extrinsics: np.ndarray, indices: np.ndarray) -> np.ndarray:
+    """World points [N, 3] float64 of the pixels `indices` [N] (sorted, flat in [T, H, W]).
+
+    One frame at a time, so that a long clip never has all its points in memory.
+    """
+    pixels = depth.shape[1] * depth.shape[2]
+    borders = np.searchsorted(indices, np.arange(len(depth) + 1) * pixels)
+    clouds = []
+    for t in track(range(len(depth)), len(depth), "points"):
+        frame = unproject(
+            np.asarray(depth[t], np.float64),
+            np.asarray(intrinsics[t], np.float64),
+            np.asarray(extrinsics[t], np.float64),
+        )
+        clouds.append(frame.reshape(-1, 3)[indices[borders[t] : borders[t + 1]] - t * pixels])
+    return np.concatenate(clouds)
+
+
+def aligned_points(prediction: ClipPrediction, truth: ClipTruth) -> np.ndarray:
+    """Predicted points [N, 3] of the compared pixels, moved by the similarity that fits the true ones best.
+
+    Raises:
+      ValueError: no true points, no predicted intrinsics, a prediction that is not finite, no similarity.
+    """
+    if truth.indices is None or truth.points is None or truth.clip.depth is None:
+        raise ValueError("the clip has no true points (no valid depth or no true poses)")
+    depth = _finite_depth(prediction)
+    if depth.shape != truth.clip.depth.shape:
+        raise ValueError(f"predicted depth {depth.shape} must have the shape of the true one {truth.clip.depth.shape}")
+    if prediction.intrinsics is None:
+        raise ValueError("points need predicted intrinsics")
+    cloud = points_at(depth, prediction.intrinsics, prediction.extrinsics, truth.indices)
+    return umeyama(cloud, truth.points).apply(cloud)
+
+
+def _middle(size: tuple[int, ...], crop: int | None) -> tuple[slice, slice]:
+    if crop is None:
+        return slice(None), slice(None)
+    rows, columns = (slice(max(0, edge // 2 - crop // 2), edge // 2 + crop // 2) for edge in size)
+    return rows, columns
+
+
+def _depth(prediction: ClipPrediction, clip: ClipData, measure: DepthMeasure) -> dict[str, float]:
+    depth = _finite_depth(prediction)
+    if clip.depth is None:
+        raise ValueError("the clip has no true depth")
+    if len(depth) != len(clip.depth):
+        raise ValueError(f"the method predicted {len(depth)} depth maps for {len(clip.depth)} frames")
+    errors = clip_depth_metrics(
+        depth, clip.depth, alignments=measure.alignments, max_depth=measure.max_depth, clip=measure.clip
+    )
+    result: dict[str, float] = {}
+    for alignment in measure.alignments:
+        result |= {f"{alignment}/{key}": errors[alignment][key] for key in DEPTH_KEYS}
+        result["valid_pixels"] = errors[alignment]["valid_pixels"]
+        if not result["valid_pixels"]:
+            raise ValueError("no frame of the clip has a valid depth")
+    if not np.isfinite(list(result.values())).all():
+        raise ValueError("predicted depth cannot be aligned: it is 0 at every valid pixel, or its scale overflows")
+    return result
+
+
+def _pose(prediction: ClipPrediction, true: np.ndarray) -> dict[str, float]:
+    rotation, translation = relative_pose_errors(prediction.extrinsics, true)
+    identity_rotation, _ = relative_pose_errors(np.tile(np.eye(4), (len(true), 1, 1)), true)
+    wide = pose_accuracy(rotation, translation, 30)
+    return {
+        "rra@5": pose_accuracy(rotation, translation, 5)["rra"],
+        "rra@30": wide["rra"],
+        "rta@30": wide["rta"],
+        "auc@30": wide["auc"],
+        "rotation_error": float(rotation.mean()),
+        "identity_rotation_error": float(identity_rotation.mean()),
+        "pairs": float(len(rotation)),
+    }
+
+
+def _trajectory(prediction: ClipPrediction, extrinsics: np.ndarray, static: bool) -> dict[str, float]:
+    true = np.asarray(extrinsics, np.float64)
+    radius = rms_radius(camera_centres(true))
+    if static:
+        if not radius > 0:
+            raise ValueError("the true camera does not move or has no pose")
+        return {"ate": radius, "ate_ratio": 1.0}
+    errors = trajectory_errors(invert(np.asarray(prediction.extrinsics, np.float64)), invert(true))
+    return {**errors, "ate_ratio": errors["ate"] / radius}
+
+
+def _points(prediction: ClipPrediction, truth: ClipTruth, icp_threshold: float | None) -> dict[str, float]:
+    cloud = aligned_points(prediction, truth)
+    assert truth.points is not None  # aligned_points has looked
+    return point_cloud_metrics(cloud, truth.points, target_normals=truth.normals, icp_threshold=icp_threshold)
+
+
+def _finite_depth(prediction: ClipPrediction) -> np.ndarray:
+    depth = prediction.depth
+    if depth is None:
+        raise ValueError("the method predicts no depth")
+    bad = [t for t, frame in enumerate(depth) if not np.isfinite(frame).all()]
+    if bad:
+        raise ValueError(f"predicted depth of frame {bad[0]} is not finite ({len(bad)} such frames)")
+    return depth
+
+
+def _depth_means(metrics: Sequence[Mapping[str, float]], measure: DepthMeasure) -> dict[str, float]:
+    measured = [m for m in metrics if "valid_pixels" in m]
+    result: dict[str, float] = {"clips_depth": len(measured)}
+    for alignment in measure.alignments:
+        clips = [
+            {key: m[f"{alignment}/{key}"] for key in DEPTH_KEYS} | {"valid_pixels": m["valid_pixels"]} for m in measured
+        ]
+        if clips:
+            means = mean_depth_metrics(clips)
+            result |= {f"{alignment}/{key}": means[key] for key in DEPTH_KEYS}
+            result["valid_pixels"] = means["valid_pixels"]
+    return result
+
+
+def _pose_means(scores: Sequence[tuple[str, ClipScore]], prefix: str, pooled: bool) -> dict[str, float]:
+    keys = [prefix + key for key in POSE_KEYS]
+    result = _plain_means(scores, f"{prefix}pose", keys)
+    measured = [(name, score.metrics) for name, score in scores if keys[0] in score.metrics]
+    if pooled and measured:
+        categories: dict[str, list[Mapping[str, float]]] = {}
+        for name, metrics in measured:
+            categories.setdefault(name.split("/")[0], []).append(metrics)
+        # Every one of these is a mean over pairs, so that pooling pairs is weighting by their number.
+        for key in keys:
+            means = [
+                np.average([m[key] for m in group], weights=[m[f"{prefix}pairs"] for m in group])
+                for group in categories.values()
+            ]
+            result[key] = float(np.mean(means))
+        result[f"{prefix}categories"] = len(categories)
+    if result.get(f"{prefix}identity_rotation_error"):
+        ratio = result[f"{prefix}rotation_error"] / result[f"{prefix}identity_rotation_error"]
+        result[f"{prefix}rotation_ratio"] = ratio
+    return result
+
+
+def _plain_means(scores: Sequence[tuple[str, ClipScore]], group: str, keys: Sequence[str]) -> dict[str, float]:
+    measured = [score.metrics for _, score in scores if keys[0] in score.metrics]
+    result: dict[str, float] = {f"clips_{group}": len(measured)}
+    for key in keys:
+        values = [m[key] for m in measured if key in m]
+        if values:
+            result[key] = float(np.mean(values))
+    return result

@@ -1,0 +1,210 @@
+"""Reconstruction: accuracy, completeness, normal consistency and Chamfer distance of point clouds.
+
+Source: the evaluation code of CUT3R and its descendants (`eval/mv_recon`); ICP and normals by Open3D, nearest
+neighbours by SciPy.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import importlib
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from logvggt_jax.metrics.depth import lower_median
+
+
+def point_cloud_metrics(
+    prediction: np.ndarray,
+    target: np.ndarray,
+    *,
+    prediction_normals: np.ndarray | None = None,
+    target_normals: np.ndarray | None = None,
+    icp_threshold: float | None = 0.1,
+) -> dict[str, float]:
+    """Distances and normal agreement of a predicted and a true point cloud that are already roughly aligned.
+
+    Args:
+      prediction: [N, 3] points.
+      target: [M, 3] points in the same frame and unit (metres, if ICP is to use its usual threshold).
+      prediction_normals: [N, 3] unit normals of any sign; without them they are estimated from the 30 nearest
+        points.
+      target_normals: [M, 3], likewise.
+      icp_threshold: largest distance of corresponding points in the rigid ICP that moves the prediction
+        first; None leaves it where it is.
+
+    Returns:
+      `acc_mean`, `acc_median`: distance of predicted points to the nearest true point; `comp_mean`,
+      `comp_median`: of true points to the nearest predicted point; `nc_mean`, `nc_median`: |cosine| between
+      the normals of nearest neighbours, averaged over both directions; `chamfer_sum` = acc_mean + comp_mean
+      and `chamfer_mean`, half of it (the papers do not say which they mean).
+
+    Raises:
+      ValueError: an empty cloud, wrong shapes, points that are not finite.
+      ImportError: Open3D (ICP, normals) or SciPy is not installed.
+    """
+    prediction, target = _cloud(prediction, "prediction"), _cloud(target, "target")
+    if prediction_normals is not None:
+        prediction_normals = _normals_of(prediction, prediction_normals, "prediction_normals")
+    if target_normals is not None:
+        target_normals = _normals_of(target, target_normals, "target_normals")
+    if icp_threshold is not None:
+        motion = register_icp(prediction, target, icp_threshold)
+        prediction = prediction @ motion[:3, :3].T + motion[:3, 3]
+        if prediction_normals is not None:
+            prediction_normals = prediction_normals @ motion[:3, :3].T
+    if prediction_normals is None:
+        prediction_normals = estimate_normals(prediction)
+    if target_normals is None:
+        target_normals = estimate_normals(target)
+
+    accuracy, nearest_target = _nearest(prediction, target)
+    completeness, nearest_prediction = _nearest(target, prediction)
+    cosine_accuracy = np.abs((prediction_normals * target_normals[nearest_target]).sum(-1))
+    cosine_completeness = np.abs((target_normals * prediction_normals[nearest_prediction]).sum(-1))
+    return {
+        "acc_mean": float(accuracy.mean()),
+        "acc_median": float(np.median(accuracy)),
+        "comp_mean": float(completeness.mean()),
+        "comp_median": float(np.median(completeness)),
+        "nc_mean": float((cosine_accuracy.mean() + cosine_completeness.mean()) / 2),
+        "nc_median": float((np.median(cosine_accuracy) + np.median(cosine_completeness)) / 2),
+        "chamfer_sum": float(accuracy.mean() + completeness.mean()),
+        "chamfer_mean": float((accuracy.mean() + completeness.mean()) / 2),
+    }
+
+
+def register_icp(prediction: np.ndarray, target: np.ndarray, threshold: float) -> np.ndarray:
+    """Rigid motion [4, 4] by point-to-point ICP from the identity: at most 30 iterations, tolerances 1e-6."""
+    open3d = _open3d()
+    registration = open3d.pipelines.registration
+    result = registration.registration_icp(
+        _open3d_cloud(prediction),
+        _open3d_cloud(target),
+        threshold,
+        np.eye(4),
+        registration.TransformationEstimationPointToPoint(),
+    )
+    return np.array(result.transformation)
+
+
+def estimate_normals(points: np.ndarray) -> np.ndarray:
+    """Unit normals [N, 3] of unknown sign from the 30 nearest points (all of them where there are fewer)."""
+    cloud = _open3d_cloud(points)
+    cloud.estimate_normals()
+    return np.array(cloud.normals)
+
+
+class ScaleShift(NamedTuple):
+    """Protocol A's normalisation of a cloud: z is shifted by -shift_z, then the points are multiplied."""
+
+    shift_z: float
+    scale: float
+
+
+def median_scale_shift(points: np.ndarray) -> ScaleShift:
+    """Median z, and median distance to the per-axis median once z is centred, of points [N, 3].
+
+    Medians are the lower ones. Source: the evaluation's default alignment of pointmaps in the first camera's
+    frame: subtract each cloud's `shift_z`, multiply the prediction by the ratio of scales.
+    """
+    points = _cloud(points, "points")
+    shift_z = lower_median(points[:, 2])
+    centred = points - [0.0, 0.0, shift_z]
+    centre = np.array([lower_median(centred[:, axis]) for axis in range(3)])
+    return ScaleShift(shift_z, lower_median(np.linalg.norm(centred - centre, axis=-1)))
+
+
+def align_median(prediction: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Protocol A: prediction [N, 3] and target [M, 3] of the first camera's frame, both with median z at 0.
+
+    The prediction is scaled to the target's median size; the scale measured on it is held within [1e-3, 1e3].
+    """
+    predicted, true = median_scale_shift(prediction), median_scale_shift(target)
+    factor = true.scale / float(np.clip(predicted.scale, 1e-3, 1e3))
+    return (prediction - [0.0, 0.0, predicted.shift_z]) * factor, target - [0.0, 0.0, true.shift_z]
+
+
+def align_bounding_boxes(prediction: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Prediction [N, 3] scaled and moved so that its bounding box has the target's diagonal and centre.
+
+    FastVGGT's alignment; a single outlier decides it, so prefer a similarity or `align_median`.
+    """
+    prediction, target = _cloud(prediction, "prediction"), _cloud(target, "target")
+    scale = np.linalg.norm(np.ptp(target, axis=0)) / np.linalg.norm(np.ptp(prediction, axis=0))
+    centre = (prediction.min(0) + prediction.max(0)) / 2
+    return (prediction - centre) * scale + (target.min(0) + target.max(0)) / 2
+
+
+def voxel_chamfer(
+    prediction: np.ndarray, target: np.ndarray, *, voxel: float = 0.05, max_distance: float = 0.5
+) -> float:
+    """FastVGGT's Chamfer distance: sum of both mean nearest distances between voxel centroids, each held to a maximum.
+
+    `voxel` is the side of the voxels and `max_distance` the bound on each distance, in the unit of the points.
+    """
+    reduced = [
+        np.array(_open3d_cloud(_cloud(points, name)).voxel_down_sample(voxel).points)
+        for points, name in ((prediction, "prediction"), (target, "target"))
+    ]
+    forth, back = _nearest(*reduced)[0], _nearest(*reduced[::-1])[0]
+    return float(np.minimum(forth, max_distance).mean() + np.minimum(back, max_distance).mean())
+
+
+def sample_indices(count: int, max_points: int | None, seed: int) -> np.ndarray:
+    """Sorted indices [min(count, max_points)] drawn without replacement; all where `max_points` is None.
+
+    Prediction and ground truth of corresponding points have to be reduced by the same indices.
+    """
+    if max_points is None or count <= max_points:
+        return np.arange(count)
+    return np.sort(np.random.default_rng(seed).choice(count, max_points, replace=False))
+
+
+def _nearest(points: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    try:
+        from scipy.spatial import cKDTree
+    except ImportError as error:
+        raise ImportError(f'nearest neighbours need SciPy ({error}): pip install "logvggt-jax[eval]"') from error
+    return cKDTree(others).query(points)
+
+
+def _cloud(points: np.ndarray, name: str) -> np.ndarray:
+    points = np.asarray(points, np.float64)
+    if points.ndim != 2 or points.shape[1] != 3 or not len(points):
+        raise ValueError(f"{name} must be a non-empty cloud [N, 3], got shape {points.shape}")
+    bad = np.flatnonzero(~np.isfinite(points).all(1))
+    if bad.size:
+        raise ValueError(f"{name}: point {bad[0]} is not finite ({bad.size} such points); drop them first")
+    return points
+
+
+def _normals_of(points: np.ndarray, normals: np.ndarray, name: str) -> np.ndarray:
+    normals = np.asarray(normals, np.float64)
+    if normals.shape != points.shape:
+        raise ValueError(f"{name} must have the shape of its points {points.shape}, got {normals.shape}")
+    return normals
+
+
+def _open3d_cloud(points: np.ndarray) -> Any:
+    open3d = _open3d()
+    return open3d.geometry.PointCloud(open3d.utility.Vector3dVector(np.ascontiguousarray(points)))
+
+
+def _open3d() -> Any:
+    try:
+        try:
+            return importlib.import_module("open3d")
+        except ImportError as error:
+            if "libusb" not in str(error):
+                raise
+            # Open3D's wheels link libusb, which bare machines lack; the libusb-package wheel brings it.
+            path = importlib.import_module("libusb_package").get_library_path()
+            ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
+            return importlib.import_module("open3d")
+    except ImportError as error:
+        mend = 'pip install "logvggt-jax[eval]"'
+        if ".so" in str(error):
+            mend = "install that library (Debian, Ubuntu: apt install libx11-6 libgl1 libegl1 libudev1 libidn2-0)"
+        raise ImportError(f"ICP and normals need Open3D ({error}): {mend}") from error

@@ -1,0 +1,58 @@
+"""Depth maps on disk, one file a frame, and pictures of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from logvggt_jax.files import atomic_file
+
+
+def as_stored(depth: np.ndarray, confidence: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Depth and confidence [H, W], float32, rounded as `read_depth` will give them back.
+
+    Files keep float16: 11 bits (0.05 % of the depth, finer than the estimate); values beyond its range become
+    65504.
+    """
+    return _half(depth).astype(np.float32), _half(confidence).astype(np.float32)
+
+
+def write_depth(path: str | Path, depth: np.ndarray, confidence: np.ndarray) -> None:
+    """Writes an .npz file with `depth` and `confidence`, [H, W] float16 (see `as_stored`).
+
+    Depth is z-depth in the unit of the trajectory, confidence is at least 1.
+    """
+    with atomic_file(Path(path)) as temporary, temporary.open("wb") as stream:
+        np.savez(stream, depth=_half(depth), confidence=_half(confidence))
+
+
+def read_depth(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
+    """Depth and confidence, [H, W] float32, of a file that `write_depth` has written."""
+    with np.load(path, allow_pickle=False) as arrays:
+        return arrays["depth"].astype(np.float32), arrays["confidence"].astype(np.float32)
+
+
+def depth_picture(depth: np.ndarray, *, near: float, far: float) -> np.ndarray:
+    """Depth [H, W] as colours [H, W, 3] uint8 RGB: inverse depth, bright near, dark far, black where invalid."""
+    valid = np.isfinite(depth) & (depth > 0)
+    inverse = 1.0 / np.where(valid, depth, 1.0)
+    scaled = (inverse - 1.0 / far) / max(1.0 / near - 1.0 / far, 1e-12)
+    levels = (255 * np.clip(scaled, 0.0, 1.0)).astype(np.uint8)
+    colours = cv2.cvtColor(cv2.applyColorMap(levels, cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB)
+    return np.where(valid[..., None], colours, 0).astype(np.uint8)
+
+
+def write_picture(path: str | Path, image: np.ndarray) -> None:
+    """Writes an RGB image [H, W, 3] uint8 as PNG."""
+    encoded, buffer = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    if not encoded:
+        raise ValueError(f"{path}: an image of shape {image.shape} cannot be encoded as PNG")
+    with atomic_file(Path(path)) as temporary:
+        temporary.write_bytes(buffer.tobytes())
+
+
+def _half(values: np.ndarray) -> np.ndarray:
+    limit = float(np.finfo(np.float16).max)
+    return np.clip(values, -limit, limit).astype(np.float16)

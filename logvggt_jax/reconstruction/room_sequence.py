@@ -1,0 +1,65 @@
+"""A procedural room on disk, laid out as a 7-Scenes sequence, for trying things out without data."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from rich.progress import track
+
+from logvggt_jax.data.rooms.rooms import Rooms
+from logvggt_jax.files import output_folder
+from logvggt_jax.geometry import invert
+from logvggt_jax.reconstruction.depth_files import write_picture
+
+INTRINSICS_FILE = "intrinsics.txt"
+
+
+def write_room_sequence(
+    output: str | Path,
+    *,
+    num_frames: int,
+    image_size: tuple[int, int],
+    seed: int = 0,
+    split: str = "test",
+    overwrite: bool = False,
+    progress: bool = True,
+) -> Path:
+    """Renders a room along its camera path into a folder.
+
+    Every frame has `frame-000000.color.png` (8-bit RGB), `.depth.proj.png` (16-bit millimetres of z-depth in the
+    colour camera) and `.pose.txt` (camera-to-world, 4 x 4, metres); `intrinsics.txt` holds the 3 x 3 matrix in
+    pixels, centres at integers.
+
+    Args:
+      output: the folder to make.
+      num_frames: length of the sequence; the camera is once round its path after 96 frames.
+      image_size: (H, W) in pixels.
+      seed: of the room.
+      split: `train`, `val` or `test`: rooms that a model trained on `train` has seen or not.
+      overwrite: replace an earlier sequence.
+      progress: show a progress bar.
+
+    Returns:
+      The folder.
+
+    Raises:
+      FileExistsError: `output` exists.
+      ValueError: a parameter is out of range.
+    """
+    height, width = image_size
+    rooms = Rooms(split, height=height, width=width, num_frames=num_frames, num_rooms=1, seed=seed)
+    sequence = rooms.sequences[0]
+    with output_folder(output, overwrite=overwrite, marker=INTRINSICS_FILE) as folder:
+        steps = track(range(num_frames), description=f"Rendering {sequence}", disable=not progress)
+        for index in steps:
+            frames = rooms.read(sequence, [index])
+            stem = f"frame-{index:06d}"
+            write_picture(folder / f"{stem}.color.png", frames.images[0])
+            millimetres = np.clip(np.rint(frames.depth[0] * 1000.0), 0, 65534).astype(np.uint16)
+            (folder / f"{stem}.depth.proj.png").write_bytes(cv2.imencode(".png", millimetres)[1].tobytes())
+            np.savetxt(folder / f"{stem}.pose.txt", invert(frames.extrinsics[0].astype(np.float64)), fmt="%.9g")
+        intrinsics, _ = rooms.cameras(sequence, [0])
+        np.savetxt(folder / INTRINSICS_FILE, intrinsics[0], fmt="%.9g")
+    return Path(output)

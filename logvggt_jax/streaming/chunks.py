@@ -1,0 +1,163 @@
+"""Overlapping chunks chained by robust similarities, for a predictor that knows no memory.
+
+Public VGGT weights never learned to pass the reference on from window to window. Long sequences are then cut into
+chunks as long as memory allows, each predicted in the frame of its own first camera and in its own unit, and carried
+into the first chunk's by the similarity that fits the frames which neighbours share (VGGT-Long, without its loop
+closure).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import jax
+import numpy as np
+
+from logvggt_jax.geometry import Similarity, robust_similarity, unproject
+from logvggt_jax.streaming.offline import ChunkPrediction
+
+PredictChunk = Callable[[np.ndarray], ChunkPrediction]
+
+# Shared pixels that fit a similarity: seven numbers need no more, and every chunk solves for them six times.
+_MOST_POINTS = 200_000
+# Pixels less confident than this share of the median are left out.
+_LEAST_CONFIDENCE = 0.1
+# Residuals count linearly beyond this share of the median depth.
+_HUBER_THRESHOLD = 0.1
+
+
+@dataclasses.dataclass(frozen=True)
+class ChunkPlan:
+    """Chunks of `size` frames, neighbours sharing `overlap` of them (VGGT-Long's numbers)."""
+
+    size: int = 60
+    overlap: int = 30
+
+    def __post_init__(self) -> None:
+        for name in ("size", "overlap"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise ValueError(f"chunk {name} must be a whole number of at least 1 frame, got {value!r}")
+        if not self.overlap < self.size:
+            raise ValueError(
+                f"chunk overlap must be at least 1 frame and below the chunk size {self.size}, got {self.overlap}: "
+                "neighbours are aligned by the frames they share, and each has to add some"
+            )
+
+    def ranges(self, num_frames: int) -> list[tuple[int, int]]:
+        """Frames [start, stop) of every chunk of a sequence; the last one may be shorter."""
+        step = self.size - self.overlap
+        starts = range(0, max(num_frames - self.overlap, 1), step)
+        return [(start, min(start + self.size, num_frames)) for start in starts]
+
+
+class ChunkChain:
+    """Takes a sequence frame by frame and hands out predictions in the first chunk's frame and unit.
+
+    Of a frame that several chunks hold, the last one's prediction counts. No more than one chunk of images and
+    predictions is held.
+
+    Args:
+      predict: images [n, H, W, 3] of a chunk to its prediction, in a frame and unit of the chunk's own.
+      plan: sizes of the chunks.
+    """
+
+    def __init__(self, predict: PredictChunk, plan: ChunkPlan) -> None:
+        self._predict, self._plan = predict, plan
+        self._images: list[np.ndarray] = []
+        self._shared: ChunkPrediction | None = None
+        self._first = 0
+
+    def push(self, image: np.ndarray) -> ChunkPrediction | None:
+        """Takes the next image [H, W, 3]; the frames that became final with it, oldest first, if any.
+
+        Raises:
+          ValueError: a chunk cannot be aligned with the one before.
+        """
+        self._images.append(image)
+        if len(self._images) < self._plan.size:
+            return None
+        chunk = self._next_chunk()
+        step = self._plan.size - self._plan.overlap
+        # A copy: a view would keep the whole chunk alive.
+        self._shared = jax.tree.map(lambda x: x[step:].copy(), chunk)
+        self._images = self._images[step:]
+        self._first += step
+        return jax.tree.map(lambda x: x[:step], chunk)
+
+    def close(self) -> ChunkPrediction | None:
+        """Ends the sequence: the frames still held; None if there was no frame. Errors as in `push`."""
+        if not self._images:
+            return None
+        known = 0 if self._shared is None else self._plan.overlap
+        last = self._shared if len(self._images) == known else self._next_chunk()
+        self._images, self._shared = [], None
+        return last
+
+    def _next_chunk(self) -> ChunkPrediction:
+        chunk = self._predict(np.stack(self._images))
+        if self._shared is None:
+            return chunk
+        shared = self._plan.overlap
+        try:
+            similarity = align(jax.tree.map(lambda x: x[:shared], chunk), self._shared)
+        except ValueError as error:
+            raise ValueError(
+                f"the chunk from frame {self._first} to {self._first + len(self._images) - 1} cannot be aligned with "
+                f"the one before on the {shared} frames they share ({error}); take larger chunks with more overlap"
+            ) from error
+        return move(chunk, similarity)
+
+
+def align(source: ChunkPrediction, target: ChunkPrediction) -> Similarity:
+    """The similarity that carries one prediction of some frames onto another of the same frames.
+
+    It fits the points of the same pixels where both are confident, weighted by the geometric mean of both
+    confidences, with Huber weights against what the predictions disagree about.
+
+    Raises:
+      ValueError: fewer than three pixels are valid in both, or their points lie on a line.
+    """
+    valid = _confident(source, target)
+    chosen = np.flatnonzero(valid)
+    if len(chosen) > _MOST_POINTS:
+        chosen = chosen[np.linspace(0, len(chosen) - 1, _MOST_POINTS).round().astype(int)]
+    if len(chosen) < 3:
+        raise ValueError(f"{len(chosen)} of {valid.size} pixels have a valid depth and confidence in both")
+    weights = np.sqrt(source.depth_confidence.reshape(-1)[chosen].astype(np.float64))
+    weights *= np.sqrt(target.depth_confidence.reshape(-1)[chosen].astype(np.float64))
+    threshold = _HUBER_THRESHOLD * float(np.median(target.depth.reshape(-1)[chosen]))
+    return robust_similarity(_points(source, chosen), _points(target, chosen), weights, threshold=threshold)
+
+
+def move(prediction: ChunkPrediction, similarity: Similarity) -> ChunkPrediction:
+    """The same prediction in the world and unit that `similarity` maps to; float32."""
+    points = prediction.points
+    return prediction._replace(
+        depth=(similarity.scale * prediction.depth).astype(np.float32),
+        extrinsics=similarity.apply_to_extrinsics(prediction.extrinsics).astype(np.float32),
+        points=None if points is None else similarity.apply(points).astype(np.float32),
+    )
+
+
+def _confident(source: ChunkPrediction, target: ChunkPrediction) -> np.ndarray:
+    """Pixels [n, H, W] that both predictions know something of."""
+    valid = np.ones(source.depth.shape, bool)
+    for prediction in (source, target):
+        valid &= np.isfinite(prediction.depth) & (prediction.depth > 0) & np.isfinite(prediction.depth_confidence)
+    if valid.any():
+        least = _LEAST_CONFIDENCE * min(float(np.median(p.depth_confidence[valid])) for p in (source, target))
+        valid &= (source.depth_confidence > least) & (target.depth_confidence > least)
+    return valid
+
+
+def _points(prediction: ChunkPrediction, indices: np.ndarray) -> np.ndarray:
+    """World points [N, 3] float64 of pixels `indices` [N], sorted and flat in [n, H, W]; frame by frame."""
+    pixels = prediction.depth[0].size
+    borders = np.searchsorted(indices, np.arange(len(prediction.depth) + 1) * pixels)
+    points = []
+    for t in range(len(prediction.depth)):
+        frame = [np.asarray(x[t], np.float64) for x in (prediction.depth, prediction.intrinsics, prediction.extrinsics)]
+        points.append(unproject(*frame).reshape(-1, 3)[indices[borders[t] : borders[t + 1]] - t * pixels])
+    return np.concatenate(points)

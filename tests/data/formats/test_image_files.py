@@ -1,0 +1,106 @@
+"""Whole pictures are read as they are; truncated, damaged and mistyped ones are named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from logvggt_jax.data.formats.image import read_depth, read_rgb
+
+PICTURE = np.random.default_rng(0).integers(0, 256, (40, 60, 3), np.uint8)
+DEPTH = np.random.default_rng(1).integers(0, 65536, (40, 60), np.uint16)
+
+
+def write(path: Path, array: np.ndarray, *parameters: int) -> Path:
+    assert cv2.imwrite(str(path), array, list(parameters))
+    return path
+
+
+@pytest.mark.parametrize("suffix", ["png", "bmp"])
+def test_lossless_pictures_come_back_in_rgb(tmp_path: Path, suffix: str):
+    assert np.array_equal(read_rgb(write(tmp_path / f"a.{suffix}", PICTURE[..., ::-1])), PICTURE)
+
+
+@pytest.mark.parametrize("progressive", [0, 1])
+def test_jpeg_pictures_come_back_in_rgb(tmp_path: Path, progressive: int):
+    smooth = cv2.GaussianBlur(PICTURE, (0, 0), 5)
+    path = write(
+        tmp_path / "a.jpg",
+        smooth[..., ::-1],
+        cv2.IMWRITE_JPEG_QUALITY,
+        98,
+        cv2.IMWRITE_JPEG_PROGRESSIVE,
+        progressive,
+        cv2.IMWRITE_JPEG_RST_INTERVAL,
+        2,
+    )
+    assert np.abs(read_rgb(path).astype(int) - smooth).mean() < 2
+
+
+def test_grey_is_repeated_and_alpha_is_composited_over_white(tmp_path: Path):
+    grey = read_rgb(write(tmp_path / "grey.png", PICTURE[..., 0]))
+    assert np.array_equal(grey, PICTURE[..., :1].repeat(3, 2))
+    alpha = np.dstack([PICTURE[..., ::-1], np.where(np.arange(60) < 30, 0, 255) * np.ones((40, 1))]).astype(np.uint8)
+    composited = read_rgb(write(tmp_path / "alpha.png", alpha))
+    assert (composited[:, :30] == 255).all() and np.array_equal(composited[:, 30:], PICTURE[:, 30:])
+
+
+def test_depth_keeps_its_sixteen_bits(tmp_path: Path):
+    assert np.array_equal(read_depth(write(tmp_path / "d.png", DEPTH)), DEPTH)
+
+
+@pytest.mark.parametrize("keep", [0.0, 0.05, 0.3, 0.5, 0.9, 0.999])
+@pytest.mark.parametrize("suffix", ["png", "jpg"])
+def test_truncated_pictures_are_named(tmp_path: Path, suffix: str, keep: float):
+    path = write(tmp_path / f"cut.{suffix}", PICTURE)
+    data = path.read_bytes()
+    path.write_bytes(data[: int(keep * len(data))])
+    with pytest.raises(ValueError, match=rf"cut\.{suffix}.*fetch it again"):
+        read_rgb(path)
+
+
+def test_truncated_depth_is_named(tmp_path: Path):
+    path = write(tmp_path / "cut.png", DEPTH)
+    path.write_bytes(path.read_bytes()[:-20])
+    with pytest.raises(ValueError, match=r"cut\.png.*fetch it again"):
+        read_depth(path)
+
+
+def test_a_jpeg_with_a_whole_thumbnail_but_half_a_picture_is_truncated(tmp_path: Path):
+    whole = write(tmp_path / "a.jpg", PICTURE).read_bytes()
+    thumbnail = write(tmp_path / "b.jpg", PICTURE[::4, ::4]).read_bytes()
+    segment = b"\xff\xe1" + (len(thumbnail) + 2).to_bytes(2, "big") + thumbnail
+    path = tmp_path / "c.jpg"
+    path.write_bytes(whole[:2] + segment + whole[2:])
+    assert np.array_equal(read_rgb(path), read_rgb(tmp_path / "a.jpg"))
+    path.write_bytes(whole[:2] + segment + whole[2 : len(whole) // 2])
+    with pytest.raises(ValueError, match=r"c\.jpg"):
+        read_rgb(path)
+
+
+def test_a_flipped_byte_in_a_png_is_named(tmp_path: Path):
+    path = write(tmp_path / "flipped.png", PICTURE)
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    path.write_bytes(data)
+    with pytest.raises(ValueError, match=r"flipped\.png"):
+        read_rgb(path)
+
+
+def test_what_is_no_picture_is_named(tmp_path: Path):
+    path = tmp_path / "text.png"
+    path.write_text("not a picture")
+    with pytest.raises(ValueError, match=r"text\.png"):
+        read_rgb(path)
+    with pytest.raises(FileNotFoundError, match=r"absent\.png"):
+        read_rgb(tmp_path / "absent.png")
+
+
+def test_wrong_types_are_named(tmp_path: Path):
+    with pytest.raises(ValueError, match=r"deep\.png.*uint16"):
+        read_rgb(write(tmp_path / "deep.png", DEPTH))
+    with pytest.raises(ValueError, match=r"shallow\.png.*uint8"):
+        read_depth(write(tmp_path / "shallow.png", PICTURE[..., 0]))

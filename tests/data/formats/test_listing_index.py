@@ -1,0 +1,159 @@
+"""The index of listings: a second start lists nothing, every change of the folder is seen, damage costs time only."""
+
+from __future__ import annotations
+
+import json
+import os
+import sqlite3
+from collections import Counter
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from absl import logging
+from test_replica import CAMERA, write_scene
+
+from logvggt_jax.data.formats.listing_index import ListingIndex, SourceFiles
+from logvggt_jax.data.readers.replica import Replica
+
+
+@pytest.fixture
+def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A scene of three frames that has not changed for an hour, and a cache of its own."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    folder = tmp_path / "replica"
+    write_scene(folder / "room0", 3)
+    (folder / "cam_params.json").write_text(json.dumps({"camera": CAMERA}))
+    # Clocks of file systems tick slowly: a change now differs from one an hour ago in any case.
+    for path in (folder, *folder.rglob("*")):
+        before = path.stat().st_mtime - 3600
+        os.utime(path, (before, before))
+    return folder
+
+
+@pytest.fixture
+def reads(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
+    """How often folders were listed and text files read."""
+    counts: Counter[str] = Counter()
+    for name in ("names", "content"):
+        original = getattr(SourceFiles, name)
+
+        def counted(self, path: Path, expected: str, name=name, original=original):
+            counts[name] += 1
+            return original(self, path, expected)
+
+        monkeypatch.setattr(SourceFiles, name, counted)
+    return counts
+
+
+@pytest.fixture
+def warnings_of(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    messages: list[str] = []
+    monkeypatch.setattr(logging, "warning", lambda text, *values: messages.append(text % values))
+    monkeypatch.setattr(logging, "log_first_n", lambda _, text, __, *values: messages.append(text % values))
+    return messages
+
+
+def index_file(root: Path) -> Path:
+    (path,) = (root.parent / "cache/logvggt/listings").iterdir()
+    return path
+
+
+def names(root: Path) -> list[str]:
+    replica = Replica(root)
+    assert replica.num_frames("room0") == len(replica.frame_names("room0"))
+    return replica.frame_names("room0")
+
+
+ALL = [f"frame{i:06d}" for i in range(3)]
+
+
+def test_the_second_start_reads_nothing_and_gives_the_same(root: Path, reads: Counter[str]):
+    first = Replica(root)
+    expected = first.read("room0", [0, 1, 2])
+    assert reads["names"] >= 2 and reads["content"] >= 2
+    reads.clear()
+    second = Replica(root)
+    assert second.sequences == first.sequences and second.num_frames("room0") == 3
+    assert second.frame_names("room0") == ALL and second.dropped_frames("room0") == {}
+    frames = second.read("room0", [0, 1, 2])
+    assert not reads
+    for name in ("images", "depth", "intrinsics", "extrinsics"):
+        assert (getattr(frames, name) == getattr(expected, name)).all()
+
+
+def test_files_added_and_removed_are_seen(root: Path):
+    assert names(root) == ALL
+    poses = (root / "room0/traj.txt").read_text()
+    for kind in ("frame{}.jpg", "depth{}.png"):
+        path = root / "room0/results" / kind.format("000003")
+        path.write_bytes((root / "room0/results" / kind.format("000002")).read_bytes())
+    (root / "room0/traj.txt").write_text(poses + poses.splitlines()[2] + "\n")
+    assert names(root) == [*ALL, "frame000003"]
+    (root / "room0/results/depth000003.png").unlink()
+    with pytest.raises(FileNotFoundError, match=r"depth000003\.png"):
+        names(root)
+    (root / "room0/results/frame000003.jpg").unlink()
+    (root / "room0/traj.txt").write_text(poses)
+    assert names(root) == ALL
+
+
+def test_sequences_added_and_removed_are_seen(root: Path):
+    assert Replica(root).sequences == ("room0",)
+    (root / "room0").rename(root / "room1")
+    assert Replica(root).sequences == ("room1",)
+    write_scene(root / "room2", 1)
+    assert Replica(root).sequences == ("room1", "room2")
+
+
+def test_an_edited_calibration_and_pose_are_seen(root: Path):
+    before = Replica(root).read("room0", [0])
+    (root / "cam_params.json").write_text(json.dumps({"camera": CAMERA | {"fx": 50.0}}))
+    after = Replica(root).read("room0", [0])
+    assert after.intrinsics[0, 0, 0] == 50 and before.intrinsics[0, 0, 0] == pytest.approx(40)
+    (root / "cam_params.json").unlink()
+    assert Replica(root).read("room0", [0]).intrinsics[0, 0, 0] == pytest.approx(600 * 64 / 1200)
+    lines = (root / "room0/traj.txt").read_text().splitlines()
+    (root / "room0/traj.txt").write_text("\n".join([lines[1], *lines[1:]]))
+    replica = Replica(root)
+    assert (replica.extrinsics("room0")[0] == replica.extrinsics("room0")[1]).all()
+
+
+def test_a_file_that_is_no_index_is_made_anew(root: Path, reads: Counter[str], warnings_of: list[str]):
+    assert names(root) == ALL
+    index_file(root).write_bytes(b"this is no database" * 100)
+    assert names(root) == ALL
+    assert len(warnings_of) == 1 and "made anew" in warnings_of[0] and str(index_file(root)) in warnings_of[0]
+    reads.clear()
+    assert names(root) == ALL
+    assert not reads and len(warnings_of) == 1
+
+
+@pytest.mark.parametrize("damage", [b"", b"not an archive", None])
+def test_a_damaged_listing_is_made_anew(root: Path, reads: Counter[str], warnings_of: list[str], damage: bytes | None):
+    assert names(root) == ALL
+    with closing(sqlite3.connect(index_file(root))) as connection, connection:
+        (payload,) = connection.execute("SELECT payload FROM listings WHERE key = 'frames room0'").fetchone()
+        broken = payload[:300] + b"\xff\x00\xff" + payload[303:] if damage is None else damage
+        connection.execute("UPDATE listings SET payload = ? WHERE key = 'frames room0'", (broken,))
+    assert names(root) == ALL
+    assert len(warnings_of) == 1 and "made anew" in warnings_of[0]
+    reads.clear()
+    assert names(root) == ALL and not reads
+
+
+def test_a_cache_folder_that_cannot_be_written_only_warns(root: Path, warnings_of: list[str]):
+    (root.parent / "cache").write_text("a file where the folder should be")
+    for _ in range(2):
+        assert names(root) == ALL
+    assert warnings_of and "not kept" in warnings_of[0]
+
+
+def test_copies_and_readers_do_not_share_an_index(root: Path):
+    other = root.parent / "other"
+    write_scene(other / "room0", 2)
+    assert names(root) == ALL and names(other) == ALL[:2] and names(root) == ALL
+    paths = {ListingIndex(kind, folder).path for kind in ("replica", "nrgbd") for folder in (root, other)}
+    assert len(paths) == 4
+    # However the folder is spelt.
+    assert ListingIndex("replica", root / ".." / root.name).path == ListingIndex("replica", root).path

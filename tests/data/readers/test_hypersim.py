@@ -1,0 +1,355 @@
+"""HyperSim: exact cameras of tilted and shifted lenses, ray distance, asset units, frame numbers, tone map, damage.
+
+Truth is what the set's camera matrix itself says: a pixel's ray, and where it meets the room.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from analytic_room import camera_to_world, disagreement, view
+from room_video import SIZE, View, check_video
+
+from logvggt_jax.data.dataset import check_frames
+from logvggt_jax.data.readers.hypersim import HyperSim
+from logvggt_jax.geometry import project, unproject
+
+UNIT = 0.0254
+AXES = np.diag([1.0, -1.0, -1.0])  # OpenGL to OpenCV and back
+# Rays of the OpenGL camera for (u, v, 1): a symmetric frustum; a lens tilted by 22 degrees about x with both shifts.
+PLAIN = np.diag([0.577, 0.43275, -1.0])
+TILTED = np.array([[0.61, 0, -0.05], [0, 0.42, -0.11], [0, -0.17, -1.05]])
+
+
+@dataclass(frozen=True)
+class Ray:
+    """What the pixels of a frame see: points [H, W, 3] in the world, distance [H, W], both in metres."""
+
+    image: np.ndarray
+    points: np.ndarray
+    distance: np.ndarray
+
+
+def uv_from_pixels(size: tuple[int, int]) -> np.ndarray:
+    """[3, 3]; a picture's borders are at -1 and 1, v up, pixel centres half a pixel inside."""
+    height, width = size
+    return np.array([[2 / width, 0, 1 / width - 1], [0, -2 / height, 1 - 1 / height], [0, 0, 1]])
+
+
+def cast(index: int, camera_from_uv: np.ndarray, size: tuple[int, int] = SIZE) -> Ray:
+    ray_from_pixel = AXES @ camera_from_uv @ uv_from_pixels(size)
+    pose = camera_to_world(index)
+    image, along = view(pose, np.linalg.inv(ray_from_pixel), size)
+    v, u = np.indices(size)
+    camera = along[..., None] * (np.stack([u, v, np.ones(size)], -1) @ ray_from_pixel.T)
+    return Ray(image, camera @ pose[:3, :3].T + pose[:3, 3], np.linalg.norm(camera, axis=-1))
+
+
+def camera_from_uv_of(intrinsics: np.ndarray, rotation: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """The set's matrix for a camera with `intrinsics` in pixels whose frame is turned by `rotation`."""
+    return 1.7 * AXES @ rotation.T @ np.linalg.inv(intrinsics) @ np.linalg.inv(uv_from_pixels(size))
+
+
+def write_array(path: Path, array: np.ndarray, name: str = "dataset") -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with h5py.File(path, "w") as file:
+        file.create_dataset(name, data=array)
+
+
+def write_frame(scene: Path, number: int, seen: Ray, camera: str = "cam_00") -> None:
+    geometry = scene / f"images/scene_{camera}_geometry_hdf5"
+    colour = ((seen.image + 0.5) / 255) ** 2.2 * 3.0
+    write_array(scene / f"images/scene_{camera}_final_hdf5/frame.{number:04d}.color.hdf5", colour.astype(np.float32))
+    write_array(geometry / f"frame.{number:04d}.depth_meters.hdf5", seen.distance.astype(np.float32))
+    write_array(geometry / f"frame.{number:04d}.render_entity_id.hdf5", np.ones(seen.image.shape[:2], np.int16))
+
+
+def write_keyframes(scene: Path, count: int = 4, camera: str = "cam_00") -> None:
+    poses = np.stack([camera_to_world(index) for index in range(count)])
+    detail = scene / "_detail" / camera
+    write_array(detail / "camera_keyframe_orientations.hdf5", poses[:, :3, :3] @ AXES)
+    write_array(detail / "camera_keyframe_positions.hdf5", poses[:, :3, 3] / UNIT)
+    text = f"parameter_name,parameter_value\nmeters_per_asset_unit,{UNIT}\n"
+    (scene / "_detail/metadata_scene.csv").write_text(text)
+
+
+def write_table(root: Path, scenes: dict[str, np.ndarray], width: float = 1024.0) -> None:
+    columns = [f"M_cam_from_uv_{i}{j}" for i in range(3) for j in range(3)]
+    lines = [",".join(["scene_name", "settings_output_img_width", "camera_physical_bmpaperture_tex", *columns])]
+    for scene, matrix in scenes.items():
+        lines.append(",".join([scene, str(width), '"AColor(0, 0, 0, 0)"', *map(repr, matrix.ravel().tolist())]))
+    (root / "metadata_camera_parameters.csv").write_text("\n".join(lines) + "\n")
+
+
+def write_scene(
+    root: Path, name: str, matrix: np.ndarray, *, size: tuple[int, int] = SIZE, numbers: tuple[int, ...] = (0, 2, 3)
+) -> list[Ray]:
+    """Four keyframes of cam_00, of which only `numbers` are in the release."""
+    seen = [cast(number, matrix, size) for number in numbers]
+    for number, rays in zip(numbers, seen, strict=True):
+        write_frame(root / name, number, rays)
+    write_keyframes(root / name)
+    return seen
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """One plain scene."""
+    write_scene(tmp_path, "ai_001_001", PLAIN)
+    write_table(tmp_path, {"ai_001_001": PLAIN, "ai_099_009": TILTED})
+    return tmp_path
+
+
+def final(root: Path, number: int) -> Path:
+    return root / f"ai_001_001/images/scene_cam_00_final_hdf5/frame.{number:04d}.color.hdf5"
+
+
+def geometry(root: Path, number: int, kind: str) -> Path:
+    return root / f"ai_001_001/images/scene_cam_00_geometry_hdf5/frame.{number:04d}.{kind}.hdf5"
+
+
+def tone_mapped(colour: np.ndarray, shown: np.ndarray) -> np.ndarray:
+    brightness = 0.3 * colour[..., 0] + 0.59 * colour[..., 1] + 0.11 * colour[..., 2]
+    scale = 0.8**2.2 / np.percentile(brightness[shown], 90)
+    return 255 * np.clip((scale * colour) ** (1 / 2.2), 0, 1)
+
+
+def test_a_plain_camera_comes_back_by_frame_number(root: Path):
+    scenes = HyperSim(root)
+    assert scenes.sequences == ("ai_001_001/cam_00",)
+    assert scenes.frame_names("ai_001_001/cam_00") == ["frame.0000", "frame.0002", "frame.0003"]
+    frames = scenes.read("ai_001_001/cam_00", [0, 1, 2])
+    assert frames.metric
+    expected = []
+    for index in (0, 2, 3):
+        pose, seen = camera_to_world(index), cast(index, PLAIN)
+        z = (seen.points - pose[:3, 3]) @ pose[:3, 2]
+        colour = ((seen.image + 0.5) / 255) ** 2.2
+        expected.append(View(tone_mapped(colour, np.ones(SIZE, bool)).astype(np.uint8), z, pose))
+    # Centres at integers: the middle of 64 pixels is at 31.5.
+    intrinsics = np.array([[32 / 0.577, 0, 31.5], [0, 24 / 0.43275, 23.5], [0, 0, 1]])
+    check_video(frames, expected, depth_error=1e-5, colour_error=0.05, intrinsics=intrinsics)
+
+
+def test_a_tilted_and_shifted_lens_is_exact_at_the_sets_size(tmp_path: Path):
+    seen = write_scene(tmp_path, "ai_038_009", TILTED, size=(768, 1024), numbers=(0, 2))
+    write_table(tmp_path, {"ai_038_009": TILTED})
+    frames = HyperSim(tmp_path).read("ai_038_009/cam_00", [0, 1])
+    check_frames(frames, "HyperSim")
+    intrinsics = frames.intrinsics[0]
+    assert abs(intrinsics[0, 2] - 511.5) > 20 and abs(intrinsics[1, 2] - 383.5) > 200
+    v, u = np.indices((768, 1024))
+    for index, rays in enumerate(seen):
+        points = rays.points.reshape(-1, 3)
+        pixels, z = project(
+            points, frames.intrinsics[index].astype(np.float64), frames.extrinsics[index].astype(np.float64)
+        )
+        assert np.abs(pixels - np.stack([u.ravel(), v.ravel()], -1)).max() < 1e-3
+        np.testing.assert_allclose(frames.depth[index].ravel(), z, rtol=2e-6)
+        unprojected = unproject(frames.depth[index], frames.intrinsics[index], frames.extrinsics[index])
+        assert np.abs(unprojected.reshape(-1, 3) - points).max() < 1e-4
+        rotation, translation = frames.extrinsics[index][:3, :3], frames.extrinsics[index][:3, 3]
+        centre = camera_to_world((0, 2)[index])[:3, 3]
+        np.testing.assert_allclose(-rotation.T @ translation, centre, atol=1e-5)
+    # The optical axis is not the stored one: it is tilted by atan(0.17 / 0.42).
+    stored, turned = camera_to_world(0)[:3, 2], frames.extrinsics[0][2, :3]
+    assert np.degrees(np.arccos(stored @ turned)) == pytest.approx(np.degrees(np.arctan2(0.17, 0.42)), abs=0.01)
+    error, share = disagreement(frames, 0, 1)
+    assert error < 1e-3 and share > 0.4
+
+
+def test_intrinsics_and_rotation_are_recovered(tmp_path: Path):
+    """A camera built from known intrinsics and rotation, scaled, as the table's matrices have no fixed scale."""
+    intrinsics = np.array([[56.0, 0, 20.25], [0, 57.0, 40.5], [0, 0, 1]])
+    angle = np.radians(30)
+    rotation = np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
+    matrix = camera_from_uv_of(intrinsics, rotation, SIZE)
+    write_scene(tmp_path, "ai_002_001", matrix)
+    write_table(tmp_path, {"ai_002_001": matrix})
+    frames = HyperSim(tmp_path).read("ai_002_001/cam_00", [1])
+    np.testing.assert_allclose(frames.intrinsics[0], intrinsics, atol=1e-4)
+    turn = np.eye(4)
+    turn[:3, :3] = rotation
+    np.testing.assert_allclose(frames.extrinsics[0], turn @ np.linalg.inv(camera_to_world(2)), atol=1e-6)
+
+
+def test_scenes_with_skewed_pixels_are_left_out_and_listed(root: Path):
+    width, height = 1024, 768
+    for name, skew in (("ai_003_001", 0.7), ("ai_003_002", -0.7), ("ai_003_003", 0.3)):
+        matrix = camera_from_uv_of(
+            np.array([[890, skew, 511.5], [0, 890, 383.5], [0, 0, 1]]), np.eye(3), (height, width)
+        )
+        write_scene(root, name, matrix)
+        old = (root / "metadata_camera_parameters.csv").read_text()
+        write_table(root, {name: matrix})
+        row = (root / "metadata_camera_parameters.csv").read_text().splitlines()[1]
+        (root / "metadata_camera_parameters.csv").write_text(old + row + "\n")
+    for _ in range(2):  # listed, and from the index
+        scenes = HyperSim(root)
+        assert scenes.sequences == ("ai_001_001/cam_00", "ai_003_003/cam_00")
+        assert scenes.skewed_sequences() == ["ai_003_001/cam_00", "ai_003_002/cam_00"]
+    check_frames(scenes.read("ai_003_003/cam_00", [0]), "HyperSim")
+
+
+def test_invalid_distances_become_zero(root: Path):
+    distance = np.full(SIZE, 2.0, np.float16)
+    distance[0, :5] = [np.nan, np.inf, -np.inf, 0, -1]
+    write_array(geometry(root, 0, "depth_meters"), distance)
+    write_array(geometry(root, 2, "depth_meters"), np.full(SIZE, np.nan, np.float16))
+    frames = HyperSim(root).read("ai_001_001/cam_00", [0, 1])
+    assert not frames.depth[0, 0, :5].any() and (frames.depth[0].ravel()[5:] > 1).all()
+    assert not frames.depth[1].any()
+
+
+def test_tone_map_is_exposed_by_the_pixels_that_show_an_object(root: Path):
+    generator = np.random.default_rng(0)
+    colour = generator.uniform(0.5, 4.0, (*SIZE, 3)).astype(np.float32)
+    entities = np.ones(SIZE, np.int16)
+    entities[:20] = -1
+    colour[:20] *= 1000
+    write_array(final(root, 0), colour)
+    write_array(geometry(root, 0, "render_entity_id"), entities)
+    image = HyperSim(root).read("ai_001_001/cam_00", [0]).images[0]
+    expected = tone_mapped(colour.astype(np.float64), entities != -1)
+    assert (image[:20] == 255).all()
+    # Truncated, not rounded; float32 may fall either side of a whole number.
+    assert np.abs(image - np.floor(expected)).max() <= 1 and (image == np.floor(expected)).mean() > 0.999
+    assert 100 < image[20:].mean() < 230
+
+
+def test_tone_map_without_objects_light_or_finite_values(root: Path):
+    write_array(geometry(root, 0, "render_entity_id"), np.full(SIZE, -1, np.int16))
+    write_array(final(root, 0), np.full((*SIZE, 3), 0.5**2.2, np.float32))
+    write_array(final(root, 2), np.full((*SIZE, 3), 5e-5, np.float32))
+    colour = np.full((*SIZE, 3), 0.01, np.float16)
+    colour[0, 0], colour[0, 1], colour[0, 2] = np.nan, np.inf, -1.0
+    write_array(final(root, 3), colour)
+    images = HyperSim(root).read("ai_001_001/cam_00", [0, 1, 2]).images
+    assert np.isin(images[0], (127, 128)).all()  # unscaled: 0.5 * 255
+    assert not images[1].any()  # too dark to expose
+    assert not images[2][0, 0].any() and (images[2][0, 1] == 255).all() and not images[2][0, 2].any()
+    assert np.isin(images[2][1:], (203, 204)).all()  # 0.8 * 255
+
+
+def test_splits_are_those_of_the_table_for_scenes_on_disk(root: Path):
+    write_frame(root / "ai_001_001", 0, cast(0, PLAIN), "cam_01")
+    write_keyframes(root / "ai_001_001", camera="cam_01")
+    write_scene(root, "ai_099_009", TILTED)
+    with pytest.raises(FileNotFoundError, match=r"metadata_images_split_scene_v1\.csv.*split='all'"):
+        HyperSim(root, "train")
+    table = root / "metadata_images_split_scene_v1.csv"
+    header = "scene_name,camera_name,frame_id,included_in_public_release,exclude_reason,split_partition_name\n"
+    rows = [
+        "ai_001_001,cam_00,0,True,,train",
+        "ai_001_001,cam_00,1,False,CONTENT FLAGGED FOR REMOVAL,",
+        "ai_001_001,cam_01,0,False,CONTENT FLAGGED FOR REMOVAL,train",
+        "ai_007_007,cam_00,0,True,,train",
+        "ai_099_009,cam_00,0,True,,val",
+    ]
+    table.write_text(header + "\n".join(rows))
+    assert HyperSim(root).sequences == ("ai_001_001/cam_00", "ai_001_001/cam_01", "ai_099_009/cam_00")
+    assert HyperSim(root, "train").sequences == ("ai_001_001/cam_00",)
+    assert HyperSim(root, "val").sequences == ("ai_099_009/cam_00",)
+    with pytest.raises(FileNotFoundError, match="no sequences of HyperSim"):
+        HyperSim(root, "test")
+    table.write_text(header + "\n".join(rows[:-1]))
+    with pytest.raises(ValueError, match=r"split_scene_v1\.csv: no row for ai_099_009/cam_00"):
+        HyperSim(root, "train")
+    table.write_text("scene,split\nai_001_001,train\n")
+    with pytest.raises(ValueError, match=r"split_scene_v1\.csv: no column 'scene_name'"):
+        HyperSim(root, "train")
+
+
+def test_lost_keyframes_are_dropped_and_counted(root: Path):
+    positions = np.zeros((4, 3))
+    positions[2] = np.nan
+    write_array(root / "ai_001_001/_detail/cam_00/camera_keyframe_positions.hdf5", positions)
+    scenes = HyperSim(root)
+    assert scenes.frame_names("ai_001_001/cam_00") == ["frame.0000", "frame.0003"]
+    assert scenes.dropped_frames("ai_001_001/cam_00") == {"no pose": 1}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "images/scene_cam_00_final_hdf5/frame.0002.color.hdf5",
+        "images/scene_cam_00_geometry_hdf5/frame.0002.depth_meters.hdf5",
+        "images/scene_cam_00_geometry_hdf5/frame.0002.render_entity_id.hdf5",
+        "_detail/metadata_scene.csv",
+        "_detail/cam_00/camera_keyframe_positions.hdf5",
+        "_detail/cam_00/camera_keyframe_orientations.hdf5",
+    ],
+)
+def test_a_missing_file_is_named(root: Path, name: str):
+    (root / "ai_001_001" / name).unlink()
+    with pytest.raises(FileNotFoundError, match=name):
+        HyperSim(root).num_frames("ai_001_001/cam_00")
+
+
+def test_a_missing_or_damaged_camera_table_is_named(root: Path):
+    table = root / "metadata_camera_parameters.csv"
+    for matrix, complaint in (
+        (np.diag([1.0, 1, 0]), "ai_001_001 has no inverse"),
+        (np.full((3, 3), np.nan), "ai_001_001 has no inverse"),
+        (np.diag([0.577, 0.433, 1.0]), "ai_001_001 mirrors"),
+    ):
+        write_table(root, {"ai_001_001": matrix})
+        with pytest.raises(ValueError, match=rf"camera_parameters\.csv: M_cam_from_uv of {complaint}"):
+            HyperSim(root)
+    table.write_text("scene_name,M_cam_from_uv_00\nai_001_001,zero\n")
+    with pytest.raises(ValueError, match=r"camera_parameters\.csv: expected M_cam_from_uv_00.*ai_001_001"):
+        HyperSim(root)
+    write_table(root, {"ai_099_009": TILTED})
+    with pytest.raises(ValueError, match=r"camera_parameters\.csv: no row for ai_001_001"):
+        HyperSim(root)
+    table.unlink()
+    with pytest.raises(FileNotFoundError, match=r"camera_parameters\.csv.*contrib/mikeroberts3000"):
+        HyperSim(root)
+
+
+def test_damaged_keyframes_and_units_are_named(root: Path):
+    detail = root / "ai_001_001/_detail"
+    write_array(detail / "cam_00/camera_keyframe_positions.hdf5", np.zeros((3, 3)))
+    with pytest.raises(ValueError, match=r"positions\.hdf5: expected numbers of shape 4 x 3.*\(3, 3\)"):
+        HyperSim(root).num_frames("ai_001_001/cam_00")
+    write_keyframes(root / "ai_001_001", count=3)
+    with pytest.raises(ValueError, match="_detail/cam_00: expected a keyframe for each frame up to 3, got 3"):
+        HyperSim(root).num_frames("ai_001_001/cam_00")
+    write_keyframes(root / "ai_001_001")
+    write_array(detail / "cam_00/camera_keyframe_orientations.hdf5", np.stack([np.diag([1.0, 1, -1])] * 4))
+    with pytest.raises(ValueError, match="_detail/cam_00, keyframe 0: not a rigid transform"):
+        HyperSim(root).num_frames("ai_001_001/cam_00")
+    write_keyframes(root / "ai_001_001")
+    (detail / "cam_00/camera_keyframe_orientations.hdf5").write_bytes(b"\x89HDF")
+    with pytest.raises(ValueError, match=r"orientations\.hdf5: truncated or damaged"):
+        HyperSim(root).num_frames("ai_001_001/cam_00")
+    write_keyframes(root / "ai_001_001")
+    for text in ("", "parameter_name,parameter_value\nmeters_per_asset_unit,0\n", "meters_per_asset_unit,inch\n"):
+        (detail / "metadata_scene.csv").write_text(text)
+        with pytest.raises(ValueError, match=r"metadata_scene\.csv: expected a row meters_per_asset_unit"):
+            HyperSim(root).num_frames("ai_001_001/cam_00")
+
+
+def test_damaged_pictures_are_named(root: Path):
+    scenes = HyperSim(root)
+    for path, smaller in (
+        (final(root, 0), np.zeros((24, 32), np.float32)),
+        (geometry(root, 0, "depth_meters"), np.zeros((24, 32), np.float32)),
+        (geometry(root, 0, "render_entity_id"), np.zeros((24, 32), np.int16)),
+    ):
+        whole = path.read_bytes()
+        path.write_bytes(whole[:-200])
+        with pytest.raises(ValueError, match=rf"{path.name}: truncated or damaged"):
+            scenes.read("ai_001_001/cam_00", [0])
+        write_array(path, smaller)
+        with pytest.raises(ValueError, match=rf"{path.name}: expected numbers of shape .*\(24, 32\)"):
+            scenes.read("ai_001_001/cam_00", [0])
+        path.unlink()
+        with pytest.raises(FileNotFoundError, match=path.name):
+            scenes.read("ai_001_001/cam_00", [0])
+        path.write_bytes(whole)
+    assert scenes.read("ai_001_001/cam_00", [0]).depth.all()

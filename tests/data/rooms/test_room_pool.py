@@ -1,0 +1,83 @@
+"""The pool holds what `Rooms` renders, is opened rather than rendered again, and is never left half-written."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from logvggt_jax.data.rooms import pool as room_pool
+from logvggt_jax.data.rooms.pool import render_pool
+from logvggt_jax.data.rooms.rooms import Rooms
+
+ROOMS = Rooms("val", height=28, width=42, num_frames=5, num_rooms=3)
+
+
+def assert_same_frames(pool, rooms: Rooms) -> None:
+    for name in rooms.sequences:
+        expected, got = rooms.read(name, [4, 0, 2]), pool.read(name, [4, 0, 2])
+        for key in ("images", "depth", "intrinsics", "extrinsics"):
+            assert np.array_equal(getattr(expected, key), getattr(got, key)), key
+        assert got.metric and pool.frame_names(name) == rooms.frame_names(name)
+    assert pool.sequences == rooms.sequences
+
+
+def test_a_pool_in_memory_equals_rendering_on_demand():
+    pool = render_pool(ROOMS, progress=False)
+    assert_same_frames(pool, ROOMS)
+    assert_same_frames(pickle.loads(pickle.dumps(pool)), ROOMS)
+
+
+def test_what_is_read_is_a_copy():
+    pool = render_pool(ROOMS, progress=False)
+    pool.read(ROOMS.sequences[0], [0, 1]).depth[:] = -1
+    assert_same_frames(pool, ROOMS)
+
+
+def test_a_cached_pool_is_opened_not_rendered_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    assert_same_frames(render_pool(ROOMS, cache_dir=tmp_path, progress=False), ROOMS)
+    monkeypatch.setattr(room_pool, "_read_all", lambda *_: pytest.fail("rendered although cached"))
+    pool = render_pool(ROOMS, cache_dir=tmp_path, progress=False)
+    assert_same_frames(pool, ROOMS)
+    sent = pickle.dumps(pool)
+    assert len(sent) < 5000
+    assert_same_frames(pickle.loads(sent), ROOMS)
+
+
+def test_other_options_have_another_cache(tmp_path: Path):
+    render_pool(ROOMS, cache_dir=tmp_path, progress=False)
+    other = Rooms("val", height=28, width=42, num_frames=5, num_rooms=3, speed=1.5)
+    assert_same_frames(render_pool(other, cache_dir=tmp_path, progress=False), other)
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_an_interrupted_rendering_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def interrupted(rooms: Rooms, sequence: str):
+        if sequence == rooms.sequences[1]:
+            raise KeyboardInterrupt
+        return rooms.read(sequence, range(5))
+
+    monkeypatch.setattr(room_pool, "_read_all", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        render_pool(ROOMS, cache_dir=tmp_path, progress=False)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_damaged_cache_is_named(tmp_path: Path):
+    folder = render_pool(ROOMS, cache_dir=tmp_path, progress=False).folder
+    with (folder / "depth.npy").open("r+b") as file:
+        file.truncate(1000)
+    with pytest.raises(ValueError, match=r"depth\.npy.*delete"):
+        render_pool(ROOMS, cache_dir=tmp_path, progress=False)
+
+
+def test_a_pool_too_large_for_memory_is_refused():
+    with pytest.raises(ValueError, match="max_bytes"):
+        render_pool(Rooms("train", num_frames=1000))
+
+
+def test_worker_processes_render_the_same(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(room_pool, "_SERIAL_PIXELS", 0)
+    assert_same_frames(render_pool(ROOMS, workers=2, progress=False), ROOMS)

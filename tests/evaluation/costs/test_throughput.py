@@ -1,0 +1,80 @@
+"""Timings of whole sequences: what is run, what is kept, what cannot be run; how fast is no test's business."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from logvggt_jax import LogVGGT, ModelConfig
+from logvggt_jax.evaluation.costs import throughput
+from logvggt_jax.evaluation.costs.parts import PARTS
+from logvggt_jax.evaluation.costs.throughput import TimingConfig, measured_timings, random_pictures, time_stream
+from logvggt_jax.evaluation.methods.method import ClipPrediction, Method, PredictionError
+from logvggt_jax.evaluation.settings import BenchmarkRun
+
+SETTING = {"longer_edge": 42, "identity": "parameters"}
+
+
+def short_only(images: np.ndarray) -> ClipPrediction:
+    if len(images) > 5:
+        raise PredictionError("too long")
+    return ClipPrediction(None, np.zeros((len(images), 3, 4)), None)
+
+
+def test_every_row_is_timed_once_and_kept(
+    small_config: ModelConfig, small_variables: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, references = LogVGGT(small_config), [Method("short only", "nothing", short_only)]
+    config = TimingConfig(lengths=(7, 5), rounds=2)
+    report = measured_timings(model, small_variables, references, config, tmp_path, **SETTING)
+    assert report["image_size"] == [28, 42] and report["lengths"] == [5, 7] and report["part_frames"] == 7
+    rates = dict(report["frames_per_second"])
+    assert rates.pop("short only")["7"] == "too long"
+    assert len(rates) == 3 and all("GCCR" in name for name in rates)
+    for by_length in rates.values():
+        assert set(by_length) == {"5", "7"}
+        assert all(len(values) == 2 and min(values) > 0 for values in by_length.values())
+    assert [part["name"] for part in report["parts"]] == list(PARTS)
+    assert all(part["seconds"] > 0 for part in report["parts"])
+    assert json.loads((tmp_path / "timings.json").read_text()) == report
+
+    def again(*_: object) -> None:
+        raise AssertionError("measured again")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(throughput, "time_stream", again)
+        assert measured_timings(model, small_variables, references, config, tmp_path, **SETTING) == report
+        for changed in ({"longer_edge": 56}, {"identity": "others"}):
+            with pytest.raises(AssertionError, match="measured again"):
+                measured_timings(model, small_variables, references, config, tmp_path, **{**SETTING, **changed})
+        (tmp_path / "timings.json").write_text("{")
+        with pytest.raises(AssertionError, match="measured again"):
+            measured_timings(model, small_variables, references, config, tmp_path, **SETTING)
+
+
+def test_a_stream_is_timed_from_its_first_frame_to_its_cameras(
+    small_config: ModelConfig, small_variables: dict[str, Any]
+) -> None:
+    run = time_stream(LogVGGT(small_config), small_variables, random_pictures((28, 42)), 9, watch=True)
+    assert 0 < run.first_result < run.seconds and run.live_bytes > 0
+    # Windows end with frames 4, 6 and 8; the last frame waits for the end.
+    assert len(run.steps) == 3 and sum(run.steps) < run.seconds
+
+
+@pytest.mark.parametrize(
+    ("timings", "message"),
+    [
+        ({"lengths": (0,)}, "timings.lengths must be numbers of frames, 1 or more each"),
+        ({"rounds": 0}, "timings.rounds must be at least 1, got 0"),
+        ({"length": (5,)}, "unknown field timings.length"),
+    ],
+)
+def test_wrong_settings_are_named(timings: dict[str, Any], message: str) -> None:
+    protocol = {"longer_edge": 42}
+    values = {"title": "t", "benchmarks": ("*",), "baselines": False, "protocol": protocol, "timings": timings}
+    with pytest.raises(ValueError, match=message):
+        BenchmarkRun.from_dict(values)

@@ -1,0 +1,95 @@
+"""Ablation variants: the models they claim to be, on one checkpoint, with shared windows."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from logvggt_jax import LogVGGT, ModelConfig, WindowConfig
+from logvggt_jax.evaluation.methods import variants as module
+from logvggt_jax.evaluation.methods.method import ClipPrediction
+from logvggt_jax.evaluation.methods.variants import VARIANTS, variant_methods
+
+FRAMES = 9
+IMAGES = np.random.default_rng(0).integers(0, 256, (FRAMES, 28, 42, 3), np.uint8)
+NAMES = ("full", "gccr_online", "no_cwa")
+
+
+@pytest.fixture(scope="module")
+def predictions(small_config: ModelConfig, small_variables: dict) -> dict[str, ClipPrediction]:
+    methods = variant_methods(LogVGGT(small_config), small_variables, NAMES)
+    return {method.name: method.predict(IMAGES) for method in methods}
+
+
+def test_each_variant_comes_with_both_trunks(predictions: dict[str, ClipPrediction]) -> None:
+    labels = [VARIANTS[name].label for name in NAMES]
+    assert list(predictions) == [f"{label}, trunk {trunk}" for label in labels for trunk in ("all", "4")]
+
+
+def test_a_variant_is_the_model_of_its_configuration(
+    predictions: dict[str, ClipPrediction], small_config: ModelConfig, small_variables: dict
+) -> None:
+    settings = dataclasses.replace(small_config.refinement, period=2, context=4)
+    model = LogVGGT(dataclasses.replace(small_config, refinement=settings))
+    expected = jax.jit(model.apply)(small_variables, IMAGES[None])
+    prediction = predictions["GCCR online, trunk 4"]
+    np.testing.assert_allclose(prediction.depth, expected.depth[0], rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(prediction.extrinsics, expected.extrinsics[0], rtol=1e-3, atol=1e-3)
+
+
+def test_variants_differ_where_they_should(predictions: dict[str, ClipPrediction]) -> None:
+    full = predictions["full, trunk all"]
+    assert full.depth is not None
+    for name, prediction in predictions.items():
+        assert prediction.depth is not None
+        same_depth = np.array_equal(prediction.depth, full.depth)
+        assert same_depth == (not name.startswith("w/o CWA")), name
+        if name != "full, trunk all":
+            assert np.abs(prediction.extrinsics - full.extrinsics).max() > 1e-5, name
+
+
+def test_windows_run_once_for_all_refinements(
+    small_config: ModelConfig, small_variables: dict, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runs = []
+    original = module.stream_windows
+    monkeypatch.setattr(module, "stream_windows", lambda model, *rest: runs.append(model) or original(model, *rest))
+    methods = variant_methods(LogVGGT(small_config), small_variables, ("full", "no_gccr", "no_cwa"))
+    for _ in range(2):
+        images = IMAGES.copy()
+        predictions = {method.name: method.predict(images) for method in methods}
+    assert np.abs(predictions["w/o GCCR, trunk 4"].extrinsics - predictions["full, trunk 4"].extrinsics).max() > 1e-5
+    assert [model.config.windows.cross_window for model in runs] == [True, False] * 2
+
+
+def test_the_same_model_has_one_row(small_config: ModelConfig, small_variables: dict) -> None:
+    base = LogVGGT(dataclasses.replace(small_config, windows=WindowConfig(4, 2, cache="input")))
+    names = ("full", "cache_input", "cache_output", "windows_4_2")
+    rows = [method.name for method in variant_methods(base, small_variables, names)]
+    assert rows == ["full, trunk all", "full, trunk 4", "cache of outputs, trunk all", "cache of outputs, trunk 4"]
+
+
+def test_the_checkpoint_is_ablated_from_the_full_model(small_config: ModelConfig) -> None:
+    """Whatever a checkpoint was trained as, `full` has all parts, and refines once."""
+    settings = dataclasses.replace(small_config.refinement, enabled=False, period=50, context=8)
+    base = dataclasses.replace(small_config, refinement=settings, windows=WindowConfig(6, 3, cross_window=False))
+    full = VARIANTS["full"].config(base, limited_trunk=False)
+    assert full.windows == WindowConfig(6, 3)
+    assert full.refinement == small_config.refinement
+    assert VARIANTS["gccr_online"].config(base, limited_trunk=True).refinement.period == 3
+    assert VARIANTS["windows_8_4"].config(base, limited_trunk=True).refinement.context == 8
+    assert VARIANTS["gccr_every_50"].config(base, limited_trunk=False).refinement.period == 50
+
+
+def test_every_variant_is_a_valid_model() -> None:
+    configs = {VARIANTS[name].config(ModelConfig(), limited_trunk=limited) for name in VARIANTS for limited in (0, 1)}
+    # cache_output and windows_4_2 are the full model at the paper's configuration.
+    assert len(configs) == 2 * (len(VARIANTS) - 2)
+
+
+def test_an_unknown_variant_is_named(small_config: ModelConfig, small_variables: dict) -> None:
+    with pytest.raises(ValueError, match="unknown 'no_gcrc'; known are full, no_gccr"):
+        variant_methods(LogVGGT(small_config), small_variables, ("full", "no_gcrc"))

@@ -1,0 +1,212 @@
+"""What is written can be read back, appears whole or not at all, and follows its format."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from logvggt_jax.files import atomic_file, output_folder
+from logvggt_jax.geometry import camera_centres, invert, quaternion_to_matrix, rotation_angle
+from logvggt_jax.reconstruction.depth_files import (
+    as_stored,
+    depth_picture,
+    read_depth,
+    write_depth,
+    write_picture,
+)
+from logvggt_jax.reconstruction.room_sequence import write_room_sequence
+from logvggt_jax.reconstruction.trajectory_files import (
+    read_cameras,
+    read_trajectory,
+    write_cameras,
+    write_trajectory,
+)
+
+
+def random_extrinsics(count: int) -> np.ndarray:
+    generator = np.random.default_rng(0)
+    rotation = quaternion_to_matrix(generator.standard_normal((count, 4)))
+    return np.concatenate([rotation, generator.standard_normal((count, 3, 1))], axis=2)
+
+
+def test_trajectory_round_trip_and_format(tmp_path: Path) -> None:
+    extrinsics = random_extrinsics(20)
+    timestamps = np.arange(20) / 30.0
+    write_trajectory(tmp_path / "t.txt", timestamps, extrinsics)
+    times, poses = read_trajectory(tmp_path / "t.txt")
+    np.testing.assert_allclose(times, timestamps, atol=1e-6)
+    np.testing.assert_allclose(poses[:, :3, 3], extrinsics[:, :3, 3], atol=1e-7)
+    assert rotation_angle(poses[:, :3, :3], extrinsics[:, :3, :3]).max() < 1e-7
+    # Columns: position of the camera in the world, then the camera-to-world quaternion, scalar last.
+    row = np.array((tmp_path / "t.txt").read_text().splitlines()[1].split(), float)
+    np.testing.assert_allclose(row[1:4], camera_centres(extrinsics)[0], atol=1e-7)
+    np.testing.assert_allclose(quaternion_to_matrix(row[4:]), extrinsics[0, :3, :3].T, atol=1e-7)
+
+
+def test_trajectory_refuses_what_it_cannot_mean(tmp_path: Path) -> None:
+    extrinsics = random_extrinsics(3)
+    with pytest.raises(ValueError, match="2 time stamps for 3 poses"):
+        write_trajectory(tmp_path / "t.txt", [0, 1], extrinsics)
+    extrinsics[1, 0, 3] = np.nan
+    with pytest.raises(ValueError, match="pose 1 is not finite"):
+        write_trajectory(tmp_path / "t.txt", [0, 1, 2], extrinsics)
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "bad.txt").write_text("# comment\n0 1 2 3 0 0 0 1\n1 2 3\n")
+    with pytest.raises(ValueError, match=r"bad\.txt:3: expected 8 numbers"):
+        read_trajectory(tmp_path / "bad.txt")
+
+
+def test_cameras_round_trip(tmp_path: Path) -> None:
+    extrinsics = random_extrinsics(4)
+    intrinsics = np.tile(np.array([[500.0, 0, 320], [0, 510, 240], [0, 0, 1]]), (4, 1, 1))
+    write_cameras(
+        tmp_path / "cameras.json",
+        names=["a", "b", "c", "d"],
+        timestamps=[0.0, 0.5, 1.0, 1.5],
+        extrinsics=extrinsics,
+        intrinsics=intrinsics,
+        image_size=(480, 640),
+        model_intrinsics=intrinsics / 2,
+        model_size=(240, 320),
+    )
+    cameras = read_cameras(tmp_path / "cameras.json")
+    assert cameras["image_size"] == [480, 640]
+    assert [frame["name"] for frame in cameras["frames"]] == ["a", "b", "c", "d"]
+    np.testing.assert_array_equal([frame["extrinsics"] for frame in cameras["frames"]], extrinsics)
+    np.testing.assert_array_equal([frame["depth_intrinsics"] for frame in cameras["frames"]], intrinsics / 2)
+
+
+@pytest.mark.parametrize("content", ["{", "[]", "{}", json.dumps({"format": "other", "frames": []})])
+def test_other_files_are_no_cameras(tmp_path: Path, content: str) -> None:
+    (tmp_path / "cameras.json").write_text(content)
+    with pytest.raises(ValueError, match=r"cameras\.json"):
+        read_cameras(tmp_path / "cameras.json")
+    with pytest.raises(FileNotFoundError, match="logvggt reconstruct"):
+        read_cameras(tmp_path / "none.json")
+
+
+def test_depth_comes_back_as_announced(tmp_path: Path) -> None:
+    generator = np.random.default_rng(0)
+    depth = generator.uniform(0.1, 50, (6, 8)).astype(np.float32)
+    confidence = 1 + np.exp(generator.uniform(-5, 20, (6, 8)).astype(np.float32))
+    write_depth(tmp_path / "d.npz", depth, confidence)
+    read, read_confidence = read_depth(tmp_path / "d.npz")
+    assert read.dtype == read_confidence.dtype == np.float32
+    np.testing.assert_allclose(read, depth, rtol=5e-4)
+    assert np.isfinite(read_confidence).all()
+    stored, stored_confidence = as_stored(depth, confidence)
+    np.testing.assert_array_equal(read, stored)
+    np.testing.assert_array_equal(read_confidence, stored_confidence)
+
+
+def test_depth_picture_is_brighter_when_nearer_and_black_where_invalid(tmp_path: Path) -> None:
+    depth = np.array([[0.0, 1.0, 2.0, 4.0, np.nan]], np.float32)
+    picture = depth_picture(depth, near=1.0, far=5.0)
+    brightness = picture[0].astype(int).sum(1)
+    assert brightness[0] == brightness[4] == 0
+    assert brightness[1] > brightness[2] > brightness[3]
+    write_picture(tmp_path / "p.png", picture)
+    np.testing.assert_array_equal(cv2.imread(str(tmp_path / "p.png"))[..., ::-1], picture)
+
+
+def test_a_file_appears_whole_or_not_at_all(tmp_path: Path) -> None:
+    path = tmp_path / "f.txt"
+    path.write_text("old")
+    with pytest.raises(RuntimeError), atomic_file(path) as temporary:
+        temporary.write_text("half")
+        raise RuntimeError
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_folder_appears_whole_or_not_at_all(tmp_path: Path) -> None:
+    target = tmp_path / "deep" / "out"
+    with pytest.raises(KeyboardInterrupt), output_folder(target, overwrite=False, marker="done") as folder:
+        (folder / "done").touch()
+        raise KeyboardInterrupt
+    assert list((tmp_path / "deep").iterdir()) == []
+    with output_folder(target, overwrite=False, marker="done") as folder:
+        assert not target.exists()
+        (folder / "done").write_text("1")
+    assert (target / "done").read_text() == "1"
+    assert list((tmp_path / "deep").iterdir()) == [target]
+
+
+def test_only_results_are_overwritten_and_only_when_asked(tmp_path: Path) -> None:
+    target = tmp_path / "out"
+    target.mkdir()
+    (target / "thesis.tex").write_text("years of work")
+    for overwrite in (False, True):
+        with (
+            pytest.raises(FileExistsError, match=str(target)),
+            output_folder(target, overwrite=overwrite, marker="done"),
+        ):
+            pass
+    (target / "done").touch()
+    with pytest.raises(RuntimeError), output_folder(target, overwrite=True, marker="done"):
+        raise RuntimeError
+    assert (target / "thesis.tex").exists()
+    with output_folder(target, overwrite=True, marker="done") as folder:
+        (folder / "new").touch()
+    assert [path.name for path in target.iterdir()] == ["new"]
+    assert list(tmp_path.iterdir()) == [target]
+
+
+def test_a_folder_that_cannot_be_replaced_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    target = tmp_path / "out"
+    target.mkdir()
+    (target / "done").write_text("old")
+    original = Path.rename
+
+    def refuse(self: Path, new: Path) -> Path:
+        if self.name == "out.partial":
+            raise PermissionError(f"{self} is in use")
+        return original(self, new)
+
+    monkeypatch.setattr(Path, "rename", refuse)
+    with pytest.raises(PermissionError), output_folder(target, overwrite=True, marker="done") as folder:
+        (folder / "done").write_text("new")
+    assert (target / "done").read_text() == "old"
+    assert list(tmp_path.iterdir()) == [target]
+
+
+def test_two_runs_do_not_write_into_one_folder(tmp_path: Path) -> None:
+    with (
+        output_folder(tmp_path / "out", overwrite=False, marker="done"),
+        pytest.raises(FileExistsError, match=r"out\.partial exists"),
+        output_folder(tmp_path / "out", overwrite=False, marker="done"),
+    ):
+        pass
+    assert (tmp_path / "out").is_dir()
+
+
+def test_room_sequence_has_consistent_depth_poses_and_intrinsics(tmp_path: Path) -> None:
+    folder = write_room_sequence(tmp_path / "room", num_frames=3, image_size=(48, 64), seed=3, progress=False)
+    names = sorted(path.name for path in folder.iterdir())
+    assert names == sorted(
+        [f"frame-00000{i}.{kind}" for i in range(3) for kind in ("color.png", "depth.proj.png", "pose.txt")]
+        + ["intrinsics.txt"]
+    )
+    intrinsics = np.loadtxt(folder / "intrinsics.txt")
+    colours = [cv2.imread(str(folder / f"frame-00000{i}.color.png")).astype(float) for i in range(3)]
+    depths = [cv2.imread(str(folder / f"frame-00000{i}.depth.proj.png"), cv2.IMREAD_UNCHANGED) for i in range(3)]
+    poses = [np.loadtxt(folder / f"frame-00000{i}.pose.txt") for i in range(3)]
+    assert depths[0].dtype == np.uint16
+    # A pixel's point, carried into the next camera, lies at that camera's depth and shows the same colour.
+    v, u = np.mgrid[0:48, 0:64]
+    depth = depths[0] / 1000.0
+    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(intrinsics).T
+    points = rays.reshape(-1, 3) * depth.reshape(-1, 1)
+    moved = invert(poses[1])[:3] @ poses[0] @ np.concatenate([points, np.ones((len(points), 1))], 1).T
+    pixels = (intrinsics @ moved)[:2] / moved[2]
+    column, row = np.rint(pixels).astype(int)
+    inside = (column >= 0) & (column < 64) & (row >= 0) & (row < 48)
+    difference = np.abs(depths[1][row[inside], column[inside]] / 1000.0 - moved[2][inside])
+    assert inside.mean() > 0.5
+    assert np.median(difference) < 0.02
+    shown = np.abs(colours[1][row[inside], column[inside]] - colours[0].reshape(-1, 3)[inside]).mean(1)
+    assert np.median(shown) < np.abs(colours[1] - colours[0].mean((0, 1))).mean() / 3

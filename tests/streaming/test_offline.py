@@ -1,0 +1,74 @@
+"""Plain VGGT made of the model's parts: no window, no memory, the same numbers in pieces."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from logvggt_jax import LogVGGT, ModelConfig, WindowConfig
+from logvggt_jax.model import logvggt as module
+from logvggt_jax.streaming.chunks import ChunkChain, ChunkPlan
+from logvggt_jax.streaming.offline import ChunkPrediction, plain_vggt, predict_plain
+
+FRAMES = 6
+IMAGES = np.random.default_rng(0).integers(0, 256, (FRAMES, 28, 42, 3), np.uint8)
+
+
+@pytest.fixture(scope="module")
+def whole(small_config: ModelConfig, small_variables: dict) -> ChunkPrediction:
+    return predict_plain(LogVGGT(small_config), small_variables, IMAGES)
+
+
+def test_one_window_over_all_frames_whatever_its_stride(
+    small_config: ModelConfig, small_variables: dict, whole: ChunkPrediction
+) -> None:
+    model = LogVGGT(dataclasses.replace(small_config, windows=WindowConfig(FRAMES, FRAMES - 1)))
+    predictions = jax.jit(model.apply)(small_variables, IMAGES[None])
+    np.testing.assert_allclose(whole.depth, predictions.depth[0], rtol=2e-4, atol=2e-4)
+    np.testing.assert_allclose(whole.extrinsics, predictions.extrinsics[0], rtol=2e-4, atol=2e-4)
+
+
+def test_every_frame_sees_every_other(small_config: ModelConfig, small_variables: dict, whole: ChunkPrediction) -> None:
+    changed = IMAGES.copy()
+    changed[-1] = 255 - changed[-1]
+    other = predict_plain(LogVGGT(small_config), small_variables, changed)
+    assert np.abs(other.depth[0] - whole.depth[0]).max() > 1e-4
+
+
+def test_limited_trunk_and_periods_are_the_streams_not_vggts(small_config: ModelConfig) -> None:
+    settings = dataclasses.replace(small_config.refinement, period=2, context=4)
+    model = LogVGGT(dataclasses.replace(small_config, refinement=settings))
+    assert plain_vggt(model, 7) == plain_vggt(LogVGGT(small_config), 7)
+
+
+def test_one_frame_alone(small_config: ModelConfig, small_variables: dict) -> None:
+    """A window of four frames holds it, so that the model is plain VGGT itself."""
+    plain = predict_plain(LogVGGT(small_config), small_variables, IMAGES[:1])
+    predictions = jax.jit(LogVGGT(small_config).apply)(small_variables, IMAGES[None, :1])
+    np.testing.assert_allclose(plain.depth, predictions.depth[0], rtol=2e-4, atol=2e-4)
+    np.testing.assert_allclose(plain.extrinsics, predictions.extrinsics[0], rtol=2e-4, atol=2e-4)
+
+
+@pytest.mark.parametrize("size", [FRAMES, FRAMES + 3])
+def test_a_chunk_as_long_as_the_sequence_is_plain_vggt(
+    small_config: ModelConfig, small_variables: dict, whole: ChunkPrediction, size: int
+) -> None:
+    chain = ChunkChain(lambda chunk: predict_plain(LogVGGT(small_config), small_variables, chunk), ChunkPlan(size, 2))
+    parts = [part for image in IMAGES if (part := chain.push(image)) is not None]
+    last = chain.close()
+    assert last is not None
+    fields = zip(*(part[:4] for part in (*parts, last)), strict=True)
+    for actual, expected in zip(fields, whole, strict=False):
+        np.testing.assert_array_equal(np.concatenate(actual), expected)
+
+
+def test_dense_heads_in_groups_give_the_same(
+    small_config: ModelConfig, small_variables: dict, whole: ChunkPrediction, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_DENSE_PIXELS", 2 * 28 * 42)
+    predictions = jax.jit(plain_vggt(LogVGGT(small_config), FRAMES).apply)(small_variables, IMAGES[None])
+    np.testing.assert_allclose(predictions.depth[0], whole.depth, rtol=2e-4, atol=2e-4)
+    np.testing.assert_allclose(predictions.depth_confidence[0], whole.depth_confidence, rtol=2e-4, atol=2e-4)

@@ -1,0 +1,230 @@
+"""A stream gives the numbers of the whole sequence, in every mode, at constant state."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from logvggt_jax import LogVGGT, ModelConfig, Predictions, RefinementConfig, WindowConfig
+from logvggt_jax.streaming import windows as session_module
+from logvggt_jax.streaming.windows import FrameResult, StreamSession
+
+HEIGHT, WIDTH = 28, 42
+LENGTHS = np.tri(13, dtype=bool)  # frame masks of 1, 2 … 13 frames
+
+
+@pytest.fixture(scope="module")
+def frames() -> np.ndarray:
+    return np.random.default_rng(1).integers(0, 256, (13, HEIGHT, WIDTH, 3), np.uint8)
+
+
+def with_modes(config: ModelConfig, *, size: int = 4, stride: int = 2, **refinement: object) -> LogVGGT:
+    return LogVGGT(
+        dataclasses.replace(
+            config,
+            windows=WindowConfig(size=size, stride=stride),
+            refinement=RefinementConfig(num_heads=2, **refinement),  # type: ignore[arg-type]
+        )
+    )
+
+
+def stream(session: StreamSession, frames: np.ndarray) -> list[FrameResult]:
+    results = [result for frame in frames for result in session.push(frame)]
+    return results + session.close()
+
+
+@pytest.fixture(scope="module")
+def whole(small_config: ModelConfig, small_variables: dict, frames: np.ndarray) -> Predictions:
+    """`model.apply` on the first 1, 2 … 13 frames, as one batch."""
+    images = np.repeat(frames[None], len(frames), axis=0)
+    return jax.device_get(jax.jit(with_modes(small_config).apply)(small_variables, images, LENGTHS))
+
+
+def assert_equals_whole(
+    model: LogVGGT, variables: dict, frames: np.ndarray, whole: Predictions, counts: list[int], **options: int
+) -> None:
+    """Streams of `counts` frames give the depth in `whole` and the poses that the model's mode makes of its tokens."""
+    rows = np.array(counts) - 1
+    expected = jax.jit(model.refine_sequence)(
+        variables, whole.camera_tokens[rows], whole.register_tokens[rows], LENGTHS[rows]
+    )
+    for count, encodings in zip(counts, expected, strict=True):
+        session = StreamSession(model, variables, **options)
+        results = stream(session, frames[:count])
+        assert [result.index for result in results] == list(range(count))
+        depth, confidence = whole.depth[count - 1], whole.depth_confidence[count - 1]
+        np.testing.assert_allclose([r.depth for r in results], depth[:count], rtol=2e-5, atol=2e-5)
+        np.testing.assert_allclose([r.confidence for r in results], confidence[:count], rtol=2e-5, atol=2e-5)
+        cameras = session.cameras()
+        assert cameras.is_final.all()
+        np.testing.assert_allclose(cameras.pose_encoding, encodings[:count, -1], rtol=1e-4, atol=2e-5)
+
+
+def test_stream_equals_apply_for_every_length(
+    small_config: ModelConfig, small_variables: dict, frames: np.ndarray, whole: Predictions
+) -> None:
+    for count in range(1, 14):
+        session = StreamSession(with_modes(small_config), small_variables, chunk=16)
+        results = stream(session, frames[:count])
+        assert [result.index for result in results] == list(range(count))
+        expected = jax.tree.map(lambda x, row=count - 1, stop=count: x[row, :stop], whole)
+        np.testing.assert_allclose([r.depth for r in results], expected.depth, rtol=2e-5, atol=2e-5)
+        np.testing.assert_allclose([r.confidence for r in results], expected.depth_confidence, rtol=2e-5, atol=2e-5)
+        cameras = session.cameras()
+        np.testing.assert_allclose(cameras.pose_encoding, expected.pose_encoding, rtol=1e-4, atol=2e-5)
+        np.testing.assert_allclose(cameras.extrinsics, expected.extrinsics, rtol=1e-4, atol=5e-5)
+
+
+@pytest.mark.parametrize(
+    "mode",
+    [
+        {"enabled": False},
+        {"period": 2},
+        {"period": 5},
+        {"period": 50},
+        {"context": 4},
+        {"period": 2, "context": 3},
+        {"period": 5, "context": 4},
+        {"period": 3, "enabled": False, "context": 2},
+    ],
+    ids=str,
+)
+def test_stream_equals_whole_in_every_refinement_mode(
+    small_config: ModelConfig, small_variables: dict, frames: np.ndarray, whole: Predictions, mode: dict
+) -> None:
+    model = with_modes(small_config, **mode)
+    assert_equals_whole(model, small_variables, frames, whole, [1, 4, 6, 10, 13], chunk=16)
+
+
+@pytest.mark.slow
+def test_stream_equals_whole_with_other_windows(
+    small_config: ModelConfig, small_variables: dict, frames: np.ndarray
+) -> None:
+    model = with_modes(small_config, size=5, stride=2, period=3)
+    expected = jax.jit(model.apply)(small_variables, frames[None, :8])
+    session = StreamSession(model, small_variables, chunk=16)
+    results = stream(session, frames[:8])
+    np.testing.assert_allclose([r.depth for r in results], expected.depth[0], rtol=2e-5, atol=2e-5)
+    np.testing.assert_allclose(session.cameras().pose_encoding, expected.pose_encoding[0], rtol=1e-4, atol=2e-5)
+
+
+def test_buffers_that_grow_on_the_way_change_nothing(
+    small_config: ModelConfig, small_variables: dict, frames: np.ndarray, whole: Predictions
+) -> None:
+    model = with_modes(small_config, period=5)
+    assert_equals_whole(model, small_variables, frames, whole, [13], chunk=8)
+
+
+def test_frames_in_any_grouping(small_config: ModelConfig, small_variables: dict, frames: np.ndarray) -> None:
+    model = with_modes(small_config)
+    one_by_one = StreamSession(model, small_variables, chunk=16)
+    expected = stream(one_by_one, frames)
+    grouped = StreamSession(model, small_variables, chunk=16)
+    results = grouped.push(frames[:1]) + grouped.push(frames[1:8]) + grouped.push(frames[8:])
+    results += grouped.close()
+    np.testing.assert_array_equal([r.depth for r in results], [r.depth for r in expected])
+    np.testing.assert_array_equal(grouped.cameras().pose_encoding, one_by_one.cameras().pose_encoding)
+
+
+def test_depth_comes_as_soon_as_its_last_window_is_done(
+    small_config: ModelConfig, small_variables: dict, frames: np.ndarray
+) -> None:
+    session = StreamSession(with_modes(small_config), small_variables, chunk=16)
+    final = [len(session.push(frame)) for frame in frames[:9]]
+    assert final == [0, 0, 0, 2, 0, 2, 0, 2, 0]
+    assert len(session.close()) == 3
+    assert session.close() == []
+
+
+def test_online_poses_are_final_with_the_depth_and_never_move(
+    small_config: ModelConfig, small_variables: dict, frames: np.ndarray
+) -> None:
+    session = StreamSession(with_modes(small_config, period=2), small_variables, chunk=16)
+    results = stream(session, frames)
+    assert all(result.pose_is_final for result in results)
+    np.testing.assert_array_equal(
+        np.stack([result.pose_encoding for result in results]), session.cameras().pose_encoding
+    )
+
+
+@pytest.mark.parametrize("mode", [{}, {"period": 4}], ids=str)
+def test_provisional_poses_are_those_of_a_stream_that_ends_there(
+    small_config: ModelConfig, small_variables: dict, frames: np.ndarray, whole: Predictions, mode: dict
+) -> None:
+    model = with_modes(small_config, **mode)
+    refine = jax.jit(model.refine_sequence)
+    session = StreamSession(model, small_variables, chunk=16, provisional=True)
+    results = session.push(frames[:8])
+    assert len(results) == 6
+    assert results[-1].pose_encoding is not None
+    assert not results[-1].pose_is_final
+    provisional = session.cameras(provisional=True)
+    frozen = mode.get("period", 0)
+    assert provisional.is_final.tolist() == [True] * frozen + [False] * (6 - frozen)
+    assert len(session.cameras().is_final) == frozen
+    # The tokens at hand, those of frames whose last window is done, refined as a sequence of their own.
+    tokens, registers = whole.camera_tokens[7:8], whole.register_tokens[7:8]
+    expected = refine(small_variables, tokens, registers, np.arange(13)[None] < 6)
+    np.testing.assert_allclose(provisional.pose_encoding, expected[0, :6, -1], rtol=1e-4, atol=2e-5)
+    # Asking must not change what follows.
+    rest = session.push(frames[8:]) + session.close()
+    assert len(rest) == 7
+    expected = refine(small_variables, whole.camera_tokens[12:], whole.register_tokens[12:], LENGTHS[12:])
+    np.testing.assert_allclose(session.cameras().pose_encoding, expected[0, :, -1], rtol=1e-4, atol=2e-5)
+
+
+def test_nothing_compiles_per_frame_and_the_state_does_not_grow(
+    small_config: ModelConfig, small_variables: dict
+) -> None:
+    model = with_modes(small_config, period=2, context=3)
+    session = StreamSession(model, small_variables, chunk=64)
+    frame = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    session.push(np.stack([frame] * 8))
+
+    def compiled() -> list[int]:
+        programs = (session_module._step, session_module._fire)
+        return [program._cache_size() for program in programs]
+
+    def state_bytes() -> int:
+        return sum(leaf.nbytes for leaf in jax.tree.leaves(session._state))
+
+    before, size, capacity = compiled(), state_bytes(), session._store.capacity
+    for _ in range(40):
+        session.push(frame)
+    assert compiled() == before
+    assert state_bytes() == size
+    assert session._store.capacity == capacity == 64
+    assert len(session._pending) < 2
+
+
+def test_an_empty_stream_has_no_frames(small_config: ModelConfig, small_variables: dict) -> None:
+    session = StreamSession(with_modes(small_config), small_variables, chunk=16)
+    assert session.close() == []
+    assert session.cameras().extrinsics.shape == (0, 3, 4)
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        (np.zeros((30, 42, 3), np.float32), "multiples of 14"),
+        (np.zeros((28, 42), np.float32), r"\[n, H, W, 3\]"),
+        (np.zeros((28, 42, 3), np.int32), "int32"),
+        (np.zeros((42, 28, 3), np.float32), "alike"),
+        (np.zeros((28, 42, 3), np.uint8), "alike"),
+    ],
+)
+def test_bad_frames_are_named(small_config: ModelConfig, small_variables: dict, bad: np.ndarray, message: str) -> None:
+    session = StreamSession(with_modes(small_config), small_variables, chunk=16)
+    session.push(np.zeros((28, 42, 3), np.float32))
+    with pytest.raises(ValueError, match=message):
+        session.push(bad)
+
+
+def test_a_closed_session_takes_no_frames(small_config: ModelConfig, small_variables: dict) -> None:
+    session = StreamSession(with_modes(small_config), small_variables, chunk=16)
+    session.close()
+    with pytest.raises(ValueError, match="closed"):
+        session.push(np.zeros((28, 42, 3), np.float32))
