@@ -40,9 +40,8 @@ from logvggt_jax.reconstruction.point_cloud import (
 )
 from logvggt_jax.reconstruction.sources import Source, open_source, read_ahead
 from logvggt_jax.reconstruction.trajectory_files import write_cameras, write_trajectory
-from logvggt_jax.streaming.chunk_session import ChunkSession
-from logvggt_jax.streaming.chunks import ChunkPlan
-from logvggt_jax.streaming.windows import Cameras, FrameResult, StreamSession
+from logvggt_jax.streaming import Cameras, FrameResult, StreamSession
+from logvggt_jax.streaming.chunks import ChunkPlan, ChunkSession
 
 CAMERAS_FILE = "cameras.json"
 TRAJECTORY_FILE = "trajectory.txt"
