@@ -12,8 +12,9 @@ from logvggt_jax.config import ModelConfig
 from logvggt_jax.geometry.pose_encoding import decode_poses
 from logvggt_jax.model.checks import check_images, checked_mask
 from logvggt_jax.model.cross_window import CrossWindowMemory
+from logvggt_jax.model.parameters import Variables
 from logvggt_jax.model.refinement import Refinement
-from logvggt_jax.model.windows import Variables, Windows, WindowState
+from logvggt_jax.model.windows import Windows, WindowState
 from logvggt_jax.types import Predictions, WindowOutput
 
 __all__ = ["LogVGGT", "Variables"]

@@ -7,7 +7,6 @@ only one: `LogVGGT.apply` loops over it, streams call it when it is due, and ope
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,8 +15,7 @@ from logvggt_jax.config import ModelConfig
 from logvggt_jax.model.camera_head import CameraHead
 from logvggt_jax.model.checks import check_array
 from logvggt_jax.model.gccr import GCCR, RegisterKeys
-
-Variables = dict[str, Any]
+from logvggt_jax.model.parameters import Variables, run
 
 
 def num_triggers(num_frames: int, period: int | None) -> int:
@@ -210,7 +208,7 @@ class Refinement:
         """
         width, registers = self._width, self.config.aggregator.num_registers
         check_array("register_tokens", register_tokens, (None, None, registers, width), jnp.floating)
-        return self.gccr.apply(_params(variables, "gccr"), register_tokens, method=GCCR.project)
+        return run(self.gccr, variables["params"]["gccr"], register_tokens, method=GCCR.project)
 
     def attend_registers(
         self, variables: Variables, camera_tokens: jax.Array, registers: RegisterKeys, frames: jax.Array
@@ -222,7 +220,7 @@ class Refinement:
         check_array("camera_tokens", camera_tokens, (len(registers.key), None, self._width), jnp.floating)
         if frames.ndim != 1:
             check_array("register_mask", frames, registers.key.shape[:2], jnp.bool_)
-        return self.gccr.apply(_params(variables, "gccr"), camera_tokens, registers, frames, method=GCCR.attend)
+        return run(self.gccr, variables["params"]["gccr"], camera_tokens, registers, frames, method=GCCR.attend)
 
     def decode_cameras(self, variables: Variables, camera_tokens: jax.Array, frames: jax.Array) -> jax.Array:
         """Camera head alone: refined tokens [B, N, 2C] -> pose encodings [B, N, R, 9].
@@ -232,7 +230,7 @@ class Refinement:
         check_array("camera_tokens", camera_tokens, (None, None, self._width), jnp.floating)
         if frames.ndim != 1:
             check_array("camera_mask", frames, camera_tokens.shape[:2], jnp.bool_)
-        return self.camera_head.apply(_params(variables, "camera_head"), camera_tokens, frames)
+        return run(self.camera_head, variables["params"]["camera_head"], camera_tokens, frames)
 
     @property
     def camera_head(self) -> CameraHead:
@@ -245,7 +243,3 @@ class Refinement:
     @property
     def _width(self) -> int:
         return 2 * self.config.encoder.embed_dim
-
-
-def _params(variables: Variables, name: str) -> Variables:
-    return {"params": variables["params"][name]}

@@ -18,9 +18,8 @@ from logvggt_jax.model.checks import check_images, checked_mask
 from logvggt_jax.model.cross_window import CrossWindowMemory
 from logvggt_jax.model.dinov2 import DinoV2
 from logvggt_jax.model.dpt_head import DPTHead, depth_activation, point_activation
+from logvggt_jax.model.parameters import Variables, run
 from logvggt_jax.types import WindowOutput
-
-Variables = dict[str, Any]
 
 _PATCH_TOKENS = "patch_tokens"
 # Pixels that a dense head takes at once, about 8 frames of 518 x 518: its maps are the model's largest.
@@ -225,7 +224,7 @@ class Windows:
             # At the source: nothing of the encoder's pass is then kept for a backward pass.
             params = jax.lax.stop_gradient(params)
         pixels = jnp.asarray(images, jnp.float32) / (255.0 if images.dtype == jnp.uint8 else 1.0)
-        tokens = self.encoder.apply({"params": params}, pixels.reshape(-1, *images.shape[2:]))
+        tokens = run(self.encoder, params, pixels.reshape(-1, *images.shape[2:]))
         return checkpoint_name(tokens.reshape(*images.shape[:2], *tokens.shape[1:]), _PATCH_TOKENS)
 
     def attend(
@@ -240,9 +239,15 @@ class Windows:
           window_mask: bool [B, K], True … True False … False.
         """
         is_first = state.step == 0
-        params = {"params": variables["params"]["aggregator"]}
-        tokens, _ = self.aggregator.apply(
-            params, patch_tokens, window_mask.sum(1), is_first, self._memory(state), grid=self.grid(state.image_size)
+        params = variables["params"]["aggregator"]
+        tokens, _ = run(
+            self.aggregator,
+            params,
+            patch_tokens,
+            window_mask.sum(1),
+            is_first,
+            self._memory(state),
+            grid=self.grid(state.image_size),
         )
         return tokens
 
@@ -264,7 +269,7 @@ class Windows:
 
         def dense(head: DPTHead, name: str) -> jax.Array:
             def frames(levels: list[jax.Array]) -> jax.Array:
-                return head.apply({"params": params[name]}, levels, grid=grid, image_size=image_size)
+                return run(head, params[name], levels, grid=grid, image_size=image_size)
 
             raw = _in_groups(frames, levels, max(1, _DENSE_PIXELS // math.prod(image_size)))
             return raw.reshape(batch, count, *raw.shape[1:])
