@@ -15,17 +15,19 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from logvggt_jax.errors import InputError, one_line
+
 if TYPE_CHECKING:
     from logvggt_jax.streaming.chunks import ChunkPlan
 
-BAD_INPUT, FAILURE, INTERRUPTED = 2, 1, 130
+BAD_INPUT, INTERRUPTED = 2, 130
 PROBLEMS_FOUND = 1
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command line and returns the exit code: 0, 2 for bad input, 1 for any other failure.
+    """Runs the command line and returns the exit code: 0, 2 for bad input; `data check` 1 where it found problems.
 
-    `data check` also returns 1 where it found problems.
+    Any exception but InputError is a fault of this package and passes through with its traceback.
 
     Args:
       arguments: without the program's name; default `sys.argv[1:]`.
@@ -39,12 +41,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("logvggt: interrupted; nothing half-written is left", file=sys.stderr)
         return INTERRUPTED
-    except Exception as error:
+    except InputError as error:
         if options.traceback:
             traceback.print_exc()
-        bad_input = isinstance(error, ValueError | OSError | ImportError)
-        print(f"logvggt: error: {_one_line(error, named=not bad_input)}", file=sys.stderr)
-        return BAD_INPUT if bad_input else FAILURE
+        print(f"logvggt: error: {one_line(error)}", file=sys.stderr)
+        return BAD_INPUT
 
 
 def _convert(options: argparse.Namespace) -> None:
@@ -103,7 +104,7 @@ def _chunks(options: argparse.Namespace) -> ChunkPlan | None:
         return ChunkPlan(size, size // 2 if options.chunk_overlap is None else options.chunk_overlap)
     for name, value in given.items():
         if value is not None:
-            raise ValueError(f"{name} needs --mode chunks")
+            raise InputError(f"{name} needs --mode chunks")
     return None
 
 
@@ -379,11 +380,6 @@ def _with_dashes(arguments: Sequence[str]) -> list[str]:
             argument = name.replace("_", "-") + equals + value
         result.append(argument)
     return result
-
-
-def _one_line(error: Exception, *, named: bool) -> str:
-    text = " ".join(str(error).split()) or type(error).__name__
-    return f"{type(error).__name__}: {text} (--traceback shows where)" if named else text
 
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:

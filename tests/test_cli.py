@@ -215,14 +215,26 @@ def test_traceback_only_when_asked(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "Traceback" in capsys.readouterr().err
 
 
-def test_failures_that_are_no_bad_input_exit_with_1(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(*_: object) -> None:
-        raise RuntimeError("out of\nmemory")
+def test_a_fault_of_our_own_keeps_its_traceback() -> None:
+    """Only InputError becomes a line: a ValueError is a bug, whatever it says."""
+    program = """
+import sys
+from logvggt_jax.cli import main
+from logvggt_jax.weights import checkpoints
+def load_model(path):
+    raise ValueError("operands could not be broadcast")
+checkpoints.load_model = load_model
+sys.exit(main(["info", "x"]))
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 1
+    assert done.stderr.startswith("Traceback") and "operands could not be broadcast" in done.stderr
+    assert "logvggt: error" not in done.stderr
 
-    monkeypatch.setattr("logvggt_jax.weights.checkpoints.load_model", fail)
-    assert_fails(capsys, ["info", "x"], "RuntimeError: out of memory", "--traceback", code=1)
+
+def test_what_the_disk_refuses_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").touch()
+    assert_fails(capsys, ["render-room", "--output", str(tmp_path / "file" / "room")], "file/room", "Not a directory")
 
 
 def test_compilation_cache_follows_flag_environment_and_user_folder(

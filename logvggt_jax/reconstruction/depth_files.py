@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from logvggt_jax.errors import InputError, disk_errors, one_line
 from logvggt_jax.files import atomic_file
 
 
@@ -30,8 +32,12 @@ def write_depth(path: str | Path, depth: np.ndarray, confidence: np.ndarray) -> 
 
 def read_depth(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     """Depth and confidence, [H, W] float32, of a file that `write_depth` has written."""
-    with np.load(path, allow_pickle=False) as arrays:
-        return arrays["depth"].astype(np.float32), arrays["confidence"].astype(np.float32)
+    with disk_errors(path), Path(path).open("rb") as stream:
+        try:
+            with np.load(stream, allow_pickle=False) as arrays:
+                return arrays["depth"].astype(np.float32), arrays["confidence"].astype(np.float32)
+        except (zipfile.BadZipFile, EOFError, KeyError, ValueError, TypeError) as error:
+            raise InputError(f"{path}: no depth file of this program, or damaged: {one_line(error)}") from error
 
 
 def depth_picture(depth: np.ndarray, *, near: float, far: float) -> np.ndarray:

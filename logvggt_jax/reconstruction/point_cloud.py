@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from logvggt_jax.errors import InputError
 from logvggt_jax.files import atomic_file
 from logvggt_jax.geometry import unproject
 
@@ -41,13 +42,13 @@ class PointFilter:
 
     def __post_init__(self) -> None:
         if not 0 <= self.confidence_percentile < 100:
-            raise ValueError(f"confidence_percentile must be in [0, 100), got {self.confidence_percentile}")
+            raise InputError(f"confidence_percentile must be in [0, 100), got {self.confidence_percentile}")
         if self.edge_threshold is not None and not self.edge_threshold > 0:
-            raise ValueError(f"edge_threshold must be above 0, got {self.edge_threshold}")
+            raise InputError(f"edge_threshold must be above 0, got {self.edge_threshold}")
         if self.pixel_stride < 1:
-            raise ValueError(f"pixel_stride must be at least 1 pixel, got {self.pixel_stride}")
+            raise InputError(f"pixel_stride must be at least 1 pixel, got {self.pixel_stride}")
         if self.max_points is not None and self.max_points < 1:
-            raise ValueError(f"max_points must be at least 1, got {self.max_points}")
+            raise InputError(f"max_points must be at least 1, got {self.max_points}")
 
     def candidates(self, depth: np.ndarray, confidence: np.ndarray) -> np.ndarray:
         """Pixels of a depth map [H, W] that may become points, whatever the threshold; bool [H, W]."""

@@ -22,6 +22,7 @@ from rich.progress import (
 from rich.text import Text
 
 from logvggt_jax.data.feeding.transforms import ResizeTransform, preprocess
+from logvggt_jax.errors import InputError
 from logvggt_jax.files import atomic_folder, check_output
 from logvggt_jax.geometry import decode_poses
 from logvggt_jax.model.logvggt import LogVGGT, Variables
@@ -101,7 +102,7 @@ def check_request(
     """
     source = open_source(source_path, stride=stride, max_frames=max_frames)
     if Path(output).expanduser().resolve() in (source.path.resolve(), *source.path.resolve().parents):
-        raise ValueError(f"output {output} contains the source {source.path}: choose another output")
+        raise InputError(f"output {output} contains the source {source.path}: choose another output")
     check_output(output, overwrite=overwrite, marker=CAMERAS_FILE)
     return source
 
@@ -150,7 +151,7 @@ def reconstruct(
     """
     point_filter = point_filter or PointFilter()
     if num_previews < 0:
-        raise ValueError(f"num_previews must not be negative, got {num_previews}")
+        raise InputError(f"num_previews must not be negative, got {num_previews}")
     source = check_request(source_path, output, stride=stride, max_frames=max_frames, overwrite=overwrite)
     target = Path(output).expanduser().resolve()
     with (
@@ -240,7 +241,7 @@ def _stream(
         save(session.push(picture.image))
     save(session.close())
     if transform is None:
-        raise ValueError(f"{source.path} gave no frame")
+        raise InputError(f"{source.path} gave no frame")
     bars.update(task, total=len(names))
     return _Sequence(names, timestamps, transform), session.cameras()
 
@@ -288,7 +289,7 @@ def _vertices(
     index = 0
     for picture in read_ahead(_pictures(source, longer_edge)):
         if index >= len(sequence.names) or picture.name != sequence.names[index]:
-            raise ValueError(f"{source.path} changed while it was read: frame {picture.name} is new")
+            raise InputError(f"{source.path} changed while it was read: frame {picture.name} is new")
         depth, confidence = read_depth(_depth_file(folder, picture.name))
         if index in previews:
             _write_preview(folder / PREVIEW_FOLDER / f"{picture.name}.png", picture.image, depth)
@@ -297,7 +298,7 @@ def _vertices(
         bars.advance(task)
         index += 1
     if index < len(sequence.names):
-        raise ValueError(f"{source.path} changed while it was read: frame {sequence.names[index]} is gone")
+        raise InputError(f"{source.path} changed while it was read: frame {sequence.names[index]} is gone")
 
 
 def _write_preview(path: Path, image: np.ndarray, depth: np.ndarray) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from logvggt_jax.errors import InputError, MissingInput, disk_errors
 from logvggt_jax.files import write_text
 from logvggt_jax.geometry import (
     as_matrix,
@@ -52,7 +53,9 @@ def read_trajectory(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
       ValueError: a line does not hold 8 numbers; names file and line.
     """
     rows = []
-    for number, line in enumerate(Path(path).read_text().splitlines(), start=1):
+    with disk_errors(path):
+        text = Path(path).read_text()
+    for number, line in enumerate(text.splitlines(), start=1):
         fields = line.split("#", 1)[0].split()
         if not fields:
             continue
@@ -61,7 +64,7 @@ def read_trajectory(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
         except ValueError:
             row = []
         if len(row) != 8:
-            raise ValueError(f"{path}:{number}: expected 8 numbers (timestamp tx ty tz qx qy qz qw), got {line!r}")
+            raise InputError(f"{path}:{number}: expected 8 numbers (timestamp tx ty tz qx qy qz qw), got {line!r}")
         rows.append(row)
     values = np.array(rows, np.float64).reshape(-1, 8)
     poses = np.concatenate([quaternion_to_matrix(values[:, 4:]), values[:, 1:4, None]], axis=2)
@@ -123,15 +126,16 @@ def read_cameras(path: str | Path) -> dict[str, Any]:
     """
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"{path} does not exist: expected the output of `logvggt reconstruct`")
+        raise MissingInput(f"{path} does not exist: expected the output of `logvggt reconstruct`")
     try:
-        document = json.loads(path.read_text())
+        with disk_errors(path):
+            document = json.loads(path.read_text())
         known = document["format"] == CAMERAS_FORMAT
         for frame in document["frames"]:
             for key in ("extrinsics", "intrinsics", "depth_intrinsics"):
                 frame[key] = np.array(frame[key], np.float64)
     except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path} is not a cameras file of this program: {error!r}") from None
+        raise InputError(f"{path} is not a cameras file of this program: {error!r}") from None
     if not known:
-        raise ValueError(f"{path} has format {document['format']!r}, expected {CAMERAS_FORMAT!r}")
+        raise InputError(f"{path} has format {document['format']!r}, expected {CAMERAS_FORMAT!r}")
     return document

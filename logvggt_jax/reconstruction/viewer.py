@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from logvggt_jax.errors import MissingInput, MissingPackage
 from logvggt_jax.geometry import camera_centres, matrix_to_quaternion
 from logvggt_jax.reconstruction.reconstruct import CAMERAS_FILE, POINTS_FILE
 from logvggt_jax.reconstruction.trajectory_files import read_cameras
@@ -32,7 +33,7 @@ def open_viewer(folder: str | Path, *, port: int = 8080) -> Any:
     try:
         import viser
     except ImportError as error:
-        raise ImportError('the viewer needs viser: pip install "logvggt-jax[viewer]"') from error
+        raise MissingPackage('the viewer needs viser: pip install "logvggt-jax[viewer]"') from error
 
     extrinsics = np.stack([frame["extrinsics"] for frame in cameras["frames"]])
     centres = camera_centres(extrinsics)
@@ -76,7 +77,7 @@ def read_points(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     from plyfile import PlyData
 
     if not Path(path).is_file():
-        raise FileNotFoundError(f"{path} does not exist: expected the output of `logvggt reconstruct`")
+        raise MissingInput(f"{path} does not exist: expected the output of `logvggt reconstruct`")
     vertices = PlyData.read(str(path))["vertex"].data
     points = np.stack([vertices[name] for name in "xyz"], axis=-1)
     return points, np.stack([vertices[name] for name in ("red", "green", "blue")], axis=-1)

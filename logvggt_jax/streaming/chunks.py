@@ -14,6 +14,7 @@ from collections.abc import Callable
 import jax
 import numpy as np
 
+from logvggt_jax.errors import InputError
 from logvggt_jax.geometry import Similarity, robust_similarity, unproject
 from logvggt_jax.streaming.offline import ChunkPrediction
 
@@ -38,9 +39,9 @@ class ChunkPlan:
         for name in ("size", "overlap"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise ValueError(f"chunk {name} must be a whole number of at least 1 frame, got {value!r}")
+                raise InputError(f"chunk {name} must be a whole number of at least 1 frame, got {value!r}")
         if not self.overlap < self.size:
-            raise ValueError(
+            raise InputError(
                 f"chunk overlap must be at least 1 frame and below the chunk size {self.size}, got {self.overlap}: "
                 "neighbours are aligned by the frames they share, and each has to add some"
             )
@@ -103,7 +104,7 @@ class ChunkChain:
         try:
             similarity = align(jax.tree.map(lambda x: x[:shared], chunk), self._shared)
         except ValueError as error:
-            raise ValueError(
+            raise InputError(
                 f"the chunk from frame {self._first} to {self._first + len(self._images) - 1} cannot be aligned with "
                 f"the one before on the {shared} frames they share ({error}); take larger chunks with more overlap"
             ) from error

@@ -25,7 +25,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from logvggt_jax.config import ModelConfig
-from logvggt_jax.errors import disk_errors
+from logvggt_jax.errors import InputError, MissingInput, OutputExists, disk_errors
 from logvggt_jax.files import atomic_folder
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.weights.files import open_state_dict
@@ -69,9 +69,9 @@ def verify_digests(tree: Any, expected: dict[str, str], where: str) -> None:
     for name in sorted(found.keys() | expected.keys()):
         if name not in found or name not in expected:
             which = "is not in the checkpoint" if name not in found else "has no digest"
-            raise ValueError(f"{where}: leaf {name} {which}; {_MEND}")
+            raise InputError(f"{where}: leaf {name} {which}; {_MEND}")
         if found[name] != expected[name]:
-            raise ValueError(
+            raise InputError(
                 f"{where}: leaf {name} differs from its digest ({found[name]}, expected {expected[name]}); {_MEND}"
             )
 
@@ -111,8 +111,8 @@ def check_destination(path: Path) -> None:
         return
     try:
         _read_description(path)
-    except (FileNotFoundError, ValueError) as error:
-        raise FileExistsError(f"{path}: exists and is not a model folder; give another path or remove it") from error
+    except InputError as error:
+        raise OutputExists(f"{path}: exists and is not a model folder; give another path or remove it") from error
 
 
 def load_model(path: str | Path) -> tuple[LogVGGT, dict[str, Any]]:
@@ -134,7 +134,7 @@ def load_model(path: str | Path) -> tuple[LogVGGT, dict[str, Any]]:
     try:
         config = ModelConfig.from_dict(description["config"])
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{path / 'config.json'}: {error}; written by another version of this package?") from error
+        raise InputError(f"{path / 'config.json'}: {error}; written by another version of this package?") from error
     model = LogVGGT(config)
     params = _restore(path / "params", parameter_shapes(config))
     verify_digests(params, description["digests"], str(path))
@@ -162,7 +162,7 @@ def from_pretrained(
     if path.is_dir() and _is_model_folder(path):
         model, variables = load_model(path)
         if point_head and model.config.point_head is None:
-            raise ValueError(f"{path}: the model has no point head; convert VGGT with point_head, or leave it out")
+            raise InputError(f"{path}: the model has no point head; convert VGGT with point_head, or leave it out")
     else:
         with open_state_dict(path) as state_dict, _naming(path):
             config = config_from_vggt(state_dict, point_head=point_head)
@@ -245,29 +245,30 @@ def _is_model_folder(path: Path) -> bool:
 def _read_description(path: Path) -> dict[str, Any]:
     file = path / "config.json"
     if not file.is_file():
-        raise FileNotFoundError(
+        raise MissingInput(
             f"{file}: no such file, so the folder is not a model's; give one made by `logvggt convert` or training"
         )
     try:
-        description = json.loads(file.read_text())
-    except ValueError as error:
-        raise ValueError(f"{file}: not valid JSON ({error}); {_MEND}") from error
+        with disk_errors(file):
+            description = json.loads(file.read_text())
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{file}: not valid JSON ({error}); {_MEND}") from error
     if not isinstance(description, dict) or description.get("format") != FORMAT:
-        raise ValueError(f"{file}: not the description of a model of this package (format {FORMAT!r})")
+        raise InputError(f"{file}: not the description of a model of this package (format {FORMAT!r})")
     if description.get("version") != VERSION:
-        raise ValueError(
+        raise InputError(
             f"{file}: format version {description.get('version')!r}, this package reads {VERSION}; "
             "use the version of logvggt-jax that wrote it"
         )
     if not all(isinstance(description.get(part), dict) for part in ("config", "digests")):
-        raise ValueError(f"{file}: config or digests are missing; {_MEND}")
+        raise InputError(f"{file}: config or digests are missing; {_MEND}")
     return description
 
 
 def _restore(path: Path, target: Any) -> Any:
     """Parameters in the shapes and placement of `target`, after a check that these are the stored shapes."""
     if not path.is_dir():
-        raise FileNotFoundError(f"{path}: the parameters are missing; {_MEND}")
+        raise MissingInput(f"{path}: the parameters are missing; {_MEND}")
     try:
         with _checkpointer() as checkpointer:
             stored = checkpointer.metadata(path).item_metadata
@@ -281,10 +282,10 @@ def _restore(path: Path, target: Any) -> Any:
     except Exception as error:
         # Orbax raises bare Exception, among others, for truncated and missing files.
         reason = " ".join(str(error).split())
-        raise ValueError(f"{path}: cannot be read ({type(error).__name__}: {reason:.200}); {_MEND}") from error
+        raise InputError(f"{path}: cannot be read ({type(error).__name__}: {reason:.200}); {_MEND}") from error
 
 
-class _OtherModelError(ValueError):
+class _OtherModelError(InputError):
     """The stored parameters are not those of the configuration."""
 
 
@@ -302,7 +303,7 @@ def _naming(path: Path) -> Iterator[None]:
     """Puts the file's path before errors that know only the tensor."""
     try:
         yield
-    except ValueError as error:
+    except InputError as error:
         if str(error).startswith(str(path)):
             raise
-        raise ValueError(f"{path}: {error}") from error
+        raise InputError(f"{path}: {error}") from error

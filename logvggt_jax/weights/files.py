@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import safetensors
 
+from logvggt_jax.errors import InputError, MissingInput, disk_errors
 from logvggt_jax.weights.lazy import LazyTensors
 from logvggt_jax.weights.torch_zip import open_torch_zip
 
@@ -27,11 +28,11 @@ def find_weights(path: Path) -> Path:
         for name in WEIGHT_FILES:
             if (path / name).is_file():
                 return path / name
-        raise FileNotFoundError(f"{path}: the folder holds no {' or '.join(WEIGHT_FILES)}; give the file itself")
+        raise MissingInput(f"{path}: the folder holds no {' or '.join(WEIGHT_FILES)}; give the file itself")
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file or folder; give a checkpoint file or the folder that holds it")
+        raise MissingInput(f"{path}: no such file or folder; give a checkpoint file or the folder that holds it")
     if path.suffix not in (".safetensors", ".pt"):
-        raise ValueError(f"{path}: unknown suffix {path.suffix!r}; expected a .safetensors or .pt checkpoint")
+        raise InputError(f"{path}: unknown suffix {path.suffix!r}; expected a .safetensors or .pt checkpoint")
     return path
 
 
@@ -55,10 +56,11 @@ def open_state_dict(path: str | Path) -> AbstractContextManager[Mapping[str, np.
 @contextmanager
 def _open_safetensors(path: Path) -> Iterator[Mapping[str, np.ndarray]]:
     try:
-        opened = safetensors.safe_open(path, framework="numpy")
+        with disk_errors(path):
+            opened = safetensors.safe_open(path, framework="numpy")
     except safetensors.SafetensorError as error:
         reason = " ".join(str(error).split())
-        raise ValueError(
+        raise InputError(
             f"{path}: not a readable safetensors file ({reason}); it is damaged or truncated, copy or download it again"
         ) from error
     with opened as file:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from logvggt_jax.errors import MissingInput, MissingPackage
 from logvggt_jax.weights.files import WEIGHT_FILES
 
 _REPOSITORY = re.compile(r"[\w-][\w.-]*/[\w-][\w.-]*")
@@ -25,7 +26,7 @@ def resolve(path_or_repo: str | Path) -> Path:
     name = str(path_or_repo)
     if _REPOSITORY.fullmatch(name) and not name.endswith((".safetensors", ".pt")):
         return download(name)
-    raise FileNotFoundError(
+    raise MissingInput(
         f"{path}: no such file or folder; give a checkpoint file, its folder, or a hub repository as owner/name"
     )
 
@@ -48,7 +49,7 @@ def download(repository: str) -> Path:
         import huggingface_hub
         from huggingface_hub import errors
     except ImportError as error:
-        raise ImportError(
+        raise MissingPackage(
             f"{repository}: reading from the hub needs huggingface_hub; "
             'pip install "logvggt-jax[hub]" or download the file and give its path'
         ) from error
@@ -56,15 +57,15 @@ def download(repository: str) -> Path:
         try:
             return Path(huggingface_hub.hf_hub_download(repository, name))
         except errors.RepositoryNotFoundError as error:  # a gated repository raises a subclass
-            raise FileNotFoundError(
+            raise MissingInput(
                 f"{repository}: no such repository on the hub, or it needs a login; check the name, "
                 "accept its licence on its page and run `hf auth login`"
             ) from error
         except errors.LocalEntryNotFoundError as error:
-            raise FileNotFoundError(
+            raise MissingInput(
                 f"{repository}: the hub cannot be reached and its cache on this machine has no {name}; "
                 "connect, or download the file elsewhere and give its path"
             ) from error
         except errors.RemoteEntryNotFoundError:
             continue
-    raise FileNotFoundError(f"{repository}: the repository holds no {' or '.join(WEIGHT_FILES)}; give a file's path")
+    raise MissingInput(f"{repository}: the repository holds no {' or '.join(WEIGHT_FILES)}; give a file's path")
