@@ -13,6 +13,8 @@ from typing import Any
 
 import jax.numpy as jnp
 
+from logvggt_jax.errors import InputError
+
 ATTENTION_IMPLEMENTATIONS = ("auto", "xla", "cudnn", "tpu_flash")
 
 
@@ -50,7 +52,10 @@ class EncoderConfig:
 
     def __post_init__(self) -> None:
         _positive(self, "embed_dim", "depth", "num_heads", "mlp_ratio", "num_registers", "position_grid")
-        _positive(self, "patch_size")
+        if self.patch_size != 14:
+            raise InputError(
+                f"EncoderConfig.patch_size must be 14, as VGGT's and all resizing here, got {self.patch_size!r}"
+            )
         _divides(self, self.embed_dim, self.num_heads, 1, "one slice of channels a head")
 
 

@@ -1,6 +1,6 @@
 """Model folders: parameters in Orbax's format, and beside them the configuration and a digest of every leaf.
 
-    <folder>/config.json   format version, ModelConfig, digests, versions of the libraries that wrote it
+    <folder>/config.json   format version, ModelConfig, provenance, digests, versions of the libraries that wrote it
     <folder>/params/       Orbax
 
 Orbax restores flipped bytes without complaint; the digests find them.
@@ -29,8 +29,9 @@ from logvggt_jax.errors import InputError, MissingInput, OutputExists, disk_erro
 from logvggt_jax.files import atomic_folder
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.weights.files import open_state_dict
-from logvggt_jax.weights.hub import resolve
+from logvggt_jax.weights.hub import licence, resolve
 from logvggt_jax.weights.lazy import LazyTensors
+from logvggt_jax.weights.provenance import Provenance
 from logvggt_jax.weights.vggt import (
     ConversionReport,
     config_from_vggt,
@@ -41,6 +42,8 @@ from logvggt_jax.weights.vggt import (
 
 FORMAT = "logvggt-jax model"
 VERSION = 1
+_UNKNOWN = Provenance()
+_VGGT_LONGER_EDGE = 518
 _MEND = "the checkpoint is damaged: copy or convert it again"
 
 
@@ -76,16 +79,17 @@ def verify_digests(tree: Any, expected: dict[str, str], where: str) -> None:
             )
 
 
-def save_model(path: str | Path, config: ModelConfig, params: Any) -> None:
+def save_model(path: str | Path, config: ModelConfig, params: Any, provenance: Provenance = _UNKNOWN) -> None:
     """Writes a model folder; an older model folder at `path` is replaced once the new one is complete.
 
     Args:
       path: The folder to make.
       config: Configuration of the model.
       params: Its parameter tree, `variables["params"]`.
+      provenance: What the weights were trained for and where they come from.
 
     Raises:
-      FileExistsError: `path` exists and is not a model folder.
+      OutputExists: `path` exists and is not a model folder.
     """
     path = Path(path).expanduser().absolute()
     check_destination(path)
@@ -93,6 +97,7 @@ def save_model(path: str | Path, config: ModelConfig, params: Any) -> None:
         "format": FORMAT,
         "version": VERSION,
         "config": config.to_dict(),
+        "provenance": provenance.to_dict(),
         "digests": digests(params),
         "libraries": {
             name: importlib.metadata.version(name) for name in ("logvggt-jax", "jax", "flax", "orbax-checkpoint")
@@ -141,6 +146,21 @@ def load_model(path: str | Path) -> tuple[LogVGGT, dict[str, Any]]:
     return model, {"params": params}
 
 
+def read_provenance(path_or_repo: str | Path) -> Provenance:
+    """What the weights that `from_pretrained` would read were trained for; reads no parameter.
+
+    A folder written before this was recorded gives a `Provenance` of unknowns, a VGGT checkpoint that of VGGT.
+
+    Raises:
+      InputError: As `from_pretrained`, for what can be seen without reading parameters.
+    """
+    path = resolve(path_or_repo)
+    if not (path.is_dir() and _is_model_folder(path)):
+        return _vggt_provenance(path_or_repo)
+    with _naming(path / "config.json"):
+        return Provenance.from_dict(_read_description(path).get("provenance", {}))
+
+
 def from_pretrained(
     path_or_repo: str | Path, *, dtype: str | None = None, point_head: bool = False
 ) -> tuple[LogVGGT, dict[str, Any]]:
@@ -149,8 +169,8 @@ def from_pretrained(
     VGGT-1B is converted in memory; its sizes are read off the tensors' shapes (`config_from_vggt`).
 
     Args:
-      path_or_repo: A model folder of this package; a VGGT `.safetensors` or `.pt` file or the folder that holds
-        `model.safetensors` or `model.pt`; or a hub repository such as `facebook/VGGT-1B`.
+      path_or_repo: A model folder of this package; a VGGT `.safetensors` or `.pt` file or a folder that holds one;
+        or a hub repository such as `facebook/VGGT-1B`.
       dtype: Compute type of the model, `float32` or `bfloat16`; None keeps the checkpoint's (VGGT: float32).
       point_head: Keep VGGT's point head. A model folder has it or not.
 
@@ -203,13 +223,17 @@ def convert(source: str | Path, destination: str | Path, *, point_head: bool = F
 
             params, report = params_from_vggt(LazyTensors(list(state_dict), read), config)
     with console.status("Writing the model folder"):
-        save_model(destination, config, params)
+        save_model(destination, config, params, _vggt_provenance(source))
     console.print(
         f"{path}: {len(report.used)} tensors used, {len(report.skipped)} skipped, "
         f"{len(report.initialised)} parameters initialised",
         soft_wrap=True,
     )
     return report
+
+
+def _vggt_provenance(source: str | Path) -> Provenance:
+    return Provenance("vggt", _VGGT_LONGER_EDGE, licence(source), f"VGGT checkpoint {source}")
 
 
 def _checkpointer() -> ocp.StandardCheckpointer:
