@@ -21,7 +21,7 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from logvggt_jax.data.feeding.transforms import ResizeTransform, preprocess
+from logvggt_jax.data.feeding.transforms import LONGER_EDGE, ResizeTransform, check_longer_edge, preprocess
 from logvggt_jax.errors import InputError
 from logvggt_jax.files import atomic_folder, check_output
 from logvggt_jax.geometry import decode_poses
@@ -92,6 +92,7 @@ def check_request(
     source_path: str | Path,
     output: str | Path,
     *,
+    longer_edge: int | None = None,
     stride: int = 1,
     max_frames: int | None = None,
     overwrite: bool = False,
@@ -100,6 +101,8 @@ def check_request(
 
     Arguments and errors as in `reconstruct`.
     """
+    if longer_edge is not None:
+        check_longer_edge(longer_edge)
     source = open_source(source_path, stride=stride, max_frames=max_frames)
     if Path(output).expanduser().resolve() in (source.path.resolve(), *source.path.resolve().parents):
         raise InputError(f"output {output} contains the source {source.path}: choose another output")
@@ -114,7 +117,7 @@ def reconstruct(
     model: LogVGGT,
     variables: Variables,
     chunks: ChunkPlan | None = None,
-    longer_edge: int = 518,
+    longer_edge: int = LONGER_EDGE,
     stride: int = 1,
     max_frames: int | None = None,
     point_filter: PointFilter | None = None,
@@ -152,7 +155,9 @@ def reconstruct(
     point_filter = point_filter or PointFilter()
     if num_previews < 0:
         raise InputError(f"num_previews must not be negative, got {num_previews}")
-    source = check_request(source_path, output, stride=stride, max_frames=max_frames, overwrite=overwrite)
+    source = check_request(
+        source_path, output, longer_edge=longer_edge, stride=stride, max_frames=max_frames, overwrite=overwrite
+    )
     target = Path(output).expanduser().resolve()
     with (
         atomic_folder(target, replace=overwrite) as folder,

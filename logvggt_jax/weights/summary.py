@@ -8,6 +8,7 @@ import jax
 from rich.table import Table
 
 from logvggt_jax.config import ModelConfig
+from logvggt_jax.weights.provenance import Provenance
 
 
 def model_summary(config: ModelConfig, params: dict[str, Any]) -> Table:
@@ -41,3 +42,14 @@ def model_summary(config: ModelConfig, params: dict[str, Any]) -> Table:
         table.add_row(part, f"{count:,}", f"{mebibytes:,.1f}", descriptions[part])
     table.add_row("all", f"{total:,}", f"{size:,.1f}", "", style="bold")
     return table
+
+
+def provenance_lines(provenance: Provenance) -> str:
+    """What the weights were trained for and where they come from, one line each."""
+    lines = [
+        ("trained for", {"windows": "windows (LoG-VGGT)", "vggt": "all frames at once (VGGT)"}, provenance.trained_for),
+        ("image size", {}, provenance.longer_edge and f"longer edge {provenance.longer_edge} pixels"),
+        ("licence", {}, provenance.licence),
+        ("source", {}, provenance.source),
+    ]
+    return "\n".join(f"{title}: {names.get(value, value) or 'not recorded'}" for title, names, value in lines)
