@@ -1,4 +1,4 @@
-"""Depth maps on disk, one file a frame, and pictures of them."""
+"""Depth maps and images on disk, one file a frame, and pictures of depth."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from PIL import Image
 
-from logvggt_jax.errors import InputError, disk_errors, one_line
+from logvggt_jax.errors import InputError, MissingInput, disk_errors, one_line
 from logvggt_jax.files import atomic_file
 
 
@@ -57,6 +58,28 @@ def write_picture(path: str | Path, image: np.ndarray) -> None:
         raise ValueError(f"{path}: an image of shape {image.shape} cannot be encoded as PNG")
     with atomic_file(path) as temporary:
         temporary.write_bytes(buffer.tobytes())
+
+
+def write_jpeg(path: str | Path, image: np.ndarray) -> None:
+    """Writes an RGB image [H, W, 3] uint8 as JPEG, at a quality that keeps every pixel to a few grey levels."""
+    with atomic_file(path) as temporary:
+        Image.fromarray(image).save(temporary, quality=95, subsampling=0)
+
+
+def read_picture(path: str | Path) -> np.ndarray:
+    """An image file as [H, W, 3] uint8 RGB.
+
+    Raises:
+      MissingInput: no such file.
+      InputError: it is no picture, or damaged.
+    """
+    try:
+        with Path(path).open("rb") as stream, Image.open(stream) as picture:
+            return np.asarray(picture.convert("RGB"))
+    except FileNotFoundError as error:
+        raise MissingInput(f"{path} does not exist: expected the output of `logvggt reconstruct`") from error
+    except (OSError, SyntaxError) as error:  # what Pillow raises for damaged pictures
+        raise InputError(f"{path}: cannot be read as a picture ({one_line(error)}); reconstruct again") from error
 
 
 def _half(values: np.ndarray) -> np.ndarray:

@@ -46,10 +46,12 @@ def model_summary(config: ModelConfig, params: dict[str, Any]) -> Table:
 
 def provenance_lines(provenance: Provenance) -> str:
     """What the weights were trained for and where they come from, one line each."""
-    lines = [
-        ("trained for", {"windows": "windows (LoG-VGGT)", "vggt": "all frames at once (VGGT)"}, provenance.trained_for),
-        ("image size", {}, provenance.longer_edge and f"longer edge {provenance.longer_edge} pixels"),
-        ("licence", {}, provenance.licence),
-        ("source", {}, provenance.source),
-    ]
-    return "\n".join(f"{title}: {names.get(value, value) or 'not recorded'}" for title, names, value in lines)
+    purpose = {"windows": "windows (LoG-VGGT)", "vggt": "all frames at once (VGGT)"}
+    edge = provenance.longer_edge
+    lines = {
+        "trained for": purpose.get(provenance.trained_for or ""),
+        "image size": f"longer edge {edge} pixels" if edge else None,
+        "licence": provenance.licence,
+        "source": provenance.source,
+    }
+    return "\n".join(f"{title}: {value or 'not recorded'}" for title, value in lines.items())

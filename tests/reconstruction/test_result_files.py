@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from logvggt_jax.geometry import camera_centres, invert, quaternion_to_matrix, rotation_angle
+from logvggt_jax.reconstruction.cameras_file import read_cameras, write_cameras
 from logvggt_jax.reconstruction.depth_files import (
     as_stored,
     depth_picture,
@@ -17,13 +18,8 @@ from logvggt_jax.reconstruction.depth_files import (
     write_depth,
     write_picture,
 )
+from logvggt_jax.reconstruction.exporters.tum import read_trajectory, write_trajectory
 from logvggt_jax.reconstruction.room_sequence import write_room_sequence
-from logvggt_jax.reconstruction.trajectory_files import (
-    read_cameras,
-    read_trajectory,
-    write_cameras,
-    write_trajectory,
-)
 
 
 def random_extrinsics(count: int) -> np.ndarray:
