@@ -50,8 +50,8 @@ def from_mapping(cls: type[Config], values: Any, path: str) -> Config:
     for name in values:
         if name not in fields:
             similar = difflib.get_close_matches(str(name), fields, 1)
-            guess = f", did you mean {similar[0]}?" if similar else ";"
-            raise InputError(f"unknown field {_joined(path, name)}{guess} {known}")
+            guess = f" did you mean {similar[0]}?" if similar else ""
+            raise InputError(f"unknown field {_joined(path, name)};{guess} {known}")
     for name, field in fields.items():
         optional = field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
         if name not in values and not optional:

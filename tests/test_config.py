@@ -94,7 +94,7 @@ def test_settings_survive_json() -> None:
         ({"extras": 1}, r"config\.extras must be a mapping, got 1"),
         ({"part": 1}, r"config\.part must be a mapping with the fields of Part, got 1"),
         ({"parts": {"one": 1}}, r"config\.parts\.one must be a mapping with the fields of Part, got 1"),
-        ({"parts": {"one": {"wieght": 1}}}, r"unknown field config\.parts\.one\.wieght, did you mean weight\? Part"),
+        ({"parts": {"one": {"wieght": 1}}}, r"unknown field config\.parts\.one\.wieght; did you mean weight\? Part"),
         ({"parts": {"one": {"weight": 0}}}, r"^config\.parts\.one\.weight must lie in \(0, 2\], got 0\.0"),
         ({"limit": 1.5}, r"config\.limit must be a whole number or a string, got 1\.5"),
         ({"zzz": 1}, r"unknown field config\.zzz; Settings knows count, parts, rate"),
@@ -166,7 +166,7 @@ def test_any_stride_below_the_window_is_accepted(size: int) -> None:
         (lambda: ModelConfig.from_dict({"encoder": None}), r"model\.encoder must be a mapping .*got None"),
         (
             lambda: ModelConfig.from_dict({"windows": {"sizes": 4}}),
-            r"unknown field model\.windows\.sizes, did you mean size\? WindowConfig knows size,",
+            r"unknown field model\.windows\.sizes; did you mean size\? WindowConfig knows size,",
         ),
     ],
 )
