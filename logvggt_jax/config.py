@@ -225,7 +225,8 @@ class EncoderConfig:
     frozen: bool = True
 
     def __post_init__(self) -> None:
-        require_counts(self, *(field.name for field in dataclasses.fields(self) if field.name != "frozen"))
+        require_counts(self, "embed_dim", "depth", "num_heads", "mlp_ratio", "num_registers", "position_grid")
+        require_one_of(self, (14,), "patch_size")  # images are prepared for no other
         _divides(self, self.embed_dim, self.num_heads, 1, "one slice of channels a head")
 
 

@@ -149,6 +149,7 @@ def test_any_stride_below_the_window_is_accepted(size: int) -> None:
         (lambda: EncoderConfig(depth=0), r"EncoderConfig\.depth must be a positive integer, got 0"),
         (lambda: EncoderConfig(depth=1.5), r"EncoderConfig\.depth must be a positive integer, got 1\.5"),
         (lambda: EncoderConfig(depth=True), r"EncoderConfig\.depth must be a positive integer, got True"),
+        (lambda: EncoderConfig(patch_size=16), r"EncoderConfig\.patch_size must be one of 14, got 16"),
         (lambda: EncoderConfig(num_heads=15), r"EncoderConfig\.num_heads=15 must split the width 1024"),
         (lambda: AggregatorConfig(key_layers=(4, 11, 17)), r"AggregatorConfig\.key_layers must be four"),
         (lambda: AggregatorConfig(key_layers=(4, 11, 17, 24)), r"AggregatorConfig\.key_layers must be four"),
