@@ -24,7 +24,7 @@ import orbax.checkpoint as ocp
 from rich.console import Console
 from rich.progress import Progress
 
-from logvggt_jax.config import ModelConfig
+from logvggt_jax.config import ModelConfig, from_mapping
 from logvggt_jax.errors import InputError, MissingInput, OutputExists, disk_errors
 from logvggt_jax.files import atomic_folder
 from logvggt_jax.model.logvggt import LogVGGT
@@ -97,7 +97,7 @@ def save_model(path: str | Path, config: ModelConfig, params: Any, provenance: P
         "format": FORMAT,
         "version": VERSION,
         "config": config.to_dict(),
-        "provenance": provenance.to_dict(),
+        "provenance": dataclasses.asdict(provenance),
         "digests": digests(params),
         "libraries": {
             name: importlib.metadata.version(name) for name in ("logvggt-jax", "jax", "flax", "orbax-checkpoint")
@@ -138,7 +138,7 @@ def load_model(path: str | Path) -> tuple[LogVGGT, dict[str, Any]]:
     description = _read_description(path)
     try:
         config = ModelConfig.from_dict(description["config"])
-    except (TypeError, ValueError) as error:
+    except InputError as error:
         raise InputError(f"{path / 'config.json'}: {error}; written by another version of this package?") from error
     model = LogVGGT(config)
     params = _restore(path / "params", parameter_shapes(config))
@@ -157,8 +157,9 @@ def read_provenance(path_or_repo: str | Path) -> Provenance:
     path = resolve(path_or_repo)
     if not (path.is_dir() and _is_model_folder(path)):
         return _vggt_provenance(path_or_repo)
+    description = _read_description(path)
     with _naming(path / "config.json"):
-        return Provenance.from_dict(_read_description(path).get("provenance", {}))
+        return from_mapping(Provenance, description.get("provenance", {}), "provenance")
 
 
 def from_pretrained(

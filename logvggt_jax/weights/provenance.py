@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Literal
 
+from logvggt_jax.config import require_counts
 from logvggt_jax.errors import InputError
-
-TRAINED_FOR = ("windows", "vggt")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,29 +21,12 @@ class Provenance:
       source: file, hub repository or training run, in a few words.
     """
 
-    trained_for: str | None = None
+    trained_for: Literal["windows", "vggt"] | None = None
     longer_edge: int | None = None
     licence: str | None = None
     source: str | None = None
 
     def __post_init__(self) -> None:
-        if self.trained_for not in (None, *TRAINED_FOR):
-            raise InputError(f"trained_for must be one of {', '.join(TRAINED_FOR)}, got {self.trained_for!r}")
-        edge = self.longer_edge
-        if edge is not None and (type(edge) is not int or edge < 14 or edge % 14):
-            raise InputError(f"longer_edge must be a positive multiple of 14 pixels, got {edge!r}")
-        for name in ("licence", "source"):
-            if not isinstance(getattr(self, name), str | None):
-                raise InputError(f"{name} must be a text, got {getattr(self, name)!r}")
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON types, the form that model folders store."""
-        return dataclasses.asdict(self)
-
-    @classmethod
-    def from_dict(cls, values: Any) -> Provenance:
-        """Inverse of `to_dict`; InputError for anything else."""
-        known = [field.name for field in dataclasses.fields(cls)]
-        if not isinstance(values, dict) or not set(values) <= set(known):
-            raise InputError(f"the record of the weights must have the fields {', '.join(known)}, got {values!r}")
-        return cls(**values)
+        require_counts(self, "longer_edge")
+        if self.longer_edge is not None and self.longer_edge % 14:
+            raise InputError(f"Provenance.longer_edge must be a multiple of 14 pixels, got {self.longer_edge}")

@@ -108,7 +108,7 @@ def test_a_folder_says_what_its_weights_were_trained_for(tmp_path, folder, vggt_
     _assert_same(load_model(folder)[1], small_variables)
     for wrong in ({"trained_for": "chess"}, {"longer_edge": 500}, {"author": "me"}, ["windows"]):
         _edit(folder, lambda description, wrong=wrong: description.update(provenance=wrong))
-        with pytest.raises(InputError, match=r"config\.json: \S+ .*must"):
+        with pytest.raises(InputError, match=r"config\.json: .*provenance"):
             read_provenance(folder)
 
 
