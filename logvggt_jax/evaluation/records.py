@@ -6,10 +6,11 @@ import contextlib
 import hashlib
 import json
 import math
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+from logvggt_jax.files import write_text
 
 PREDICTION = "prediction"  # the group under which a method's own failure is recorded
 
@@ -73,16 +74,6 @@ class ClipRecords:
 def record_key(*parts: Any) -> str:
     """Digest of JSON values."""
     return hashlib.blake2b(json.dumps(plain(parts), sort_keys=True).encode(), digest_size=12).hexdigest()
-
-
-def write_text(path: Path, text: str) -> None:
-    """Writes a file whole or not at all."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        temporary.write_text(text)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def plain(value: Any) -> Any:

@@ -20,7 +20,7 @@ from logvggt_jax.evaluation.environment import environment
 from logvggt_jax.evaluation.methods.method import ClipPrediction, Method
 from logvggt_jax.evaluation.progress import progress_display
 from logvggt_jax.evaluation.protocols.protocol import Protocol
-from logvggt_jax.evaluation.records import PREDICTION, ClipRecords, plain, record_key, write_text
+from logvggt_jax.evaluation.records import PREDICTION, ClipRecords, plain, record_key
 from logvggt_jax.evaluation.scores import (
     ClipScore,
     ClipTruth,
@@ -30,6 +30,7 @@ from logvggt_jax.evaluation.scores import (
     is_measured,
     prepare_truth,
 )
+from logvggt_jax.files import write_text
 
 
 @dataclasses.dataclass(frozen=True)

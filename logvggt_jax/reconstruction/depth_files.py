@@ -24,8 +24,8 @@ def write_depth(path: str | Path, depth: np.ndarray, confidence: np.ndarray) -> 
 
     Depth is z-depth in the unit of the trajectory, confidence is at least 1.
     """
-    with atomic_file(Path(path)) as temporary, temporary.open("wb") as stream:
-        np.savez(stream, depth=_half(depth), confidence=_half(confidence))
+    with atomic_file(path) as temporary:
+        np.savez(temporary, depth=_half(depth), confidence=_half(confidence))
 
 
 def read_depth(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
@@ -49,7 +49,7 @@ def write_picture(path: str | Path, image: np.ndarray) -> None:
     encoded, buffer = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
     if not encoded:
         raise ValueError(f"{path}: an image of shape {image.shape} cannot be encoded as PNG")
-    with atomic_file(Path(path)) as temporary:
+    with atomic_file(path) as temporary:
         temporary.write_bytes(buffer.tobytes())
 
 

@@ -22,7 +22,7 @@ from rich.progress import (
 from rich.text import Text
 
 from logvggt_jax.data.feeding.transforms import ResizeTransform, preprocess
-from logvggt_jax.files import check_output, output_folder
+from logvggt_jax.files import atomic_folder, check_output
 from logvggt_jax.geometry import decode_poses
 from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.reconstruction.depth_files import (
@@ -129,7 +129,7 @@ def reconstruct(
 
     Args:
       source_path: folder of images or video, see `open_source`.
-      output: folder to make; it appears when all is done, until then the work lies in `<output>.partial`.
+      output: folder to make; it appears when all is done, until then the work lies beside it in a `.partial` folder.
       model: the model.
       variables: {"params": …}.
       chunks: plain VGGT on overlapping chunks instead of the model's windows, for public VGGT weights; see
@@ -152,8 +152,9 @@ def reconstruct(
     if num_previews < 0:
         raise ValueError(f"num_previews must not be negative, got {num_previews}")
     source = check_request(source_path, output, stride=stride, max_frames=max_frames, overwrite=overwrite)
+    target = Path(output).expanduser().resolve()
     with (
-        output_folder(output, overwrite=overwrite, marker=CAMERAS_FILE) as folder,
+        atomic_folder(target, replace=overwrite) as folder,
         Progress(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -177,7 +178,6 @@ def reconstruct(
             source, folder, longer_edge, sequence, cameras.extrinsics, intrinsics, selection, previews, bars
         )
         num_points = write_point_cloud(folder / POINTS_FILE, vertices)
-    target = Path(output).expanduser().resolve()
     return Reconstruction(target, len(sequence.names), num_points, sequence.transform.size, seconds)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from logvggt_jax.files import atomic_file
+from logvggt_jax.files import write_text
 from logvggt_jax.geometry import (
     as_matrix,
     camera_centres,
@@ -42,8 +42,7 @@ def write_trajectory(path: str | Path, timestamps: Sequence[float] | np.ndarray,
         raise ValueError(f"pose {bad} is not finite: {extrinsics[bad].tolist()}")
     lines = ["# timestamp tx ty tz qx qy qz qw (camera to world, OpenCV axes)"]
     lines += [f"{row[0]:.6f} " + " ".join(f"{value:.9g}" for value in row[1:]) for row in rows]
-    with atomic_file(Path(path)) as temporary:
-        temporary.write_text("\n".join(lines) + "\n")
+    write_text(path, "\n".join(lines) + "\n")
 
 
 def read_trajectory(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
@@ -112,8 +111,7 @@ def write_cameras(
         "depth_size": list(model_size),
         "frames": frames,
     }
-    with atomic_file(Path(path)) as temporary:
-        temporary.write_text(json.dumps(document, indent=1) + "\n")
+    write_text(path, json.dumps(document, indent=1) + "\n")
 
 
 def read_cameras(path: str | Path) -> dict[str, Any]:

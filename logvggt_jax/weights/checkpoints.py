@@ -13,7 +13,6 @@ import dataclasses
 import hashlib
 import importlib.metadata
 import json
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -26,6 +25,8 @@ from rich.console import Console
 from rich.progress import Progress
 
 from logvggt_jax.config import ModelConfig
+from logvggt_jax.errors import disk_errors
+from logvggt_jax.files import atomic_folder
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.weights.files import open_state_dict
 from logvggt_jax.weights.hub import resolve
@@ -88,7 +89,6 @@ def save_model(path: str | Path, config: ModelConfig, params: Any) -> None:
     """
     path = Path(path).expanduser().absolute()
     check_destination(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     description = {
         "format": FORMAT,
         "version": VERSION,
@@ -98,21 +98,11 @@ def save_model(path: str | Path, config: ModelConfig, params: Any) -> None:
             name: importlib.metadata.version(name) for name in ("logvggt-jax", "jax", "flax", "orbax-checkpoint")
         },
     }
-    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch:
-        fresh, old = Path(scratch) / "new", Path(scratch) / "old"
-        fresh.mkdir()
+    with atomic_folder(path, replace=True) as fresh, disk_errors(path):
         with _checkpointer() as checkpointer:
             checkpointer.save(fresh / "params", jax.device_get(params))
             checkpointer.wait_until_finished()
         (fresh / "config.json").write_text(json.dumps(description, indent=2) + "\n")
-        if path.exists():
-            path.replace(old)
-        try:
-            fresh.replace(path)
-        except BaseException:  # Ctrl-C too: leaving the block removes what is in `old`
-            if old.exists():
-                old.replace(path)
-            raise
 
 
 def check_destination(path: Path) -> None:

@@ -23,11 +23,11 @@ from logvggt_jax.evaluation.methods.baselines import all_baselines, depth_statis
 from logvggt_jax.evaluation.methods.method import ClipPrediction, Method, network
 from logvggt_jax.evaluation.protocols import PointsMeasure
 from logvggt_jax.evaluation.protocols.clips import clip_protocols
-from logvggt_jax.evaluation.records import write_text
 from logvggt_jax.evaluation.report.report import print_report, tables, write_report
 from logvggt_jax.evaluation.runner import Benchmark, Clip, evaluate, plan_clips
 from logvggt_jax.evaluation.scores import ClipScore, benchmark_score, clip_score, points_at, prepare_truth
 from logvggt_jax.evaluation.settings import BenchmarkRun, EvaluationConfig, EvaluationRun, read_run
+from logvggt_jax.files import write_text
 from logvggt_jax.geometry import compose, unproject
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.types import Frames

@@ -17,7 +17,8 @@ from logvggt_jax.evaluation.costs.parts import PARTS, live_device_bytes, sequenc
 from logvggt_jax.evaluation.environment import describe_device
 from logvggt_jax.evaluation.methods.method import Method
 from logvggt_jax.evaluation.progress import progress_display
-from logvggt_jax.evaluation.records import plain, record_key, write_text
+from logvggt_jax.evaluation.records import plain, record_key
+from logvggt_jax.files import write_text
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.streaming import StreamSession
 

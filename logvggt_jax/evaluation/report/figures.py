@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from logvggt_jax.files import atomic_file
 from logvggt_jax.geometry import camera_centres, invert
 from logvggt_jax.metrics.depth import align_depth, resize_depth
 from logvggt_jax.metrics.trajectory import align_trajectory
@@ -211,9 +211,5 @@ def _figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, li
 
 def _save(figure: Any, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.png")
-    try:
+    with atomic_file(path) as temporary:
         figure.savefig(temporary, dpi=130)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
