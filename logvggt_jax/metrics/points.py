@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from logvggt_jax.errors import MissingPackage
 from logvggt_jax.metrics.depth import lower_median
 from logvggt_jax.metrics.errors import NotMeasurable
 
@@ -44,7 +45,7 @@ def point_cloud_metrics(
     Raises:
       NotMeasurable: an empty cloud, points that are not finite.
       ValueError: wrong shapes.
-      ImportError: Open3D (ICP, normals) or SciPy is not installed.
+      MissingPackage: Open3D (ICP, normals) or SciPy is not installed.
     """
     prediction, target = _cloud(prediction, "prediction"), _cloud(target, "target")
     if prediction_normals is not None:
@@ -138,7 +139,7 @@ def _nearest(points: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.nda
     try:
         from scipy.spatial import cKDTree
     except ImportError as error:
-        raise ImportError(f'nearest neighbours need SciPy ({error}): pip install "logvggt-jax[eval]"') from error
+        raise MissingPackage(f'nearest neighbours need SciPy ({error}): pip install "logvggt-jax[eval]"') from error
     return cKDTree(others).query(points)
 
 
@@ -181,4 +182,4 @@ def _open3d() -> Any:
         mend = 'pip install "logvggt-jax[eval]"'
         if ".so" in str(error):
             mend = "install that library (Debian, Ubuntu: apt install libx11-6 libgl1 libegl1 libudev1 libidn2-0)"
-        raise ImportError(f"ICP and normals need Open3D ({error}): {mend}") from error
+        raise MissingPackage(f"ICP and normals need Open3D ({error}): {mend}") from error

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from logvggt_jax.errors import MissingPackage
 from logvggt_jax.geometry import nearest_rotation, umeyama
 from logvggt_jax.metrics.errors import NotMeasurable
 from logvggt_jax.metrics.pose import checked_poses
@@ -29,7 +30,7 @@ def trajectory_errors(predicted_poses: np.ndarray, true_poses: np.ndarray) -> di
       NotMeasurable: no similarity exists (fewer than three poses, a static or a straight trajectory), or a pose is
         not finite (the frame is named). It is a ValueError.
       ValueError: lengths or shapes differ.
-      ImportError: evo is not installed.
+      MissingPackage: evo is not installed.
     """
     predicted = checked_poses(predicted_poses, "predicted_poses")
     true = checked_poses(true_poses, "true_poses")
@@ -91,4 +92,4 @@ def _evo(module: str) -> Any:
     try:
         return importlib.import_module(f"evo.core.{module}")
     except ImportError as error:
-        raise ImportError(f'trajectory errors need evo ({error}): pip install "logvggt-jax[eval]"') from error
+        raise MissingPackage(f'trajectory errors need evo ({error}): pip install "logvggt-jax[eval]"') from error
