@@ -21,7 +21,7 @@ from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.optimizer import learning_rate_schedule, make_optimizer
 from logvggt_jax.training.sharding import check_batch_size, data_mesh
 from logvggt_jax.training.state import initial_state
-from logvggt_jax.training.step import make_loss, make_train_step
+from logvggt_jax.training.step import make_loss_terms, make_train_step
 
 ROOT = Path(__file__).parents[1]
 
@@ -90,7 +90,7 @@ def test_h20_step_holds_together_on_sixteen_devices(monkeypatch: pytest.MonkeyPa
     trained = sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(modules))
     assert 2 * trained <= moments < 2 * trained + 100, "two moments for what is trained, none for the encoder"
     schedule = learning_rate_schedule(config.optimizer, config.stages)
-    step = make_train_step(make_loss(model, config.loss), optimizer, schedule, mesh)
+    step = make_train_step(make_loss_terms(model, config.loss), config.loss, optimizer, schedule, mesh)
     after, metrics = jax.eval_shape(step, state, shapes)
     assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(lambda x: (x.shape, x.dtype), state)
     assert all(value.shape == () for value in metrics.values())

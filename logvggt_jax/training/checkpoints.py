@@ -137,7 +137,7 @@ class RunCheckpoints:
             raise ValueError(f"{where} cannot be read ({type(error).__name__}: {reason:.200}); {mend}") from error
 
     def _check_configuration(self, stored: Mapping[str, Any], where: str) -> None:
-        ours = _json(self.config.to_dict())
+        ours = self.config.to_dict()
         for part in ("model", "stages", "data", "loss", "optimizer", "seed"):
             theirs = stored.get(part)
             if part == "data" and theirs is not None:
@@ -165,12 +165,6 @@ def _parts(state: TrainState) -> tuple[Any, dict[str, Any]]:
 
 def _abstract(tree: Any) -> Any:
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding), tree)
-
-
-def _json(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _json(item) for key, item in value.items()}
-    return [_json(item) for item in value] if isinstance(value, list | tuple) else value
 
 
 def _first_difference(theirs: Any, ours: Any, name: str) -> tuple[str, Any, Any] | None:

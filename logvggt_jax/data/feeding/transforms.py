@@ -220,7 +220,7 @@ def _crop(matrix: np.ndarray, source: tuple[int, int], size: tuple[int, int]) ->
             f"the principal point ({centre[0]:g}, {centre[1]:g}) lies outside the image of size {source}: "
             "correct the intrinsics"
         )
-    scale = float(max(((target + 0.5) / before).max(), ((target - 0.5) / after).max()))
+    scale = float(max(np.max((target + 0.5) / before), np.max((target - 0.5) / after)))
     left, top = (float(c) for c in centre + 0.5 - (target + 0.5) / scale)
     return scale, left, top
 

@@ -159,7 +159,7 @@ def crop_about_principal_point(
     depth = depth[top : top + 2 * half_height, left : left + 2 * half_width]
     cropped = np.array(image.shape[1::-1], np.float64)
     target = np.array(size[::-1])
-    scale = float((target / cropped).max()) + 1e-8
+    scale = float(np.max(target / cropped)) + 1e-8
     covering = np.floor(cropped * scale).astype(int)
     image = resize_image(image, (int(covering[1]), int(covering[0])))
     depth = cv2.resize(depth, (int(covering[0]), int(covering[1])), interpolation=cv2.INTER_NEAREST)
