@@ -61,6 +61,7 @@ def parse_flags(arguments: list[str]) -> list[str]:
     """Flags as absl reads them, with an unknown configuration field as one line."""
     try:
         rest = app.parse_flags_with_usage(arguments)
+        _CONFIG.value.to_dict()  # a file that cannot be loaded says so only now
     except (AttributeError, KeyError) as error:
         # The library wraps one error in the other, with quotes around quotes.
         reason = error.args[0] if error.args else error

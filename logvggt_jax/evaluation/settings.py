@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import types
-import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
+from logvggt_jax.config import from_mapping, require_counts
 from logvggt_jax.errors import InputError
 from logvggt_jax.evaluation.costs.throughput import TimingConfig
 from logvggt_jax.evaluation.methods.references import ReferenceConfig
@@ -81,9 +80,8 @@ class PaperRun(Run):
 
     def __post_init__(self) -> None:
         if not self.benchmarks:
-            raise InputError("benchmarks must name at least one, for example ('*',) or ('seven_scenes-*',)")
-        if self.max_sequences is not None and self.max_sequences < 1:
-            raise InputError(f"max_sequences must be at least 1, got {self.max_sequences}")
+            raise InputError("PaperRun.benchmarks must name at least one, for example ('*',) or ('seven_scenes-*',)")
+        require_counts(self, "max_sequences")
 
 
 def read_run(values: Mapping[str, Any]) -> ClipRun | PaperRun:
@@ -92,26 +90,4 @@ def read_run(values: Mapping[str, Any]) -> ClipRun | PaperRun:
     Raises:
       InputError: an unknown, missing or impossible field; named.
     """
-    return _from_mapping(PaperRun if "benchmarks" in values else ClipRun, values, "config")
-
-
-def _from_mapping(cls: Any, values: Any, path: str) -> Any:
-    """An instance of a dataclass from a mapping with its fields."""
-    hints = typing.get_type_hints(cls)
-    arguments = dict(values)
-    for name in values:
-        if name not in hints:
-            raise InputError(f"unknown field {path}.{name}; known are {', '.join(hints)}")
-    for field in dataclasses.fields(cls):
-        if field.name not in values:
-            if field.default is field.default_factory is dataclasses.MISSING:
-                raise InputError(f"field {path}.{field.name} is missing")
-            continue
-        value, hint = values[field.name], hints[field.name]
-        alternatives = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
-        for kind in alternatives:
-            if dataclasses.is_dataclass(kind) and isinstance(value, Mapping):
-                arguments[field.name] = _from_mapping(kind, value, f"{path}.{field.name}")
-            elif typing.get_origin(kind) is tuple and isinstance(value, Sequence):
-                arguments[field.name] = tuple(value)
-    return cls(**arguments)
+    return from_mapping(PaperRun if "benchmarks" in values else ClipRun, values, "config")

@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from logvggt_jax.config import ModelConfig
+from logvggt_jax.config import ModelConfig, require_counts
 from logvggt_jax.errors import InputError
 from logvggt_jax.evaluation.costs.parts import PARTS, live_device_bytes, sequence_parts, time_part
 from logvggt_jax.evaluation.environment import code_version, describe_device
@@ -49,9 +49,8 @@ class TimingConfig:
     def __post_init__(self) -> None:
         object.__setattr__(self, "lengths", tuple(sorted(self.lengths)))
         if any(n < 1 for n in self.lengths):
-            raise InputError(f"timings.lengths must be numbers of frames, 1 or more each, got {self.lengths}")
-        if self.rounds < 1:
-            raise InputError(f"timings.rounds must be at least 1, got {self.rounds!r}")
+            raise InputError(f"TimingConfig.lengths must be numbers of frames, 1 or more each, got {self.lengths}")
+        require_counts(self, "rounds")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,7 +8,7 @@ import functools
 import jax
 import numpy as np
 
-from logvggt_jax.errors import InputError
+from logvggt_jax.config import require_counts
 from logvggt_jax.evaluation.methods.method import Checkpoint, ClipPrediction, Method, PredictionError
 from logvggt_jax.streaming.chunks import ChunkChain, ChunkPlan
 from logvggt_jax.streaming.offline import predict_plain
@@ -30,12 +30,8 @@ class ReferenceConfig:
     chunk_overlap: int = 30
 
     def __post_init__(self) -> None:
-        if self.max_frames is not None and self.max_frames < 1:
-            raise InputError(f"references.max_frames must be at least 1 frame or None, got {self.max_frames!r}")
-        try:
-            self.plan()
-        except ValueError as error:
-            raise InputError(f"references: {error}") from error
+        require_counts(self, "max_frames")
+        self.plan()
 
     def plan(self) -> ChunkPlan:
         """The chunks; ValueError for impossible ones."""

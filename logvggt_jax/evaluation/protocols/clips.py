@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 
+from logvggt_jax.config import require_counts, require_within
 from logvggt_jax.errors import InputError
 from logvggt_jax.evaluation.protocols.frame_selection import Clips
 from logvggt_jax.evaluation.protocols.images import Fit
-from logvggt_jax.evaluation.protocols.protocol import DepthMeasure, PointsMeasure, Protocol, check_points
+from logvggt_jax.evaluation.protocols.protocol import DepthMeasure, PointsMeasure, Protocol
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,14 +38,14 @@ class ClipSettings:
     figures: int = 1
 
     def __post_init__(self) -> None:
-        if len(self.image_size) != 2 or any(side < 14 or side % 14 for side in self.image_size):
-            raise InputError(f"image_size must be (H, W), multiples of 14, got {self.image_size}")
+        if any(side < 14 or side % 14 for side in self.image_size):
+            raise InputError(f"ClipSettings.image_size must be (H, W), multiples of 14, got {self.image_size}")
         if not self.clip_lengths or any(length < 2 for length in self.clip_lengths):
-            raise InputError(f"clip_lengths must be at least one number of 2 or more frames, got {self.clip_lengths}")
-        for name in ("stride", "clips_per_sequence", "max_sequences"):
-            if (value := getattr(self, name)) is not None and value < 1:
-                raise InputError(f"{name} must be at least 1, got {value}")
-        check_points(self.max_points, self.icp_threshold)
+            raise InputError(
+                f"ClipSettings.clip_lengths must be at least one number of 2 or more frames, got {self.clip_lengths}"
+            )
+        require_counts(self, "stride", "clips_per_sequence", "max_sequences", "max_points")
+        require_within(self, "(0, inf)", "icp_threshold")
 
 
 def clip_protocols(dataset: str, split: str, settings: ClipSettings) -> list[Protocol]:

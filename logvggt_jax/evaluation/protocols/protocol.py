@@ -7,6 +7,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
+from logvggt_jax.config import require_counts, require_within
 from logvggt_jax.errors import InputError
 from logvggt_jax.evaluation.protocols.frame_selection import FrameSelection
 from logvggt_jax.evaluation.protocols.images import ImageRule
@@ -109,14 +110,6 @@ class Protocol:
         return settings
 
 
-def check_points(max_points: int | None, icp_threshold: float | None) -> None:
-    """InputError where a setting of points is out of range."""
-    if max_points is not None and max_points < 1:
-        raise InputError(f"max_points must be at least 1, or None for all, got {max_points}")
-    if icp_threshold is not None and not icp_threshold > 0:
-        raise InputError(f"icp_threshold must be positive, or None for no ICP, got {icp_threshold}")
-
-
 @dataclasses.dataclass(frozen=True)
 class ProtocolSettings:
     """What all benchmarks of the paper share (`protocol` in configs/eval/paper.py).
@@ -138,8 +131,11 @@ class ProtocolSettings:
 
     def __post_init__(self) -> None:
         if self.longer_edge < 28 or self.longer_edge % 14:
-            raise InputError(f"longer_edge must be a multiple of 14, at least 28, got {self.longer_edge!r}")
-        check_points(self.max_points, self.icp_threshold)
+            raise InputError(
+                f"ProtocolSettings.longer_edge must be a multiple of 14, at least 28, got {self.longer_edge}"
+            )
+        require_counts(self, "max_points")
+        require_within(self, "(0, inf)", "icp_threshold")
 
     @property
     def points(self) -> PointsMeasure:
