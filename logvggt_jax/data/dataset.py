@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from logvggt_jax.types import Frames
+from logvggt_jax.frames import Frames
 
 SPLITS = ("train", "val", "test", "all")
 

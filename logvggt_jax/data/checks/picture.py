@@ -11,8 +11,8 @@ import numpy as np
 
 from logvggt_jax.data.checks.report import SequenceReport
 from logvggt_jax.data.readers.folder_dataset import FolderDataset
+from logvggt_jax.frames import Frames
 from logvggt_jax.geometry import camera_centres, unproject
-from logvggt_jax.types import Frames
 
 _ARROWS = 40  # headings along a path
 _POINTS = 3000  # of a frame, in the view from above

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image
 
-from logvggt_jax.types import Frames
+from logvggt_jax.frames import Frames
 
 PATCH = 14
 _BLOCK = 32  # output rows of one product: the filter is local, so most of a full matrix is zero

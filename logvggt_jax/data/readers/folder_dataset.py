@@ -22,7 +22,7 @@ from logvggt_jax.data.dataset import check_indices, check_sequence, check_split
 from logvggt_jax.data.errors import EmptySequence, UnequalSizes
 from logvggt_jax.data.formats.calibration import check_intrinsics
 from logvggt_jax.data.formats.listing_index import ListingIndex, SourceFiles
-from logvggt_jax.types import Frames
+from logvggt_jax.frames import Frames
 
 NO_POSES = np.full((4, 4), np.nan)
 # Listings kept in memory; a set of twenty thousand sequences would fill it with all of them.

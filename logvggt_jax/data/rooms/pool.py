@@ -18,7 +18,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from logvggt_jax.data.dataset import check_indices, check_sequence
 from logvggt_jax.data.rooms.rooms import Rooms
-from logvggt_jax.types import Frames
+from logvggt_jax.frames import Frames
 
 RENDERER_VERSION = 1  # part of the cache's key; raise it whenever the same options give other frames
 _ARRAYS = ("images", "depth", "intrinsics", "extrinsics")

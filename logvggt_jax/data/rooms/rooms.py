@@ -12,7 +12,7 @@ import numpy as np
 from logvggt_jax.data.dataset import check_indices, check_sequence, check_split
 from logvggt_jax.data.rooms.layout import STYLES, Room, random_room
 from logvggt_jax.data.rooms.ray_caster import render
-from logvggt_jax.types import Frames
+from logvggt_jax.frames import Frames
 
 _DEFAULT_ROOMS = {"train": 1500, "val": 32, "test": 32}
 

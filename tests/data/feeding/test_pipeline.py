@@ -13,7 +13,7 @@ from logvggt_jax.data.feeding.augmentation import ColourAugmentation
 from logvggt_jax.data.feeding.batches import training_batches
 from logvggt_jax.data.feeding.broken_clips import TooManyBrokenClips
 from logvggt_jax.data.rooms.rooms import Rooms
-from logvggt_jax.types import Frames
+from logvggt_jax.frames import Frames
 
 
 class Numbered:
