@@ -23,6 +23,7 @@ from logvggt_jax.data.feeding.augmentation import ColourAugmentation
 from logvggt_jax.data.feeding.broken_clips import BrokenClips, describe
 from logvggt_jax.data.feeding.sampling import Sampler, example_rng, sampler_for
 from logvggt_jax.data.feeding.transforms import fit_each, nearest_size
+from logvggt_jax.errors import InputError
 
 Batch = dict[str, np.ndarray]
 Size = tuple[int, int]
@@ -61,7 +62,7 @@ class _ClipReader:
         check_frames(clip, where)
         valid = np.count_nonzero(clip.depth > 0) / clip.depth.size
         if valid < self.min_valid_depth:
-            raise ValueError(
+            raise InputError(
                 f"{where}: {valid:.2%} of the pixels have depth, min_valid_depth={self.min_valid_depth:g} asks for more"
             )
         if self.augmentation is not None:
@@ -93,7 +94,7 @@ class _ReplaceBroken:
                     broken.append(describe(error))
         names = ", ".join(dict.fromkeys(read.name for read, _ in self.streams))
         height, width = self.streams[0][0].size
-        raise ValueError(
+        raise InputError(
             f"{names}, pictures for {height} x {width}: {len(broken)} clips in a row are broken: "
             f"{'; '.join(list(dict.fromkeys(broken))[:_SHOWN])}"
         )
@@ -190,17 +191,17 @@ class BatchIterator(Iterator[Batch]):
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Continues after the examples that `state` counts.
 
-        Raises ValueError if the state is of another seed, clip or mixture, whose examples would differ.
+        Raises InputError if the state is of another seed, clip or mixture, whose examples would differ.
         """
         expected = {"examples", "broken", *self._identity}
         if set(state) != expected:
-            raise ValueError(
+            raise InputError(
                 f"data state has fields {sorted(state)}, expected {sorted(expected)}: "
                 "it was written by another version or is damaged"
             )
         for name, value in self._identity.items():
             if state[name] != value:
-                raise ValueError(
+                raise InputError(
                     f"data state was written with {name}={state[name]}, this run has {value}: "
                     "resume with the same data settings, or start a new run"
                 )
@@ -284,32 +285,32 @@ def training_batches(
       B = batch_size / process_count.
 
     Raises:
-      ValueError: an argument is out of range, or a data set has no sequence long enough. While iterating:
+      InputError: an argument is out of range, or a data set has no sequence long enough. While iterating:
         `TooManyBrokenClips`, or with max_broken=0 the error of bad data, named.
     """
     if not datasets:
         raise ValueError("no data sets given: pass a mapping from name to data set")
     if batch_size < 1 or process_count < 1 or batch_size % process_count:
-        raise ValueError(
+        raise InputError(
             f"batch_size must be a positive multiple of process_count, got {batch_size} and {process_count}"
         )
     if not 0 <= process_index < process_count:
         raise ValueError(f"process_index must lie in [0, {process_count}), got {process_index}")
     if seed < 0 or worker_count < 0 or num_threads < 0:
-        raise ValueError(
+        raise InputError(
             f"seed, worker_count and num_threads must not be negative, got {seed}, {worker_count} and {num_threads}"
         )
     if weights is not None and (set(weights) != set(datasets) or min(weights.values()) <= 0):
-        raise ValueError(f"weights must give a positive number for each of {', '.join(datasets)}, got {dict(weights)}")
+        raise InputError(f"weights must give a positive number for each of {', '.join(datasets)}, got {dict(weights)}")
     for name, share in {"min_valid_depth": min_valid_depth, "max_broken": max_broken}.items():
         if not 0 <= share < 1:
-            raise ValueError(f"{name} must lie in [0, 1), got {share}")
+            raise InputError(f"{name} must lie in [0, 1), got {share}")
     sizes = [(int(height), int(width)) for height, width in sizes]
     if not sizes or len(set(sizes)) < len(sizes):
-        raise ValueError(f"sizes must be different (height, width), at least one, got {sizes}")
+        raise InputError(f"sizes must be different (height, width), at least one, got {sizes}")
     strides = dict(strides or {})
     if not strides.keys() <= datasets.keys():
-        raise ValueError(f"strides must be of {', '.join(datasets)}, got those of {', '.join(strides)}")
+        raise InputError(f"strides must be of {', '.join(datasets)}, got those of {', '.join(strides)}")
     samplers = {
         name: sampler_for(dataset, length=clip_length, stride=strides.get(name, stride), reverse=reverse)
         for name, dataset in datasets.items()
@@ -390,7 +391,7 @@ def training_batches(
 
 
 def _long_enough(name: str, dataset: Dataset, sampler: Sampler, *, skip_broken: bool) -> list[str]:
-    """The sequences that hold a clip; ValueError if there are none.
+    """The sequences that hold a clip; InputError if there are none.
 
     With `skip_broken` a sequence that cannot be listed stays: its clips are then broken and counted, and the examples
     are the same ones when it has been mended.
@@ -407,7 +408,7 @@ def _long_enough(name: str, dataset: Dataset, sampler: Sampler, *, skip_broken: 
 
     names = [sequence for sequence in dataset.sequences if fits(sequence)]
     if not names:
-        raise ValueError(
+        raise InputError(
             f"{name}: none of {len(dataset.sequences)} sequences has {sampler.requirement}: shorten the clips"
         )
     if len(names) < len(dataset.sequences):
@@ -442,7 +443,7 @@ def _by_size(
     for sequence, size in zip(sequences, found, strict=True):
         parts[sizes[0] if size is None else nearest_size(size, sizes)].append(sequence)
     if not any(found):
-        raise ValueError(f"{name}: no picture of {len(sequences)} sequences can be read; the log names them")
+        raise InputError(f"{name}: no picture of {len(sequences)} sequences can be read; the log names them")
     return list(parts.values())
 
 
