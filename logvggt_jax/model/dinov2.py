@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -10,6 +12,7 @@ import numpy as np
 from logvggt_jax.config import EncoderConfig
 from logvggt_jax.model.initializers import constant, fan_in_normal, normal
 from logvggt_jax.model.layers import Block, layer_norm
+from logvggt_jax.model.parameters import run
 from logvggt_jax.model.precision import product_precision
 
 _IMAGE_MEAN = np.array([0.485, 0.456, 0.406], np.float32)
@@ -39,11 +42,15 @@ class PatchEmbedding(nn.Module):
 
 
 class DinoV2(nn.Module):
-    """Images [N, H, W, 3], float32 in [0, 1], to patch tokens [N, h * w, C] float32 (h = H/14, w = W/14)."""
+    """Images [N, H, W, 3], float32 in [0, 1], to patch tokens [N, h * w, C] float32 (h = H/14, w = W/14).
+
+    Blocks run one after the other or, where their parameters come stacked, as one loop; see `Aggregator`.
+    """
 
     config: EncoderConfig
     dtype: str
     implementation: str
+    remat: bool = False
 
     @nn.compact
     def __call__(self, images: jax.Array) -> jax.Array:
@@ -63,16 +70,29 @@ class DinoV2(nn.Module):
         tokens = tokens + _resize_positions(pos_embed[:, 1:], side, grid)
         first = jnp.concatenate([cls_token + pos_embed[:, :1], registers], axis=1)
         x = jnp.concatenate([jnp.broadcast_to(first, (len(tokens), *first.shape[1:])), tokens], axis=1)
-        for i in range(config.depth):
-            x, _ = Block(
+
+        def block(**options: Any) -> Block:
+            return Block(
                 config.num_heads,
                 config.mlp_ratio,
                 epsilon=1e-6,
                 layer_scale=1.0,
                 dtype=self.dtype,
                 implementation=self.implementation,
-                name=f"block_{i}",
-            )(x)
+                **options,
+            )
+
+        if self.has_variable("params", "blocks"):
+            detached = block(parent=None)
+
+            def layer(x: jax.Array, params: Any) -> tuple[jax.Array, None]:
+                return run(detached, params, x)[0], None
+
+            body = jax.checkpoint(layer, prevent_cse=False) if self.remat else layer
+            x, _ = jax.lax.scan(body, x, self.get_variable("params", "blocks"))
+        else:
+            for i in range(config.depth):
+                x, _ = block(name=f"block_{i}")(x)
         return layer_norm(1e-6, "norm")(x[:, 1 + config.num_registers :])
 
 

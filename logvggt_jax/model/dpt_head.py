@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 
@@ -118,27 +119,68 @@ def _size(x: jax.Array) -> tuple[int, int]:
     return x.shape[1], x.shape[2]
 
 
-def _interpolation_matrix(source: int, target: int) -> np.ndarray:
-    """[target, source] weights of linear interpolation with both ends aligned (align_corners)."""
+def _interpolation(source: int, target: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Linear interpolation with both ends aligned (align_corners): the two neighbours of each of `target` places,
+    int [target] both, and the share of the upper one, float32 [target]."""
     positions = np.zeros(target) if target == 1 else np.arange(target) * ((source - 1) / (target - 1))
     lower = np.minimum(np.floor(positions).astype(int), max(source - 2, 0))
-    fraction = positions - lower
+    return lower, np.minimum(lower + 1, source - 1), (positions - lower).astype(np.float32)
+
+
+def _interpolation_matrix(source: int, target: int) -> np.ndarray:
+    """[target, source] weights of `_interpolation`."""
+    lower, upper, share = _interpolation(source, target)
     matrix = np.zeros((target, source), np.float32)
     rows = np.arange(target)
-    matrix[rows, lower] = 1.0 - fraction
-    matrix[rows, np.minimum(lower + 1, source - 1)] += fraction
+    matrix[rows, lower] = 1.0 - share
+    matrix[rows, upper] += share
     return matrix
 
 
+@functools.partial(jax.custom_vjp, nondiff_argnums=(1,))
 def _resize_bilinear(x: jax.Array, size: tuple[int, int]) -> jax.Array:
-    """[N, h, w, C] to [N, *size, C], corners aligned, which `jax.image.resize` does not offer."""
+    """[N, h, w, C] to [N, *size, C], corners aligned, which `jax.image.resize` does not offer.
+
+    GPUs read the neighbours, which costs the traffic of the result alone; elsewhere, and backwards, where reading
+    would become scattered additions, matrix products are faster.
+    """
     if _size(x) == size:
         return x
+    return jax.lax.platform_dependent(
+        x, cuda=functools.partial(_from_neighbours, size=size), default=functools.partial(_by_products, size=size)
+    )
+
+
+def _from_neighbours(x: jax.Array, size: tuple[int, int]) -> jax.Array:
+    for axis in (1, 2):
+        lower, upper, share = _interpolation(x.shape[axis], size[axis - 1])
+        weight = jnp.asarray(share).reshape(-1, *(1,) * (3 - axis))
+        below, above = (jnp.take(x, places, axis=axis).astype(jnp.float32) for places in (lower, upper))
+        x = (below + (above - below) * weight).astype(x.dtype)
+    return x
+
+
+def _by_products(x: jax.Array, size: tuple[int, int]) -> jax.Array:
     rows = jnp.asarray(_interpolation_matrix(x.shape[1], size[0]), x.dtype)
     columns = jnp.asarray(_interpolation_matrix(x.shape[2], size[1]), x.dtype)
     precision = product_precision(x.dtype)
     x = jnp.einsum("yh,nhwc->nywc", rows, x, precision=precision)
     return jnp.einsum("xw,nywc->nyxc", columns, x, precision=precision)
+
+
+def _resize_forward(x: jax.Array, size: tuple[int, int]) -> tuple[jax.Array, jax.Array]:
+    # The shape is all that the backward pass needs to know of x.
+    return _resize_bilinear(x, size), jnp.zeros((0, *x.shape[1:]), x.dtype)
+
+
+def _resize_backward(size: tuple[int, int], shape: jax.Array, cotangent: jax.Array) -> tuple[jax.Array]:
+    if shape.shape[1:3] == size:
+        return (cotangent,)
+    like = jax.ShapeDtypeStruct((len(cotangent), *shape.shape[1:]), shape.dtype)
+    return jax.linear_transpose(functools.partial(_by_products, size=size), like)(cotangent)
+
+
+_resize_bilinear.defvjp(_resize_forward, _resize_backward)
 
 
 def uv_embedding(shape: tuple[int, ...], aspect: float) -> jax.Array:

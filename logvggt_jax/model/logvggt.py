@@ -12,7 +12,7 @@ from logvggt_jax.config import ModelConfig
 from logvggt_jax.geometry.pose_encoding import decode_poses
 from logvggt_jax.model.checks import check_images, checked_mask
 from logvggt_jax.model.cross_window import CrossWindowMemory
-from logvggt_jax.model.parameters import Variables
+from logvggt_jax.model.parameters import Variables, stacked
 from logvggt_jax.model.refinement import Refinement
 from logvggt_jax.model.windows import Windows, WindowState
 from logvggt_jax.types import Predictions, WindowOutput
@@ -95,12 +95,15 @@ class LogVGGT:
           images: [B, T, H, W, 3].
           frame_mask: bool [B, T], True … True False … False for sequences of unequal length; None for full ones.
             Entries of padded frames mean nothing.
-          remat: recompute each window in the backward pass instead of storing its activations; a frame's patch
-            tokens are stored.
+          remat: for training. Layers run as one loop, and the backward pass keeps what enters a layer or a dense head
+            and recomputes the rest; a frozen encoder runs once a frame.
         """
         check_images(images, self.config.encoder.patch_size)
         frame_mask = checked_mask(images, frame_mask)
-        out = self.windows.scan(variables, images, frame_mask, remat=remat)
+        if remat:
+            out = Windows(self.config, remat=True).scan(stacked(variables), images, frame_mask)
+        else:
+            out = self.windows.scan(variables, images, frame_mask)
         pose_encodings = self.refinement.refine_sequence(variables, out.camera_tokens, out.register_tokens, frame_mask)
         pose_encoding = pose_encodings[:, :, -1]
         extrinsics, intrinsics = decode_poses(pose_encoding, (images.shape[2], images.shape[3]))

@@ -41,16 +41,11 @@ def apply_rope(tokens: jax.Array, table: RopeTable) -> jax.Array:
     Positions know the inside of a frame only: every frame is rotated alike.
     """
     batch, length, heads, head_dim = tokens.shape
-    frames = tokens.astype(jnp.float32).reshape(batch, -1, len(table.cos_y), heads, head_dim)
-    y1, y2, x1, x2 = jnp.split(frames, 4, axis=-1)
-    cos_y, sin_y, cos_x, sin_x = (part[:, None, :] for part in table)
-    rotated = jnp.concatenate(
-        [
-            y1 * cos_y - y2 * sin_y,
-            y2 * cos_y + y1 * sin_y,
-            x1 * cos_x - x2 * sin_x,
-            x2 * cos_x + x1 * sin_x,
-        ],
-        axis=-1,
-    )
+    quarter = head_dim // 4
+    # [B, n, P, heads, (y, x), (first, second), head_dim / 4]
+    pairs = tokens.astype(jnp.float32).reshape(batch, -1, len(table.cos_y), heads, 2, 2, quarter)
+    cos = jnp.stack([table.cos_y, table.cos_x], axis=1)[:, None, :, None]
+    sin = jnp.stack([table.sin_y, table.sin_x], axis=1)
+    # (a, b) becomes (a cos − b sin, b cos + a sin); a mirrored read, where a concatenation would be a copy.
+    rotated = pairs * cos + jnp.flip(pairs, axis=-2) * jnp.stack([-sin, sin], axis=2)[:, None]
     return rotated.reshape(batch, length, heads, head_dim).astype(tokens.dtype)

@@ -10,7 +10,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jax.ad_checkpoint import checkpoint_name
 
 from logvggt_jax.config import ModelConfig
 from logvggt_jax.model.aggregator import Aggregator, WindowTokens
@@ -21,7 +20,6 @@ from logvggt_jax.model.dpt_head import DPTHead, depth_activation, point_activati
 from logvggt_jax.model.parameters import Variables, run
 from logvggt_jax.types import WindowOutput
 
-_PATCH_TOKENS = "patch_tokens"
 # Pixels that a dense head takes at once, about 8 frames of 518 x 518: its maps are the model's largest.
 _DENSE_PIXELS = 8 * 518 * 518
 
@@ -70,9 +68,11 @@ class Windows:
     """Encoder, aggregator and dense heads over K frames at a time; pure functions of parameters and arrays.
 
     `start`, `step` and `finish` take a stream group by group, `scan` a whole sequence at once, with the same step.
+    With `remat` layers and dense heads keep their inputs alone for the backward pass.
     """
 
     config: ModelConfig
+    remat: bool = False
 
     # A stream.
 
@@ -160,8 +160,6 @@ class Windows:
         variables: Variables,
         images: jax.Array,
         frame_mask: jax.Array | None = None,
-        *,
-        remat: bool = False,
     ) -> WindowOutput:
         """All windows of sequences [B, T, H, W, 3] as one scan over `step`.
 
@@ -169,7 +167,6 @@ class Windows:
           variables: {"params": …}.
           images: [B, T, H, W, 3].
           frame_mask: bool [B, T]; None for all frames.
-          remat: see `LogVGGT.apply`.
         """
         check_images(images, self.config.encoder.patch_size)
         frame_mask = None if frame_mask is None else checked_mask(images, frame_mask)
@@ -186,11 +183,6 @@ class Windows:
         def advance(state: WindowState, window: jax.Array) -> tuple[WindowState, WindowOutput]:
             frames, mask = frames_from(window * stride + overlap, stride)
             return self.step(variables, state, frames, mask)
-
-        if remat:
-            # All but the encoder's result, without which a frozen encoder would run twice.
-            keep = jax.checkpoint_policies.save_only_these_names(_PATCH_TOKENS)
-            advance = jax.checkpoint(advance, prevent_cse=False, policy=keep)
 
         windows = num_windows(num_frames, self.config.windows.size, stride)
         state = self.start(variables, *frames_from(0, overlap))
@@ -225,7 +217,7 @@ class Windows:
             params = jax.lax.stop_gradient(params)
         pixels = jnp.asarray(images, jnp.float32) / (255.0 if images.dtype == jnp.uint8 else 1.0)
         tokens = run(self.encoder, params, pixels.reshape(-1, *images.shape[2:]))
-        return checkpoint_name(tokens.reshape(*images.shape[:2], *tokens.shape[1:]), _PATCH_TOKENS)
+        return tokens.reshape(*images.shape[:2], *tokens.shape[1:])
 
     def attend(
         self, variables: Variables, state: WindowState, patch_tokens: jax.Array, window_mask: jax.Array
@@ -271,6 +263,8 @@ class Windows:
             def frames(levels: list[jax.Array]) -> jax.Array:
                 return run(head, params[name], levels, grid=grid, image_size=image_size)
 
+            if self.remat:
+                frames = jax.checkpoint(frames, prevent_cse=False)
             raw = _in_groups(frames, levels, max(1, _DENSE_PIXELS // math.prod(image_size)))
             return raw.reshape(batch, count, *raw.shape[1:])
 
@@ -292,11 +286,11 @@ class Windows:
 
     @property
     def encoder(self) -> DinoV2:
-        return DinoV2(self.config.encoder, self.config.dtype, self.config.attention)
+        return DinoV2(self.config.encoder, self.config.dtype, self.config.attention, self.remat)
 
     @property
     def aggregator(self) -> Aggregator:
-        return Aggregator(self.config)
+        return Aggregator(self.config, self.remat)
 
     @property
     def depth_head(self) -> DPTHead:

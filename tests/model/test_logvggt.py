@@ -11,6 +11,9 @@ import numpy as np
 import pytest
 
 from logvggt_jax import DPTConfig, LogVGGT, ModelConfig
+from logvggt_jax.evaluation.costs.operations import count_flops
+from logvggt_jax.model.parameters import in_compute_type, stacked
+from logvggt_jax.model.windows import Windows
 
 FRAMES = 6
 
@@ -71,14 +74,42 @@ def test_training_runs_a_frozen_encoder_once_a_frame(small_config):
         variables = jax.eval_shape(model.init, jax.random.key(0), video())
 
         def loss(variables, images):
-            return jnp.log(model.windows.scan(variables, images, remat=True).depth).sum()
+            return jnp.log(Windows(model.config, remat=True).scan(stacked(variables), images).depth).sum()
 
         function = jax.grad(loss) if differentiate else loss
-        return jax.jit(function).lower(variables, video()).cost_analysis()["flops"]
+        return count_flops(function, variables, video())
 
     forward, gradient = (operations(2, each) - operations(1, each) for each in (False, True))
     assert forward > 0
     assert gradient == pytest.approx(forward, rel=1e-3)
+
+
+@pytest.mark.parametrize("cross_window", [True, False])
+def test_layers_as_a_loop_are_the_layers_one_by_one(small_config, small_variables, cross_window):
+    """Key layers that are not all layers: the loop reads the cache at some of them."""
+    sizes = dataclasses.replace(small_config.aggregator, depth=5, key_layers=(0, 1, 3, 4))
+    windows = dataclasses.replace(small_config.windows, cross_window=cross_window)
+    model = LogVGGT(dataclasses.replace(small_config, aggregator=sizes, windows=windows))
+    params = dict(small_variables["params"])
+    aggregator = params["aggregator"]
+    extra = {
+        f"{kind}_block_4": jax.tree.map(lambda x: x * 1.1, aggregator[f"{kind}_block_1"])
+        for kind in ("frame", "global")
+    }
+    variables = {"params": {**params, "aggregator": {**aggregator, **extra}}}
+    one_by_one = jax.jit(model.windows.scan)(variables, video())
+    loop = jax.jit(model.windows.scan)(stacked(variables), video())
+    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=2e-5, atol=2e-5), loop, one_by_one)
+
+
+def test_parameters_in_the_compute_type_give_the_same_bits(small_config, small_variables):
+    model = LogVGGT(dataclasses.replace(small_config, dtype="bfloat16"))
+    half = in_compute_type(small_variables, model.config)
+    assert half["params"]["aggregator"]["global_block_0"]["mlp"]["fc1"]["kernel"].dtype == jnp.bfloat16
+    assert half["params"]["aggregator"]["global_block_0"]["norm1"]["bias"].dtype == jnp.float32
+    assert half["params"]["camera_head"]["trunk_0"]["mlp"]["fc1"]["kernel"].dtype == jnp.float32
+    apply = jax.jit(model.apply)
+    jax.tree.map(np.testing.assert_array_equal, apply(half, video()), apply(small_variables, video()))
 
 
 def test_gradients_flow_through_the_cache(small_config, small_variables):
@@ -86,7 +117,7 @@ def test_gradients_flow_through_the_cache(small_config, small_variables):
     model = LogVGGT(thawed(small_config))
 
     def loss(images):
-        return jnp.log(model.windows.scan(small_variables, images, remat=True).depth)[:, -2:].sum()
+        return jnp.log(Windows(model.config, remat=True).scan(stacked(small_variables), images).depth)[:, -2:].sum()
 
     images = jax.jit(jax.grad(loss))(video(8))
     assert np.linalg.norm(images[0, 1]) > 0
