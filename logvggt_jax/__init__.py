@@ -29,10 +29,11 @@ with epy.lazy_api_imports(globals()):
         WindowConfig,
     )
     from logvggt_jax.data.feeding.transforms import preprocess
+    from logvggt_jax.frames import Frames
     from logvggt_jax.model.logvggt import LogVGGT
     from logvggt_jax.model.windows import WindowState
     from logvggt_jax.streaming import StreamSession
-    from logvggt_jax.types import Frames, Predictions, WindowOutput
+    from logvggt_jax.types import Predictions, WindowOutput
     from logvggt_jax.weights.checkpoints import from_pretrained, load_model
 
 __version__ = version("logvggt-jax")

@@ -8,7 +8,6 @@ import argparse
 import json
 import shutil
 import sys
-import textwrap
 import traceback
 import warnings
 from collections.abc import Callable, Sequence
@@ -162,11 +161,9 @@ def _check_data(options: argparse.Namespace) -> int:
 
 
 def _list_data(_: argparse.Namespace) -> None:
-    from logvggt_jax.data.checks.catalogue import UNPACKING, catalogue
+    from logvggt_jax.data.checks.catalogue import catalogue
 
-    width = min(shutil.get_terminal_size().columns, 120)
-    print("\n\n".join(entry.text(width) for entry in catalogue()))
-    print("\n" + "\n".join(textwrap.wrap(UNPACKING, width)))
+    print(catalogue(min(shutil.get_terminal_size().columns, 120)))
 
 
 def _parser() -> argparse.ArgumentParser:

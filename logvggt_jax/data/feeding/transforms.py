@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image
 
 from logvggt_jax.errors import InputError
-from logvggt_jax.types import Frames
+from logvggt_jax.frames import Frames
 
 PATCH = 14
 LONGER_EDGE = 518
@@ -134,7 +134,8 @@ def fit(frames: Frames, size: tuple[int, int]) -> Frames:
     Frames that already fit are returned as they are.
 
     Raises:
-      ValueError: `size` is not two multiples of 14, or a principal point lies outside its image.
+      ValueError: `size` is not two multiples of 14.
+      InputError: a principal point lies outside its image.
     """
     _check_size(size)
     source = frames.images.shape[1:3]
@@ -153,7 +154,7 @@ def fit(frames: Frames, size: tuple[int, int]) -> Frames:
 def fit_each(frames: Iterable[Frames], count: int, size: tuple[int, int]) -> Frames:
     """`count` frames that arrive in parts, each fitted as by `fit` and then forgotten, as one new clip.
 
-    Raises ValueError as `fit` does.
+    Raises as `fit` does.
     """
     _check_size(size)
     clip = Frames(
@@ -219,7 +220,7 @@ def _crop(matrix: np.ndarray, source: tuple[int, int], size: tuple[int, int]) ->
     centre, target = matrix[:2, 2], np.array([size[1] / 2, size[0] / 2])
     before, after = centre + 0.5, np.array(edges) - 0.5 - centre
     if not (np.isfinite(centre).all() and (before > 0).all() and (after > 0).all()):
-        raise ValueError(
+        raise InputError(
             f"the principal point ({centre[0]:g}, {centre[1]:g}) lies outside the image of size {source}: "
             "correct the intrinsics"
         )

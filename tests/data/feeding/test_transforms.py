@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from logvggt_jax.data.feeding.transforms import ResizeTransform, fit, nearest_size, preprocess
 from logvggt_jax.data.rooms.rooms import Rooms
+from logvggt_jax.frames import Frames
 from logvggt_jax.geometry import project, unproject
-from logvggt_jax.types import Frames
 
 
 @pytest.mark.parametrize(("longer_edge", "name"), [(98, "pil_70x98"), (112, "pil_84x112")])
