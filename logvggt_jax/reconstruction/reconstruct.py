@@ -41,9 +41,7 @@ from logvggt_jax.reconstruction.result import (
     image_file,
 )
 from logvggt_jax.reconstruction.sources import Source, open_source, read_ahead
-from logvggt_jax.streaming.chunk_session import ChunkSession
-from logvggt_jax.streaming.chunks import ChunkPlan
-from logvggt_jax.streaming.windows import Cameras, FrameResult, StreamSession
+from logvggt_jax.streaming import Cameras, ChunkPlan, ChunkSession, FrameResult, StreamSession
 
 _NARROWEST_FIELD_OF_VIEW = 0.01  # radians
 
