@@ -27,7 +27,7 @@ from logvggt_jax.files import atomic_folder, check_output
 from logvggt_jax.geometry import decode_poses
 from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE, write_cameras
-from logvggt_jax.reconstruction.depth_files import depth_picture, write_depth, write_jpeg, write_picture
+from logvggt_jax.reconstruction.depth_files import depth_picture, write_depth, write_picture
 from logvggt_jax.reconstruction.exporters import EXPORTERS
 from logvggt_jax.reconstruction.point_cloud import PointFilter
 from logvggt_jax.reconstruction.result import (
@@ -183,7 +183,7 @@ def _stream(
             names.append(picture.name)
             timestamps.append(picture.timestamp)
             transform = picture.transform
-            write_jpeg(image_file(folder, picture.name), picture.image)
+            write_picture(image_file(folder, picture.name), picture.image)
             save(predictor.push(picture.image))
         save(predictor.close())
         bars.update(task, total=len(names))
