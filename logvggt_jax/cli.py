@@ -17,9 +17,10 @@ from typing import TYPE_CHECKING, Any
 from logvggt_jax.errors import InputError, one_line
 
 if TYPE_CHECKING:
-    from logvggt_jax.streaming.chunks import ChunkPlan
+    from logvggt_jax.streaming import ChunkPlan
 
 BAD_INPUT, INTERRUPTED = 2, 130
+MODES = ("windows", "chunks", "offline")  # the registry of methods, which would load JAX
 PROBLEMS_FOUND = 1
 
 
@@ -79,14 +80,16 @@ def _reconstruct(options: argparse.Namespace) -> None:
         max_points=options.max_points or None,
     )
     provenance = read_provenance(options.checkpoint)
-    chunks = _chunks(options, choose_method(provenance, None if options.mode == "auto" else options.mode))
+    method = choose_method(provenance, None if options.mode == "auto" else options.mode)
+    settings = _settings(options, method)
     model, variables = from_pretrained(options.checkpoint, dtype=options.dtype)
     result = reconstruct(
         options.source,
         options.output,
         model=model,
         variables=variables,
-        chunks=chunks,
+        method=method,
+        settings=settings,
         longer_edge=options.longer_edge or provenance.longer_edge or LONGER_EDGE,
         point_filter=point_filter,
         num_previews=options.previews,
@@ -95,15 +98,14 @@ def _reconstruct(options: argparse.Namespace) -> None:
     print(result.summary())
 
 
-def _chunks(options: argparse.Namespace, method: str) -> ChunkPlan | None:
-    """Sizes of the chunks; None for windows."""
-    from logvggt_jax.streaming.chunks import ChunkPlan
+def _settings(options: argparse.Namespace, method: str) -> ChunkPlan | None:
+    """Settings of the method; None for its defaults."""
+    from logvggt_jax.streaming import ChunkPlan
 
-    given = {"--chunk-size": options.chunk_size, "--chunk-overlap": options.chunk_overlap}
     if method == "chunks":
         size = ChunkPlan.size if options.chunk_size is None else options.chunk_size
         return ChunkPlan(size, size // 2 if options.chunk_overlap is None else options.chunk_overlap)
-    for name, value in given.items():
+    for name, value in {"--chunk-size": options.chunk_size, "--chunk-overlap": options.chunk_overlap}.items():
         if value is not None:
             raise InputError(f"{name} needs --mode chunks")
     return None
@@ -226,10 +228,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     sub.add_argument(
         "--mode",
-        choices=("auto", "windows", "chunks"),
+        choices=("auto", *MODES),
         default="auto",
         help="windows: LoG-VGGT's stream. chunks: plain VGGT on overlapping chunks chained by similarities, for public "
-        "VGGT weights, which never learned the relay from window to window. auto: what the weights were trained for",
+        "VGGT weights, which never learned the relay from window to window. offline: plain VGGT on all frames at once, "
+        "where they fit the memory. auto: what the weights were trained for",
     )
     sub.add_argument(
         "--chunk-size",

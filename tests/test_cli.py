@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 
 from logvggt_jax import LogVGGT, ModelConfig
-from logvggt_jax.cli import main
+from logvggt_jax.cli import MODES, main
 from logvggt_jax.compile import default_cache_folder, enable_compilation_cache
 from logvggt_jax.data import DATASETS
+from logvggt_jax.streaming import METHODS
 from logvggt_jax.weights.checkpoints import save_model
 from logvggt_jax.weights.provenance import Provenance
 
@@ -57,6 +58,10 @@ def test_help_names_every_command_and_each_shows_an_example(capsys: pytest.Captu
             main([*command.split(), "--help"])
         assert exit_.value.code == 0
         assert f"logvggt {command}" in capsys.readouterr().out.split("example:")[1]
+
+
+def test_every_method_is_a_mode() -> None:
+    assert set(MODES) == set(METHODS)
 
 
 def test_help_does_not_wait_for_jax() -> None:

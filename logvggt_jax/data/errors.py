@@ -35,10 +35,6 @@ def missing_file(path: str | Path) -> MissingFiles:
     return MissingFiles(f"{path}: no such file; fetch it again or remove the frame's other files")
 
 
-class MissingPackage(InputError, ImportError):
-    """A package that a data set's files need; the message names the extra that brings it."""
-
-
 class BrokenPicture(InputError):
     """A picture or depth file that is truncated, damaged, or of another type than the set's."""
 

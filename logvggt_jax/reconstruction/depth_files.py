@@ -52,16 +52,10 @@ def depth_picture(depth: np.ndarray, *, near: float, far: float) -> np.ndarray:
 
 
 def write_picture(path: str | Path, image: np.ndarray) -> None:
-    """Writes an RGB image [H, W, 3] uint8 as PNG."""
-    encoded, buffer = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
-    if not encoded:
-        raise ValueError(f"{path}: an image of shape {image.shape} cannot be encoded as PNG")
-    with atomic_file(path) as temporary:
-        temporary.write_bytes(buffer.tobytes())
+    """Writes an RGB image [H, W, 3] uint8, or numbers [H, W] uint16, as PNG or JPEG, whichever the suffix says.
 
-
-def write_jpeg(path: str | Path, image: np.ndarray) -> None:
-    """Writes an RGB image [H, W, 3] uint8 as JPEG, at a quality that keeps every pixel to a few grey levels."""
+    JPEG has a quality that keeps nearly every pixel to a few grey levels.
+    """
     with atomic_file(path) as temporary:
         Image.fromarray(image).save(temporary, quality=95, subsampling=0)
 

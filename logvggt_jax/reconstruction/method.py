@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import warnings
 
+from logvggt_jax.streaming import METHODS
 from logvggt_jax.weights.provenance import Provenance
 
-_FITTING = {"windows": "windows", "vggt": "chunks", None: "windows"}
+# Of the methods that suit weights, the one that takes sequences of any length.
+_PREFERRED = {"windows": "windows", "vggt": "chunks", None: "windows"}
 
 
 def choose_method(provenance: Provenance, asked: str | None = None) -> str:
@@ -16,25 +18,27 @@ def choose_method(provenance: Provenance, asked: str | None = None) -> str:
 
     Args:
       provenance: of the weights.
-      asked: a method's name; None leaves the choice to the weights.
+      asked: a name of `METHODS`; None leaves the choice to the weights.
     """
-    fitting = _FITTING[provenance.trained_for]
-    if provenance.trained_for is None and asked is None:
-        warnings.warn(
-            "the model folder does not say what its weights were trained for, and windows are taken; if they are "
-            "public VGGT's, pass --mode chunks, or convert them again",
-            stacklevel=2,
-        )
-    elif provenance.trained_for == "vggt" and asked == "windows":
+    chosen = asked or _PREFERRED[provenance.trained_for]
+    if provenance.trained_for == METHODS[chosen].trained_for:
+        return chosen
+    if provenance.trained_for == "vggt":
         warnings.warn(
             "these weights are public VGGT's, which never learned to pass the first camera on from window to window: "
             "cameras and depth of a sequence longer than one window will be wrong; leave --mode out for chunks",
             stacklevel=2,
         )
-    elif provenance.trained_for == "windows" and asked not in (None, fitting):
+    elif provenance.trained_for == "windows":
         warnings.warn(
-            f"these weights were trained on windows with memory between them, and {asked} shows them more frames at "
+            f"these weights were trained on windows with memory between them, and {chosen} shows them more frames at "
             "once than they have ever seen; leave --mode out for windows",
             stacklevel=2,
         )
-    return asked or fitting
+    elif asked is None:
+        warnings.warn(
+            "the model folder does not say what its weights were trained for, and windows are taken; if they are "
+            "public VGGT's, pass --mode chunks, or convert them again",
+            stacklevel=2,
+        )
+    return chosen

@@ -7,7 +7,7 @@ import time
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from rich.progress import (
@@ -27,7 +27,7 @@ from logvggt_jax.files import atomic_folder, check_output
 from logvggt_jax.geometry import decode_poses
 from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE, write_cameras
-from logvggt_jax.reconstruction.depth_files import depth_picture, write_depth, write_jpeg, write_picture
+from logvggt_jax.reconstruction.depth_files import depth_picture, write_depth, write_picture
 from logvggt_jax.reconstruction.exporters import EXPORTERS
 from logvggt_jax.reconstruction.point_cloud import PointFilter
 from logvggt_jax.reconstruction.result import (
@@ -41,11 +41,9 @@ from logvggt_jax.reconstruction.result import (
     image_file,
 )
 from logvggt_jax.reconstruction.sources import Source, open_source, read_ahead
-from logvggt_jax.streaming import Cameras, ChunkPlan, ChunkSession, FrameResult, StreamSession
+from logvggt_jax.streaming import Cameras, FrameResult, Predictor, open_predictor
 
 _NARROWEST_FIELD_OF_VIEW = 0.01  # radians
-
-_Session = StreamSession | ChunkSession
 
 
 def check_request(
@@ -76,7 +74,8 @@ def reconstruct(
     *,
     model: LogVGGT,
     variables: Variables,
-    chunks: ChunkPlan | None = None,
+    method: str = "windows",
+    settings: Any = None,
     longer_edge: int = LONGER_EDGE,
     stride: int = 1,
     max_frames: int | None = None,
@@ -88,16 +87,15 @@ def reconstruct(
     """Reconstructs a sequence and writes cameras, trajectory, depth and points.
 
     Frames are read once, as they are needed, and kept at the model's size; depth maps are written as they become
-    final. Memory on device and host is constant but for the compact tokens and the cameras; with `chunks` it is that of
-    one chunk, and the cameras.
+    final. Memory on the host is constant but for the cameras, memory on the device is the method's.
 
     Args:
       source_path: folder of images or video, see `open_source`.
       output: folder to make; it appears when all is done, until then the work lies beside it in a `.partial` folder.
       model: the model.
       variables: {"params": …}.
-      chunks: plain VGGT on overlapping chunks instead of the model's windows, for public VGGT weights; see
-        `logvggt_jax.streaming.chunks`.
+      method: name of `logvggt_jax.streaming.METHODS`; `chunks` for public VGGT weights, see `choose_method`.
+      settings: of the method's own settings class; None for its defaults.
       longer_edge: size in pixels, a multiple of 14, to which the longer edge of the frames is resized; take
         what the model was trained with (518 for VGGT).
       stride: take every `stride`-th frame.
@@ -109,7 +107,7 @@ def reconstruct(
 
     Raises:
       OutputExists: `output` exists.
-      InputError: bad source or parameters, or chunks that cannot be aligned; nothing is left behind.
+      InputError: bad source or parameters, or a sequence that the method cannot predict; nothing is left behind.
     """
     if num_previews < 0:
         raise InputError(f"num_previews must not be negative, got {num_previews}")
@@ -121,9 +119,8 @@ def reconstruct(
         for name in (DEPTH_FOLDER, IMAGE_FOLDER, PREVIEW_FOLDER):
             (folder / name).mkdir()
         started = time.monotonic()
-        session: _Session
-        session = StreamSession(model, variables) if chunks is None else ChunkSession(model, variables, chunks)
-        sequence, cameras = _stream(source, folder, session, longer_edge, progress=progress)
+        predictor = open_predictor(method, model, variables, settings)
+        sequence, cameras = _stream(source, folder, predictor, longer_edge, progress=progress)
         seconds = time.monotonic() - started
         _write_all_cameras(folder, sequence, cameras)
         result = Reconstruction.with_cameras_of(folder)
@@ -167,7 +164,7 @@ def _pictures(source: Source, longer_edge: int) -> Iterator[_Picture]:
 
 
 def _stream(
-    source: Source, folder: Path, session: _Session, longer_edge: int, *, progress: bool
+    source: Source, folder: Path, predictor: Predictor, longer_edge: int, *, progress: bool
 ) -> tuple[_Sequence, Cameras]:
     """Depth and images to disk, as they become final and as they come; cameras at the end."""
     names: list[str] = []
@@ -186,13 +183,13 @@ def _stream(
             names.append(picture.name)
             timestamps.append(picture.timestamp)
             transform = picture.transform
-            write_jpeg(image_file(folder, picture.name), picture.image)
-            save(session.push(picture.image))
-        save(session.close())
+            write_picture(image_file(folder, picture.name), picture.image)
+            save(predictor.push(picture.image))
+        save(predictor.close())
         bars.update(task, total=len(names))
     if transform is None:
         raise InputError(f"{source.path} gave no frame")
-    return _Sequence(names, timestamps, transform), session.cameras()
+    return _Sequence(names, timestamps, transform), predictor.cameras()
 
 
 def _write_all_cameras(folder: Path, sequence: _Sequence, cameras: Cameras) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 from rich.progress import track
 
@@ -60,7 +59,7 @@ def write_room_sequence(
             stem = f"frame-{index:06d}"
             write_picture(folder / f"{stem}.color.png", frames.images[0])
             millimetres = np.clip(np.rint(frames.depth[0] * 1000.0), 0, 65534).astype(np.uint16)
-            (folder / f"{stem}.depth.proj.png").write_bytes(cv2.imencode(".png", millimetres)[1].tobytes())
+            write_picture(folder / f"{stem}.depth.proj.png", millimetres)
             np.savetxt(folder / f"{stem}.pose.txt", invert(frames.extrinsics[0].astype(np.float64)), fmt="%.9g")
         intrinsics, _ = rooms.cameras(sequence, [0])
         np.savetxt(folder / INTRINSICS_FILE, intrinsics[0], fmt="%.9g")

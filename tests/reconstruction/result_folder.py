@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from logvggt_jax.reconstruction.cameras_file import write_cameras
-from logvggt_jax.reconstruction.depth_files import write_depth, write_jpeg
+from logvggt_jax.reconstruction.depth_files import write_depth, write_picture
 from logvggt_jax.reconstruction.point_cloud import VERTEX, write_points
 
 SIZE = (24, 32)
@@ -33,7 +33,7 @@ def write_result(folder: Path, count: int = 3) -> None:
     (folder / "images").mkdir()
     for index, name in enumerate(names):
         write_depth(folder / "depth" / f"{name}.npz", np.full(SIZE, 2.0), np.full(SIZE, 1.0 + index))
-        write_jpeg(folder / "images" / f"{name}.jpg", np.full((*SIZE, 3), 40 * index, np.uint8))
+        write_picture(folder / "images" / f"{name}.jpg", np.full((*SIZE, 3), 40 * index, np.uint8))
     vertices = np.zeros(10, VERTEX)
     vertices["z"] = np.arange(10)
     write_points(folder / "points.ply", 10, [vertices])

@@ -17,6 +17,8 @@ from logvggt_jax.weights.provenance import Provenance
         ("windows", "windows", "windows"),
         ("vggt", None, "chunks"),
         ("vggt", "chunks", "chunks"),
+        ("vggt", "offline", "offline"),
+        (None, "windows", "windows"),
     ],
 )
 def test_weights_are_used_as_they_were_trained(trained_for: str, asked: str | None, method: str) -> None:
@@ -30,6 +32,7 @@ def test_weights_are_used_as_they_were_trained(trained_for: str, asked: str | No
     [
         ("vggt", "windows", "windows", "never learned to pass the first camera on"),
         ("windows", "chunks", "chunks", "chunks shows them more frames at once"),
+        ("windows", "offline", "offline", "offline shows them more frames at once"),
         (None, None, "windows", "does not say what its weights were trained for"),
     ],
 )

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from logvggt_jax.data.checks.report import SequenceReport
-from logvggt_jax.data.errors import MissingFiles, MissingPackage
+from logvggt_jax.data.errors import MissingFiles
 from logvggt_jax.data.readers.folder_dataset import FolderDataset
-from logvggt_jax.errors import InputError
+from logvggt_jax.errors import InputError, MissingPackage
 from logvggt_jax.files import atomic_file
 from logvggt_jax.frames import Frames
 from logvggt_jax.geometry import camera_centres, unproject

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from logvggt_jax.data.errors import BrokenPicture, MissingPackage, missing_file
+from logvggt_jax.data.errors import BrokenPicture, missing_file
+from logvggt_jax.errors import MissingPackage
 
 
 def read_hdf5(
