@@ -228,6 +228,7 @@ def aligned_points(prediction: ClipPrediction, truth: ClipTruth) -> np.ndarray:
 
 
 def _middle(size: tuple[int, ...], crop: int | None) -> tuple[slice, slice]:
+    """Rows and columns of the middle crop x crop pixels of pictures (H, W); all where there is no crop."""
     if crop is None:
         return slice(None), slice(None)
     rows, columns = (slice(max(0, edge // 2 - crop // 2), edge // 2 + crop // 2) for edge in size)
@@ -235,6 +236,7 @@ def _middle(size: tuple[int, ...], crop: int | None) -> tuple[slice, slice]:
 
 
 def _depth(prediction: ClipPrediction, clip: ClipData, measure: DepthMeasure) -> dict[str, float]:
+    """`<alignment>/<error>` of predicted depth [T, h, w] against the true [T, H, W], and `valid_pixels`."""
     depth = _finite_depth(prediction)
     assert clip.depth is not None  # read where the protocol measures depth
     pixels = valid_pixels(depth, clip.depth, measure.max_depth)
@@ -251,6 +253,7 @@ def _depth(prediction: ClipPrediction, clip: ClipData, measure: DepthMeasure) ->
 
 
 def _pose(prediction: ClipPrediction, true: np.ndarray) -> dict[str, float]:
+    """Means over all pairs of frames, against true world-to-camera extrinsics [T, 4, 4]."""
     rotation, translation = relative_pose_errors(prediction.extrinsics, true)
     identity_rotation, _ = relative_pose_errors(np.tile(np.eye(4), (len(true), 1, 1)), true)
     wide = pose_accuracy(rotation, translation, 30)
@@ -266,6 +269,7 @@ def _pose(prediction: ClipPrediction, true: np.ndarray) -> dict[str, float]:
 
 
 def _trajectory(prediction: ClipPrediction, extrinsics: np.ndarray, static: bool) -> dict[str, float]:
+    """Errors of camera positions, against true world-to-camera extrinsics [T, 4, 4]; metres where the set is metric."""
     true = np.asarray(extrinsics, np.float64)
     radius = rms_radius(camera_centres(true))
     if static:
@@ -277,12 +281,14 @@ def _trajectory(prediction: ClipPrediction, extrinsics: np.ndarray, static: bool
 
 
 def _points(prediction: ClipPrediction, truth: ClipTruth, icp_threshold: float | None) -> dict[str, float]:
+    """Errors of the aligned cloud [N, 3] against the true one; metres where the set is metric."""
     cloud = aligned_points(prediction, truth)
     assert truth.points is not None  # aligned_points has looked
     return point_cloud_metrics(cloud, truth.points, target_normals=truth.normals, icp_threshold=icp_threshold)
 
 
 def _finite_depth(prediction: ClipPrediction) -> np.ndarray:
+    """Predicted depth [T, h, w]; NotMeasurable where a value is not finite."""
     depth = prediction.depth
     if depth is None:
         raise ValueError("the method predicts no depth")
@@ -293,6 +299,7 @@ def _finite_depth(prediction: ClipPrediction) -> np.ndarray:
 
 
 def _depth_means(metrics: Sequence[Mapping[str, float]], measure: DepthMeasure) -> dict[str, float]:
+    """Means over the clips that have depth errors, weighted by valid pixels."""
     measured = [m for m in metrics if "valid_pixels" in m]
     result: dict[str, float] = {"clips_depth": len(measured)}
     for alignment in measure.alignments:
@@ -307,6 +314,7 @@ def _depth_means(metrics: Sequence[Mapping[str, float]], measure: DepthMeasure) 
 
 
 def _pose_means(scores: Sequence[tuple[str, ClipScore]], prefix: str, pooled: bool) -> dict[str, float]:
+    """Means over clips (pooled: over the pairs of a category, then over categories) of the metrics with a prefix."""
     keys = [prefix + key for key in POSE_KEYS]
     result = _plain_means(scores, f"{prefix}pose", keys)
     measured = [(name, score.metrics) for name, score in scores if keys[0] in score.metrics]
@@ -329,6 +337,7 @@ def _pose_means(scores: Sequence[tuple[str, ClipScore]], prefix: str, pooled: bo
 
 
 def _plain_means(scores: Sequence[tuple[str, ClipScore]], group: str, keys: Sequence[str]) -> dict[str, float]:
+    """Means of `keys` over the clips that have the first of them, and how many those are."""
     measured = [score.metrics for _, score in scores if keys[0] in score.metrics]
     result: dict[str, float] = {f"clips_{group}": len(measured)}
     for key in keys:

@@ -11,7 +11,7 @@ import numpy as np
 from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.data.feeding.transforms import fit
 from logvggt_jax.errors import InputError
-from logvggt_jax.evaluation.methods.method import Checkpoint, ClipPrediction, Method, network
+from logvggt_jax.evaluation.methods.method import Checkpoint, ClipPrediction, Method, model_row
 from logvggt_jax.model.logvggt import LogVGGT
 
 
@@ -107,7 +107,9 @@ def untrained(model: LogVGGT, image_size: tuple[int, int], *, seed: int = 0) -> 
     """The same network with random parameters."""
     variables = model.init(jax.random.key(seed), jnp.zeros((1, 1, *image_size, 3), jnp.uint8))
     knows = f"nothing (random parameters, seed {seed})"
-    return network(Checkpoint(model, variables, knows), name="untrained network", knows=knows)
+    return model_row(
+        "windows", Checkpoint(model, jax.device_put(variables), knows), name="untrained network", knows=knows
+    )
 
 
 def all_baselines(
@@ -132,6 +134,8 @@ def all_baselines(
 
 
 def _fixed_depth(name: str, knows: str, depth: np.ndarray, statistics: DepthStatistics) -> Method:
+    """The same depth map [H, W] for every frame."""
+
     def predict(images: np.ndarray) -> ClipPrediction:
         frames = len(images)
         return ClipPrediction(
@@ -146,10 +150,12 @@ def _fixed_depth(name: str, knows: str, depth: np.ndarray, statistics: DepthStat
 
 
 def _identities(count: int) -> np.ndarray:
+    """[count, 4, 4]."""
     return np.tile(np.eye(4), (count, 1, 1))
 
 
 def _evenly(count: int, at_most: int) -> list[int]:
+    """At most so many evenly spaced numbers below `count`, the first and the last among them."""
     if count <= at_most:
         return list(range(count))
     return [int(i) for i in np.linspace(0, count - 1, at_most).round()]
