@@ -13,7 +13,7 @@ from logvggt_jax.evaluation.methods.method import ClipPrediction, Method
 from logvggt_jax.evaluation.progress import track
 from logvggt_jax.evaluation.protocols.protocol import DepthMeasure, PointsMeasure, Protocol
 from logvggt_jax.evaluation.scratch import scratch_array
-from logvggt_jax.geometry import camera_centres, invert, umeyama, unproject
+from logvggt_jax.geometry import camera_centres, invert, umeyama, unproject_pixels
 from logvggt_jax.metrics.depth import DEPTH_KEYS, mean_depth_metrics, pixel_errors, resize_depth, valid_depth
 from logvggt_jax.metrics.errors import NotMeasurable
 from logvggt_jax.metrics.points import estimate_normals, point_cloud_metrics, sample_indices
@@ -79,7 +79,7 @@ def prepare_truth(clip: ClipData, points: PointsMeasure | None) -> ClipTruth:
     indices = valid_indices(clip.depth, points)
     if not indices.size:
         return ClipTruth(clip)
-    cloud = points_at(clip.depth, clip.intrinsics, clip.extrinsics, indices)
+    cloud = unproject_pixels(clip.depth, clip.intrinsics, clip.extrinsics, indices)
     return ClipTruth(clip, indices, cloud, estimate_normals(cloud))
 
 
@@ -136,14 +136,12 @@ def benchmark_score(
     result: dict[str, float] = {"clips": planned, "clips_measured": sum(bool(score.metrics) for _, score in scores)}
     if protocol.depth is not None and method.depth:
         result |= _depth_means([score.metrics for _, score in scores], protocol.depth)
-    for prefix in ("", SFM):
+    second = any(key.startswith(SFM) for _, score in scores for key in score.metrics)
+    for prefix in ("", SFM) if second else ("",):
         if protocol.poses and method.pose:
             result |= _pose_means(scores, prefix, protocol.pooled)
         if protocol.trajectory and method.pose:
             result |= _plain_means(scores, f"{prefix}trajectory", [prefix + key for key in TRAJECTORY_KEYS])
-        for group in ("pose", "trajectory"):
-            if prefix and not result.get(f"clips_{prefix}{group}"):
-                result.pop(f"clips_{prefix}{group}", None)
     if protocol.points is not None and method.points:
         result |= _plain_means(scores, "points", POINT_KEYS)
     return result
@@ -165,24 +163,6 @@ def valid_indices(depth: np.ndarray, points: PointsMeasure) -> np.ndarray:
         for t, frame in enumerate(depth)
     ]
     return np.concatenate(chosen)
-
-
-def points_at(depth: np.ndarray, intrinsics: np.ndarray, extrinsics: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """World points [N, 3] float64 of the pixels `indices` [N] (sorted, flat in [T, H, W]).
-
-    One frame at a time, so that a long clip never has all its points in memory.
-    """
-    pixels = depth.shape[1] * depth.shape[2]
-    borders = np.searchsorted(indices, np.arange(len(depth) + 1) * pixels)
-    clouds = []
-    for t in track(range(len(depth)), len(depth), "points"):
-        frame = unproject(
-            np.asarray(depth[t], np.float64),
-            np.asarray(intrinsics[t], np.float64),
-            np.asarray(extrinsics[t], np.float64),
-        )
-        clouds.append(frame.reshape(-1, 3)[indices[borders[t] : borders[t + 1]] - t * pixels])
-    return np.concatenate(clouds)
 
 
 def valid_pixels(prediction: np.ndarray, target: np.ndarray, max_depth: float | None) -> tuple[np.ndarray, np.ndarray]:
@@ -220,7 +200,7 @@ def aligned_points(prediction: ClipPrediction, truth: ClipTruth) -> np.ndarray:
         raise ValueError(f"predicted depth {depth.shape} must have the shape of the true one {truth.clip.depth.shape}")
     if prediction.intrinsics is None:
         raise ValueError("points need predicted intrinsics")
-    cloud = points_at(depth, prediction.intrinsics, prediction.extrinsics, truth.indices)
+    cloud = unproject_pixels(depth, prediction.intrinsics, prediction.extrinsics, truth.indices)
     try:
         return umeyama(cloud, truth.points).apply(cloud)
     except ValueError as error:

@@ -172,10 +172,6 @@ def _rates(row: Method, pictures: np.ndarray, length: int, rounds: int) -> list[
         runs = [time_stream(row.start(), pictures, length) for _ in range(rounds + 1)]
     except PredictionError as error:
         return str(error)
-    except jax.errors.JaxRuntimeError as error:
-        if "RESOURCE_EXHAUSTED" not in str(error):
-            raise
-        return "out of memory on the device"
     return [length / run.seconds for run in runs[1:]]
 
 

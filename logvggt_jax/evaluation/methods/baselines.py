@@ -71,19 +71,6 @@ def depth_statistics(
     return DepthStatistics(mean_depth, mean_map, np.mean(intrinsics, axis=0), source)
 
 
-def constant_depth(statistics: DepthStatistics) -> Method:
-    """Every pixel at the mean depth, seen by a camera that never moves."""
-    depth = np.full_like(statistics.mean_map, statistics.mean_depth)
-    return _fixed_depth("constant depth", "mean depth and mean intrinsics", depth, statistics)
-
-
-def mean_depth_map(statistics: DepthStatistics) -> Method:
-    """Every pixel at its own mean depth, seen by a camera that never moves."""
-    return _fixed_depth(
-        "mean depth map", "mean depth of each pixel and mean intrinsics", statistics.mean_map, statistics
-    )
-
-
 def unit_depth() -> Method:
     """Every pixel at depth 1, at any image size; the alignment gives it the clip's scale."""
 
@@ -125,16 +112,17 @@ def all_baselines(
       seed: of the random parameters.
     """
     statistics = depth_statistics(dataset, image_size, source=source)
+    constant = np.full_like(statistics.mean_map, statistics.mean_depth)
     return [
-        constant_depth(statistics),
-        mean_depth_map(statistics),
+        _fixed_depth("constant depth", "mean depth", constant, statistics),
+        _fixed_depth("mean depth map", "mean depth of each pixel", statistics.mean_map, statistics),
         static_camera(),
         untrained(model, image_size, seed=seed),
     ]
 
 
 def _fixed_depth(name: str, knows: str, depth: np.ndarray, statistics: DepthStatistics) -> Method:
-    """The same depth map [H, W] for every frame."""
+    """The same depth map [H, W] for every frame, seen by a camera that never moves."""
 
     def predict(images: np.ndarray) -> ClipPrediction:
         frames = len(images)
@@ -144,7 +132,7 @@ def _fixed_depth(name: str, knows: str, depth: np.ndarray, statistics: DepthStat
             np.broadcast_to(statistics.intrinsics, (frames, 3, 3)),
         )
 
-    knows = f"{knows} of {statistics.source}; static camera"
+    knows = f"{knows} and mean intrinsics of {statistics.source}; static camera"
     identity = [array.tolist() for array in (depth, statistics.intrinsics)]
     return Method(name, knows, predict, identity, pose=False)
 
