@@ -44,9 +44,11 @@ from logvggt_jax.evaluation.costs.parts import (
     spread,
     time_part,
 )
-from logvggt_jax.evaluation.costs.throughput import random_pictures, refinement_modes, time_stream
+from logvggt_jax.evaluation.costs.throughput import random_pictures, time_stream
 from logvggt_jax.evaluation.environment import describe_device
+from logvggt_jax.evaluation.methods.variants import VARIANTS
 from logvggt_jax.evaluation.report.figures import efficiency_plot
+from logvggt_jax.streaming import StreamSession
 
 MIB = 2**20
 
@@ -58,8 +60,8 @@ def speed(
     rows = []
     for length in sorted(lengths):
         for mode, model in models.items():
-            warm = time_stream(model, variables, pictures, length, watch=True)
-            runs = [time_stream(model, variables, pictures, length) for _ in range(rounds)]
+            warm = time_stream(StreamSession(model, variables), pictures, length, watch=True)
+            runs = [time_stream(StreamSession(model, variables), pictures, length) for _ in range(rounds)]
             rows.append(
                 {
                     "mode": mode,
@@ -83,7 +85,7 @@ def ratios(models: dict[str, LogVGGT], variables: Any, pictures: np.ndarray, pai
     found: dict[str, list[float]] = {mode: [] for mode in models}
     for mode, model in models.items():
         for _ in range(pairs):
-            rates = [n / time_stream(model, variables, pictures, n).seconds for n in (short, long)]
+            rates = [n / time_stream(StreamSession(model, variables), pictures, n).seconds for n in (short, long)]
             found[mode].append(rates[1] / rates[0])
     return {"short": short, "long": long, "ratios": found}
 
@@ -92,7 +94,8 @@ def transfer(pictures: np.ndarray, stride: int) -> dict[str, float]:
     """Milliseconds a frame to the device (uint8 picture) and back (depth and confidence), median of 20."""
     frames = np.ascontiguousarray(pictures[None, :stride])
     height, width = frames.shape[2:4]
-    there, back = [], []
+    there: list[float] = []
+    back: list[float] = []
     for _ in range(20):
         started = time.perf_counter()
         jax.block_until_ready(jax.device_put(frames))
@@ -200,7 +203,15 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
         variables = LogVGGT(base).init(jax.random.key(0), jnp.zeros((1, 1, *options.image_size, 3), jnp.uint8))
     variables = jax.device_put(variables)
     context = options.context or base.windows.size
-    known = {mode: LogVGGT(config) for mode, config in refinement_modes(base, context).items()}
+    known = {
+        mode: LogVGGT(VARIANTS[variant].config(base, context=limit))
+        for mode, (variant, limit) in {
+            "full": ("full", None),
+            "full+context": ("full", context),
+            "online": ("gccr_online", None),
+            "online+context": ("gccr_online", context),
+        }.items()
+    }
     models = {mode: known[mode] for mode in options.modes}
     lengths = sorted(options.lengths)
     pictures = random_pictures(options.image_size)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.data.registry import open_dataset
-from logvggt_jax.data.rooms.rooms import Rooms
 from logvggt_jax.errors import InputError
 from logvggt_jax.evaluation.methods.baselines import all_baselines, static_camera, unit_depth
 from logvggt_jax.evaluation.methods.method import Method
@@ -123,6 +121,7 @@ def open_benchmarks(
 
 
 def _first_split(protocol: Protocol, folder: Path) -> tuple[Dataset | None, str, str]:
+    """The first of the protocol's splits that the folder has, its name; or why there is none."""
     if not folder.is_dir():
         return None, "", f"{folder}: no such folder"
     reasons: list[str] = []
@@ -134,10 +133,9 @@ def _first_split(protocol: Protocol, folder: Path) -> tuple[Dataset | None, str,
     return None, "", "; ".join(reasons)
 
 
-def _rooms(split: str, image_size: tuple[int, int], options: Mapping[str, Any]) -> Rooms:
-    height, width = image_size
-    known = inspect.signature(Rooms).parameters
-    for option in options:
-        if option not in known or option in ("split", "height", "width"):
-            raise InputError(f"rooms: unknown option {option!r}; known are {', '.join(known)} without split and size")
-    return Rooms(split=split, height=height, width=width, **options)
+def _rooms(split: str, image_size: tuple[int, int], options: Mapping[str, Any]) -> Dataset:
+    """Rooms rendered at (H, W)."""
+    for name in ("split", "height", "width"):
+        if name in options:
+            raise InputError(f"rooms: {name} follows from the run's split and image size, leave it out")
+    return open_dataset("rooms", None, split, height=image_size[0], width=image_size[1], **options)

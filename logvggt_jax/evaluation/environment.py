@@ -20,6 +20,7 @@ _VERSIONED = ("logvggt-jax", "jax", "jaxlib", "flax", "numpy", "scipy", "evo", "
 # settings are in the key of every record and whose prose is nobody's number; reports; costs.
 _DECIDING = (
     "types.py",
+    "frames.py",
     "config.py",
     "geometry",
     "metrics",

@@ -17,7 +17,7 @@ from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.errors import InputError
 from logvggt_jax.evaluation.clips import load_clip
 from logvggt_jax.evaluation.environment import code_version, environment
-from logvggt_jax.evaluation.methods.method import ClipPrediction, Method, PredictionError
+from logvggt_jax.evaluation.methods.method import ClipPrediction, Method
 from logvggt_jax.evaluation.progress import progress_display
 from logvggt_jax.evaluation.protocols.protocol import Protocol
 from logvggt_jax.evaluation.records import PREDICTION, ClipRecords, plain, record_key
@@ -32,6 +32,7 @@ from logvggt_jax.evaluation.scores import (
 )
 from logvggt_jax.files import write_text
 from logvggt_jax.metrics import NotMeasurable
+from logvggt_jax.streaming import PredictionError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -190,6 +191,7 @@ def plan_clips(
 
 
 def _sequences(benchmark: Benchmark) -> list[str]:
+    """Names of the sequences that belong to the benchmark."""
     if benchmark.dataset is None:
         return []
     return [name for name in benchmark.dataset.sequences if benchmark.protocol.takes(name)]
@@ -230,6 +232,7 @@ def _run_clip(
 
 
 def _predicted(method: Method, truth: ClipTruth, protocol: Protocol) -> tuple[ClipPrediction | None, ClipScore]:
+    """A method's prediction and its metrics; None and the reason where it has none."""
     try:
         prediction = method.predict(truth.clip.images)
     except (PredictionError, MemoryError) as error:
@@ -249,6 +252,7 @@ def _collected(
     records: ClipRecords,
     keys: Mapping[tuple[Clip, str], str],
 ) -> dict[str, Any]:
+    """`benchmarks`, `summary`, `failures` and `figures` of results.json, from the records of this run's clips."""
     summary: list[dict[str, Any]] = []
     failures: list[dict[str, Any]] = []
     described: list[dict[str, Any]] = []
@@ -304,6 +308,7 @@ def _score(record: Mapping[str, Any]) -> ClipScore:
 
 
 def _where(clip: Clip) -> dict[str, Any]:
+    """A clip's address in results."""
     protocol = clip.benchmark.protocol
     return {"benchmark": protocol.name, "sequence": clip.sequence, "frames": protocol.frames.wanted}
 

@@ -13,7 +13,7 @@ from logvggt_jax.evaluation.methods.method import ClipPrediction, Method
 from logvggt_jax.evaluation.progress import track
 from logvggt_jax.evaluation.protocols.protocol import DepthMeasure, PointsMeasure, Protocol
 from logvggt_jax.evaluation.scratch import scratch_array
-from logvggt_jax.geometry import camera_centres, invert, umeyama, unproject
+from logvggt_jax.geometry import camera_centres, invert, umeyama, unproject_pixels
 from logvggt_jax.metrics.depth import DEPTH_KEYS, mean_depth_metrics, pixel_errors, resize_depth, valid_depth
 from logvggt_jax.metrics.errors import NotMeasurable
 from logvggt_jax.metrics.points import estimate_normals, point_cloud_metrics, sample_indices
@@ -79,7 +79,7 @@ def prepare_truth(clip: ClipData, points: PointsMeasure | None) -> ClipTruth:
     indices = valid_indices(clip.depth, points)
     if not indices.size:
         return ClipTruth(clip)
-    cloud = points_at(clip.depth, clip.intrinsics, clip.extrinsics, indices)
+    cloud = unproject_pixels(clip.depth, clip.intrinsics, clip.extrinsics, indices)
     return ClipTruth(clip, indices, cloud, estimate_normals(cloud))
 
 
@@ -136,14 +136,12 @@ def benchmark_score(
     result: dict[str, float] = {"clips": planned, "clips_measured": sum(bool(score.metrics) for _, score in scores)}
     if protocol.depth is not None and method.depth:
         result |= _depth_means([score.metrics for _, score in scores], protocol.depth)
-    for prefix in ("", SFM):
+    second = any(key.startswith(SFM) for _, score in scores for key in score.metrics)
+    for prefix in ("", SFM) if second else ("",):
         if protocol.poses and method.pose:
             result |= _pose_means(scores, prefix, protocol.pooled)
         if protocol.trajectory and method.pose:
             result |= _plain_means(scores, f"{prefix}trajectory", [prefix + key for key in TRAJECTORY_KEYS])
-        for group in ("pose", "trajectory"):
-            if prefix and not result.get(f"clips_{prefix}{group}"):
-                result.pop(f"clips_{prefix}{group}", None)
     if protocol.points is not None and method.points:
         result |= _plain_means(scores, "points", POINT_KEYS)
     return result
@@ -165,24 +163,6 @@ def valid_indices(depth: np.ndarray, points: PointsMeasure) -> np.ndarray:
         for t, frame in enumerate(depth)
     ]
     return np.concatenate(chosen)
-
-
-def points_at(depth: np.ndarray, intrinsics: np.ndarray, extrinsics: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """World points [N, 3] float64 of the pixels `indices` [N] (sorted, flat in [T, H, W]).
-
-    One frame at a time, so that a long clip never has all its points in memory.
-    """
-    pixels = depth.shape[1] * depth.shape[2]
-    borders = np.searchsorted(indices, np.arange(len(depth) + 1) * pixels)
-    clouds = []
-    for t in track(range(len(depth)), len(depth), "points"):
-        frame = unproject(
-            np.asarray(depth[t], np.float64),
-            np.asarray(intrinsics[t], np.float64),
-            np.asarray(extrinsics[t], np.float64),
-        )
-        clouds.append(frame.reshape(-1, 3)[indices[borders[t] : borders[t + 1]] - t * pixels])
-    return np.concatenate(clouds)
 
 
 def valid_pixels(prediction: np.ndarray, target: np.ndarray, max_depth: float | None) -> tuple[np.ndarray, np.ndarray]:
@@ -220,7 +200,7 @@ def aligned_points(prediction: ClipPrediction, truth: ClipTruth) -> np.ndarray:
         raise ValueError(f"predicted depth {depth.shape} must have the shape of the true one {truth.clip.depth.shape}")
     if prediction.intrinsics is None:
         raise ValueError("points need predicted intrinsics")
-    cloud = points_at(depth, prediction.intrinsics, prediction.extrinsics, truth.indices)
+    cloud = unproject_pixels(depth, prediction.intrinsics, prediction.extrinsics, truth.indices)
     try:
         return umeyama(cloud, truth.points).apply(cloud)
     except ValueError as error:
@@ -228,6 +208,7 @@ def aligned_points(prediction: ClipPrediction, truth: ClipTruth) -> np.ndarray:
 
 
 def _middle(size: tuple[int, ...], crop: int | None) -> tuple[slice, slice]:
+    """Rows and columns of the middle crop x crop pixels of pictures (H, W); all where there is no crop."""
     if crop is None:
         return slice(None), slice(None)
     rows, columns = (slice(max(0, edge // 2 - crop // 2), edge // 2 + crop // 2) for edge in size)
@@ -235,6 +216,7 @@ def _middle(size: tuple[int, ...], crop: int | None) -> tuple[slice, slice]:
 
 
 def _depth(prediction: ClipPrediction, clip: ClipData, measure: DepthMeasure) -> dict[str, float]:
+    """`<alignment>/<error>` of predicted depth [T, h, w] against the true [T, H, W], and `valid_pixels`."""
     depth = _finite_depth(prediction)
     assert clip.depth is not None  # read where the protocol measures depth
     pixels = valid_pixels(depth, clip.depth, measure.max_depth)
@@ -251,6 +233,7 @@ def _depth(prediction: ClipPrediction, clip: ClipData, measure: DepthMeasure) ->
 
 
 def _pose(prediction: ClipPrediction, true: np.ndarray) -> dict[str, float]:
+    """Means over all pairs of frames, against true world-to-camera extrinsics [T, 4, 4]."""
     rotation, translation = relative_pose_errors(prediction.extrinsics, true)
     identity_rotation, _ = relative_pose_errors(np.tile(np.eye(4), (len(true), 1, 1)), true)
     wide = pose_accuracy(rotation, translation, 30)
@@ -266,6 +249,7 @@ def _pose(prediction: ClipPrediction, true: np.ndarray) -> dict[str, float]:
 
 
 def _trajectory(prediction: ClipPrediction, extrinsics: np.ndarray, static: bool) -> dict[str, float]:
+    """Errors of camera positions, against true world-to-camera extrinsics [T, 4, 4]; metres where the set is metric."""
     true = np.asarray(extrinsics, np.float64)
     radius = rms_radius(camera_centres(true))
     if static:
@@ -277,12 +261,14 @@ def _trajectory(prediction: ClipPrediction, extrinsics: np.ndarray, static: bool
 
 
 def _points(prediction: ClipPrediction, truth: ClipTruth, icp_threshold: float | None) -> dict[str, float]:
+    """Errors of the aligned cloud [N, 3] against the true one; metres where the set is metric."""
     cloud = aligned_points(prediction, truth)
     assert truth.points is not None  # aligned_points has looked
     return point_cloud_metrics(cloud, truth.points, target_normals=truth.normals, icp_threshold=icp_threshold)
 
 
 def _finite_depth(prediction: ClipPrediction) -> np.ndarray:
+    """Predicted depth [T, h, w]; NotMeasurable where a value is not finite."""
     depth = prediction.depth
     if depth is None:
         raise ValueError("the method predicts no depth")
@@ -293,6 +279,7 @@ def _finite_depth(prediction: ClipPrediction) -> np.ndarray:
 
 
 def _depth_means(metrics: Sequence[Mapping[str, float]], measure: DepthMeasure) -> dict[str, float]:
+    """Means over the clips that have depth errors, weighted by valid pixels."""
     measured = [m for m in metrics if "valid_pixels" in m]
     result: dict[str, float] = {"clips_depth": len(measured)}
     for alignment in measure.alignments:
@@ -307,6 +294,7 @@ def _depth_means(metrics: Sequence[Mapping[str, float]], measure: DepthMeasure) 
 
 
 def _pose_means(scores: Sequence[tuple[str, ClipScore]], prefix: str, pooled: bool) -> dict[str, float]:
+    """Means over clips (pooled: over the pairs of a category, then over categories) of the metrics with a prefix."""
     keys = [prefix + key for key in POSE_KEYS]
     result = _plain_means(scores, f"{prefix}pose", keys)
     measured = [(name, score.metrics) for name, score in scores if keys[0] in score.metrics]
@@ -329,6 +317,7 @@ def _pose_means(scores: Sequence[tuple[str, ClipScore]], prefix: str, pooled: bo
 
 
 def _plain_means(scores: Sequence[tuple[str, ClipScore]], group: str, keys: Sequence[str]) -> dict[str, float]:
+    """Means of `keys` over the clips that have the first of them, and how many those are."""
     measured = [score.metrics for _, score in scores if keys[0] in score.metrics]
     result: dict[str, float] = {f"clips_{group}": len(measured)}
     for key in keys:

@@ -9,7 +9,7 @@ from typing import Any
 from logvggt_jax.config import from_mapping, require_counts
 from logvggt_jax.errors import InputError
 from logvggt_jax.evaluation.costs.throughput import TimingConfig
-from logvggt_jax.evaluation.methods.references import ReferenceConfig
+from logvggt_jax.evaluation.methods.rows import ReferenceConfig
 from logvggt_jax.evaluation.protocols import ProtocolSettings
 from logvggt_jax.evaluation.protocols.clips import ClipSettings
 
@@ -21,7 +21,7 @@ class Run:
     Attributes:
       title: of the report.
       baselines: whether answers that need no learning are evaluated beside the model.
-      methods: rows of the model, names of `logvggt_jax.streaming.predictor.METHODS`; the first one is drawn.
+      methods: rows of the model, names of `logvggt_jax.streaming.METHODS`; the first one is drawn.
       references: limits of the methods `offline` and `chunks`.
       variants: names of `logvggt_jax.evaluation.methods.variants.VARIANTS` that are evaluated beside the methods.
     """
@@ -90,4 +90,6 @@ def read_run(values: Mapping[str, Any]) -> ClipRun | PaperRun:
     Raises:
       InputError: an unknown, missing or impossible field; named.
     """
-    return from_mapping(PaperRun if "benchmarks" in values else ClipRun, values, "config")
+    if "benchmarks" in values:
+        return from_mapping(PaperRun, values, "config")
+    return from_mapping(ClipRun, values, "config")

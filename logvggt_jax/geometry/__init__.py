@@ -13,6 +13,7 @@ from logvggt_jax.geometry.cameras import (
     relative_to_first,
     transform_points,
     unproject,
+    unproject_pixels,
 )
 from logvggt_jax.geometry.pose_encoding import decode_poses, encode_poses
 from logvggt_jax.geometry.rotations import (
@@ -41,4 +42,5 @@ __all__ = [
     "transform_points",
     "umeyama",
     "unproject",
+    "unproject_pixels",
 ]

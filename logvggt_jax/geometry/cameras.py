@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from logvggt_jax.geometry.rotations import namespace
 
 
@@ -68,6 +70,30 @@ def unproject(depth: Any, intrinsics: Any, extrinsics: Any | None = None) -> Any
         return points
     flat = points.reshape((*points.shape[:-3], height * width, 3))
     return transform_points(invert(extrinsics), flat).reshape(points.shape)
+
+
+def unproject_pixels(
+    depth: np.ndarray, intrinsics: np.ndarray, extrinsics: np.ndarray, indices: np.ndarray
+) -> np.ndarray:
+    """World points [N, 3] float64 of some pixels of a clip (numpy), as `unproject` gives them for all.
+
+    Args:
+      depth: [T, H, W] z-depth; may be a memory map, of which one frame at a time is read.
+      intrinsics: [T, 3, 3] in pixels.
+      extrinsics: [T, 3|4, 4], world-to-camera.
+      indices: [N], sorted and flat in [T, H, W].
+    """
+    height, width = depth.shape[1:]
+    borders = np.searchsorted(indices, np.arange(len(depth) + 1) * height * width)
+    points = np.empty((len(indices), 3))
+    for t in range(len(depth)):
+        chosen = slice(borders[t], borders[t + 1])
+        v, u = np.divmod(indices[chosen] - t * height * width, width)
+        matrix, z = np.asarray(intrinsics[t], np.float64), depth[t][v, u].astype(np.float64)
+        rays = [(u - matrix[0, 2]) / matrix[0, 0], (v - matrix[1, 2]) / matrix[1, 1], np.ones_like(z)]
+        in_camera = np.stack(rays, axis=-1) * z[:, None]
+        points[chosen] = transform_points(invert(np.asarray(extrinsics[t], np.float64)), in_camera)
+    return points
 
 
 def project(points: Any, intrinsics: Any, extrinsics: Any | None = None) -> tuple[Any, Any]:

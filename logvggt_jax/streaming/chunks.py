@@ -17,7 +17,7 @@ import jax
 import numpy as np
 
 from logvggt_jax.errors import InputError
-from logvggt_jax.geometry import Similarity, robust_similarity, unproject
+from logvggt_jax.geometry import Similarity, robust_similarity, unproject_pixels
 from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.streaming.offline import FinalFrames, PlainPrediction, predict_plain
 from logvggt_jax.streaming.results import Cameras, FrameResult, PredictionError, checked_frames, device_memory
@@ -184,7 +184,8 @@ def align(source: PlainPrediction, target: PlainPrediction) -> Similarity:
     weights = np.sqrt(source.depth_confidence.reshape(-1)[chosen].astype(np.float64))
     weights *= np.sqrt(target.depth_confidence.reshape(-1)[chosen].astype(np.float64))
     threshold = _HUBER_THRESHOLD * float(np.median(target.depth.reshape(-1)[chosen]))
-    return robust_similarity(_points(source, chosen), _points(target, chosen), weights, threshold=threshold)
+    clouds = [unproject_pixels(each.depth, each.intrinsics, each.extrinsics, chosen) for each in (source, target)]
+    return robust_similarity(*clouds, weights, threshold=threshold)
 
 
 def move(prediction: PlainPrediction, similarity: Similarity) -> PlainPrediction:
@@ -206,14 +207,3 @@ def _confident(source: PlainPrediction, target: PlainPrediction) -> np.ndarray:
         least = _LEAST_CONFIDENCE * min(float(np.median(p.depth_confidence[valid])) for p in (source, target))
         valid &= (source.depth_confidence > least) & (target.depth_confidence > least)
     return valid
-
-
-def _points(prediction: PlainPrediction, indices: np.ndarray) -> np.ndarray:
-    """World points [N, 3] float64 of pixels `indices` [N], sorted and flat in [n, H, W]; frame by frame."""
-    pixels = prediction.depth[0].size
-    borders = np.searchsorted(indices, np.arange(len(prediction.depth) + 1) * pixels)
-    points = []
-    for t in range(len(prediction.depth)):
-        frame = [np.asarray(x[t], np.float64) for x in (prediction.depth, prediction.intrinsics, prediction.extrinsics)]
-        points.append(unproject(*frame).reshape(-1, 3)[indices[borders[t] : borders[t + 1]] - t * pixels])
-    return np.concatenate(points)

@@ -93,6 +93,7 @@ def test_the_version_of_the_code_is_that_of_its_statements(tmp_path: Path) -> No
         return code_version(package=tmp_path)
 
     for name in environment._DECIDING:
+        assert (environment._PACKAGE / name).exists()
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).touch() if name.endswith(".py") else (tmp_path / name).mkdir(exist_ok=True)
     first = version("model/layers.py", 'def f(x):\n    """Doubles."""\n    return 2 * x\n')

@@ -19,22 +19,12 @@ from logvggt_jax.evaluation.scores import (
     ClipScore,
     benchmark_score,
     clip_score,
-    points_at,
     prepare_truth,
     valid_pixels,
 )
 from logvggt_jax.evaluation.scratch import scratch_array
-from logvggt_jax.geometry import unproject
 from logvggt_jax.metrics import depth_metrics
 from logvggt_jax.metrics.depth import pixel_errors, resize_depth
-
-
-def test_points_of_chosen_pixels_equal_those_of_all(rooms: Rooms) -> None:
-    frames = rooms.read(rooms.sequences[0], [0, 5, 9])
-    points = unproject(*(np.asarray(x, np.float64) for x in (frames.depth, frames.intrinsics, frames.extrinsics)))
-    indices = np.array([0, 17, 28 * 42 - 1, 2 * 28 * 42, 3 * 28 * 42 - 1])
-    chosen = points_at(frames.depth, frames.intrinsics, frames.extrinsics, indices)
-    np.testing.assert_allclose(chosen, points.reshape(-1, 3)[indices])
 
 
 def test_invalid_pixels_give_no_true_points(rooms: Rooms) -> None:

@@ -17,6 +17,7 @@ from logvggt_jax.geometry import (
     relative_to_first,
     transform_points,
     unproject,
+    unproject_pixels,
 )
 
 HEIGHT, WIDTH = 6, 8
@@ -87,3 +88,11 @@ def test_a_point_in_the_cameras_plane_has_no_pixel() -> None:
     pixels, depth = project(np.array([[1.0, 1.0, 0.0]]), intrinsics())
     assert depth[0] == 0.0
     assert np.isnan(pixels).all()
+
+
+def test_chosen_pixels_have_the_points_that_all_of_them_have() -> None:
+    depth = np.random.default_rng(1).uniform(1, 3, (3, HEIGHT, WIDTH)).astype(np.float32)
+    everything = unproject(depth.astype(np.float64), intrinsics(3), poses(3)).reshape(-1, 3)
+    # Frame 1 has none.
+    chosen = np.array([0, 17, HEIGHT * WIDTH - 1, 2 * HEIGHT * WIDTH, 3 * HEIGHT * WIDTH - 1])
+    np.testing.assert_allclose(unproject_pixels(depth, intrinsics(3), poses(3), chosen), everything[chosen])

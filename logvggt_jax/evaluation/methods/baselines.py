@@ -11,7 +11,7 @@ import numpy as np
 from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.data.feeding.transforms import fit
 from logvggt_jax.errors import InputError
-from logvggt_jax.evaluation.methods.method import Checkpoint, ClipPrediction, Method, network
+from logvggt_jax.evaluation.methods.method import Checkpoint, ClipPrediction, Method, model_row
 from logvggt_jax.model.logvggt import LogVGGT
 
 
@@ -71,19 +71,6 @@ def depth_statistics(
     return DepthStatistics(mean_depth, mean_map, np.mean(intrinsics, axis=0), source)
 
 
-def constant_depth(statistics: DepthStatistics) -> Method:
-    """Every pixel at the mean depth, seen by a camera that never moves."""
-    depth = np.full_like(statistics.mean_map, statistics.mean_depth)
-    return _fixed_depth("constant depth", "mean depth and mean intrinsics", depth, statistics)
-
-
-def mean_depth_map(statistics: DepthStatistics) -> Method:
-    """Every pixel at its own mean depth, seen by a camera that never moves."""
-    return _fixed_depth(
-        "mean depth map", "mean depth of each pixel and mean intrinsics", statistics.mean_map, statistics
-    )
-
-
 def unit_depth() -> Method:
     """Every pixel at depth 1, at any image size; the alignment gives it the clip's scale."""
 
@@ -107,7 +94,9 @@ def untrained(model: LogVGGT, image_size: tuple[int, int], *, seed: int = 0) -> 
     """The same network with random parameters."""
     variables = model.init(jax.random.key(seed), jnp.zeros((1, 1, *image_size, 3), jnp.uint8))
     knows = f"nothing (random parameters, seed {seed})"
-    return network(Checkpoint(model, variables, knows), name="untrained network", knows=knows)
+    return model_row(
+        "windows", Checkpoint(model, jax.device_put(variables), knows), name="untrained network", knows=knows
+    )
 
 
 def all_baselines(
@@ -123,15 +112,18 @@ def all_baselines(
       seed: of the random parameters.
     """
     statistics = depth_statistics(dataset, image_size, source=source)
+    constant = np.full_like(statistics.mean_map, statistics.mean_depth)
     return [
-        constant_depth(statistics),
-        mean_depth_map(statistics),
+        _fixed_depth("constant depth", "mean depth", constant, statistics),
+        _fixed_depth("mean depth map", "mean depth of each pixel", statistics.mean_map, statistics),
         static_camera(),
         untrained(model, image_size, seed=seed),
     ]
 
 
 def _fixed_depth(name: str, knows: str, depth: np.ndarray, statistics: DepthStatistics) -> Method:
+    """The same depth map [H, W] for every frame, seen by a camera that never moves."""
+
     def predict(images: np.ndarray) -> ClipPrediction:
         frames = len(images)
         return ClipPrediction(
@@ -140,16 +132,18 @@ def _fixed_depth(name: str, knows: str, depth: np.ndarray, statistics: DepthStat
             np.broadcast_to(statistics.intrinsics, (frames, 3, 3)),
         )
 
-    knows = f"{knows} of {statistics.source}; static camera"
+    knows = f"{knows} and mean intrinsics of {statistics.source}; static camera"
     identity = [array.tolist() for array in (depth, statistics.intrinsics)]
     return Method(name, knows, predict, identity, pose=False)
 
 
 def _identities(count: int) -> np.ndarray:
+    """[count, 4, 4]."""
     return np.tile(np.eye(4), (count, 1, 1))
 
 
 def _evenly(count: int, at_most: int) -> list[int]:
+    """At most so many evenly spaced numbers below `count`, the first and the last among them."""
     if count <= at_most:
         return list(range(count))
     return [int(i) for i in np.linspace(0, count - 1, at_most).round()]

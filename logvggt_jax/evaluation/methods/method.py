@@ -10,9 +10,11 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from logvggt_jax.evaluation.progress import track
 from logvggt_jax.evaluation.records import record_key
-from logvggt_jax.evaluation.streaming import stream_clip
+from logvggt_jax.evaluation.scratch import scratch_array
 from logvggt_jax.model.logvggt import LogVGGT, Variables
+from logvggt_jax.streaming import Predictor, open_predictor
 from logvggt_jax.weights.checkpoints import digests, load_model
 
 
@@ -51,10 +53,6 @@ class Checkpoint:
         return cls(model, jax.device_put(variables), record_key(digests(variables["params"])))
 
 
-class PredictionError(ValueError):
-    """A method cannot predict a clip: too long for the memory, nothing to align. The clip counts as failed for it."""
-
-
 @dataclasses.dataclass(frozen=True)
 class Method:
     """A row of the table.
@@ -66,6 +64,7 @@ class Method:
         PredictionError where it has none.
       identity: what decides the predictions of given images besides the code, as JSON values: sizes, parameters,
         settings. What it does not name is taken for unchanged by a later run.
+      start: opens the predictor behind `predict`, to be timed; None for what has none.
       depth: whether depth is measured.
       pose: whether poses are measured.
       points: whether the point cloud is measured.
@@ -77,16 +76,54 @@ class Method:
     knows: str
     predict: Callable[[np.ndarray], ClipPrediction]
     identity: Any = None
+    start: Callable[[], Predictor] | None = None
     depth: bool = True
     pose: bool = True
     points: bool = True
     static: bool = False
 
 
-def network(checkpoint: Checkpoint, *, name: str = "LoG-VGGT", knows: str = "its training") -> Method:
-    """The model as a method: clips of any length are streamed, see `stream_clip`."""
+def predicted(predictor: Predictor, images: np.ndarray) -> ClipPrediction:
+    """A whole clip through a predictor; depth goes to disk as it comes, where the clip is long.
 
-    def predict(images: np.ndarray) -> ClipPrediction:
-        return ClipPrediction(*stream_clip(checkpoint.model, checkpoint.variables, images))
+    Args:
+      predictor: to which no frame has been pushed. It is closed afterwards.
+      images: [T, H, W, 3] uint8; may be a memory map.
 
-    return Method(name, knows, predict, identity=["windows", checkpoint.model.config.to_dict(), checkpoint.digest])
+    Raises:
+      PredictionError: the predictor cannot take this clip.
+    """
+    depth = scratch_array(images.shape[:3], np.float32)
+    for image in track(images, len(images), f"network, {len(images)} frames"):
+        for result in predictor.push(image):
+            depth[result.index] = result.depth
+    for result in predictor.close():
+        depth[result.index] = result.depth
+    cameras = predictor.cameras()
+    return ClipPrediction(depth, cameras.extrinsics, cameras.intrinsics)
+
+
+def model_row(
+    method: str,
+    checkpoint: Checkpoint,
+    settings: Any = None,
+    *,
+    name: str = "LoG-VGGT",
+    knows: str = "its training",
+) -> Method:
+    """A row of the model, run by one of the methods of `logvggt_jax.streaming`.
+
+    Args:
+      method: its name in the registry.
+      checkpoint: the model.
+      settings: the method's own dataclass; None for its defaults.
+      name: label of the row.
+      knows: for the reader of the table.
+    """
+
+    def start() -> Predictor:
+        return open_predictor(method, checkpoint.model, checkpoint.variables, settings)
+
+    described = None if settings is None else dataclasses.asdict(settings)
+    identity = [method, described, checkpoint.model.config.to_dict(), checkpoint.digest]
+    return Method(name, knows, lambda images: predicted(start(), images), identity, start)

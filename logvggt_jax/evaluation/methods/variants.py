@@ -11,14 +11,9 @@ import numpy as np
 
 from logvggt_jax.config import ModelConfig
 from logvggt_jax.errors import InputError
-from logvggt_jax.evaluation.methods.method import Checkpoint, ClipPrediction, Method
-from logvggt_jax.evaluation.streaming import (
-    StreamedWindows,
-    refined_cameras,
-    stream_windows,
-    without_refinement,
-)
-from logvggt_jax.model.logvggt import LogVGGT
+from logvggt_jax.evaluation.methods.method import Checkpoint, ClipPrediction, Method, model_row, predicted
+from logvggt_jax.model.logvggt import LogVGGT, Variables
+from logvggt_jax.streaming import StreamSession
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,18 +32,17 @@ class Variant:
     refinement: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     online: bool = False
 
-    def config(self, base: ModelConfig, *, limited_trunk: bool) -> ModelConfig:
+    def config(self, base: ModelConfig, *, context: int | None = None) -> ModelConfig:
         """A checkpoint's configuration, changed.
 
         Args:
           base: the checkpoint's.
-          limited_trunk: whether the camera head's trunk sees frame 0 and the last K frames, K being the window's
-            size, instead of all. A trunk over all frames is a global path of its own, beside which the others
-            hardly show.
+          context: frames that the camera head's trunk sees beside frame 0; None for all. A trunk over all frames is
+            a global path of its own, beside which the others hardly show.
         """
         windows = dataclasses.replace(base.windows, **{"cross_window": True, **self.windows})
-        refinement = {"enabled": True, "period": windows.stride if self.online else None, **self.refinement}
-        refinement["context"] = windows.size if limited_trunk else None
+        period = windows.stride if self.online else None
+        refinement = {"enabled": True, "period": period, **self.refinement, "context": context}
         return dataclasses.replace(base, windows=windows, refinement=dataclasses.replace(base.refinement, **refinement))
 
 
@@ -89,38 +83,39 @@ def variant_methods(checkpoint: Checkpoint, names: Sequence[str]) -> list[Method
     for name in names:
         if name not in VARIANTS:
             raise InputError(f"variants: unknown {name!r}; known are {', '.join(VARIANTS)}")
-    base, clips = checkpoint.model.config, _LastClip(checkpoint.variables)
+    base, clips = checkpoint.model.config, _SharedStream(checkpoint.variables)
     methods: dict[ModelConfig, Method] = {}
     for name in names:
-        for limited in (False, True):
-            variant = VARIANTS[name]
-            config = variant.config(base, limited_trunk=limited)
-            trunk = f"trunk {config.refinement.context}" if limited else "trunk all"
+        variant = VARIANTS[name]
+        for context in (None, variant.windows.get("size", base.windows.size)):
+            config = variant.config(base, context=context)
+            trunk = f"trunk {context or 'all'}"
             knows = "its training" if config == base else "its training, which was not for this variant"
-            predict = functools.partial(clips.predict, LogVGGT(config))
-            identity = ["windows", config.to_dict(), checkpoint.digest]
-            methods.setdefault(config, Method(f"{variant.label}, {trunk}", knows, predict, identity))
+            predict = functools.partial(clips.predict, config)
+            row = model_row("windows", dataclasses.replace(checkpoint, model=LogVGGT(config)), knows=knows)
+            row = dataclasses.replace(row, name=f"{variant.label}, {trunk}", predict=predict)
+            methods.setdefault(config, row)
     return list(methods.values())
 
 
-class _LastClip:
-    """Runs variants; those that differ in refinement alone share the windows of a clip.
+class _SharedStream:
+    """Runs variants; those that differ in refinement alone share the stream of a clip, which is nearly all of the cost.
 
-    Windows are nearly all of the cost. Only the last clip's output of the last windows is kept.
+    Only the last clip's stream is kept.
     """
 
-    def __init__(self, variables: dict[str, Any]) -> None:
+    def __init__(self, variables: Variables) -> None:
         self._variables = variables
-        self._images: np.ndarray | None = None
-        self._model: LogVGGT | None = None
-        self._windows: StreamedWindows | None = None
+        self._last: tuple[np.ndarray, ModelConfig, StreamSession, ClipPrediction] | None = None
 
-    def predict(self, model: LogVGGT, images: np.ndarray) -> ClipPrediction:
-        """The model's prediction of images [T, H, W, 3]; device memory does not grow with T, see `stream_clip`."""
-        plain = without_refinement(model)
-        if self._windows is None or self._images is not images or self._model != plain:
-            self._windows = None  # before the next is made
-            self._windows = stream_windows(plain, self._variables, images)
-            self._images, self._model = images, plain
-        cameras = refined_cameras(model, self._variables, self._windows)
-        return ClipPrediction(self._windows.depth, *cameras)
+    def predict(self, config: ModelConfig, images: np.ndarray) -> ClipPrediction:
+        """The variant's prediction of images [T, H, W, 3]."""
+        settings = dataclasses.replace(config.refinement, enabled=True, period=None, context=None)
+        windows = dataclasses.replace(config, refinement=settings)
+        if self._last is None or self._last[0] is not images or self._last[1] != windows:
+            self._last = None  # before the next is made
+            session = StreamSession(LogVGGT(windows), self._variables)
+            self._last = images, windows, session, predicted(session, images)
+        *_, session, prediction = self._last
+        cameras = session.cameras_with(config.refinement)
+        return prediction._replace(extrinsics=cameras.extrinsics, intrinsics=cameras.intrinsics)

@@ -56,14 +56,15 @@ def test_windows_run_once_for_all_refinements(
     small_config: ModelConfig, small_variables: dict, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     runs = []
-    original = module.stream_windows
-    monkeypatch.setattr(module, "stream_windows", lambda model, *rest: runs.append(model) or original(model, *rest))
-    methods = variant_methods(Checkpoint(LogVGGT(small_config), small_variables, ""), ("full", "no_gccr", "no_cwa"))
+    original = module.predicted
+    monkeypatch.setattr(module, "predicted", lambda session, images: runs.append(images) or original(session, images))
+    names = ("full", "no_gccr", "no_cwa")
+    methods = variant_methods(Checkpoint(LogVGGT(small_config), small_variables, ""), names)
     for _ in range(2):
         images = IMAGES.copy()
         predictions = {method.name: method.predict(images) for method in methods}
     assert np.abs(predictions["w/o GCCR, trunk 4"].extrinsics - predictions["full, trunk 4"].extrinsics).max() > 1e-5
-    assert [model.config.windows.cross_window for model in runs] == [True, False] * 2
+    assert len(runs) == 2 * 2, "with and without cross-window attention, for either clip"
 
 
 def test_the_same_model_has_one_row(small_config: ModelConfig, small_variables: dict) -> None:
@@ -77,16 +78,15 @@ def test_the_checkpoint_is_ablated_from_the_full_model(small_config: ModelConfig
     """Whatever a checkpoint was trained as, `full` has all parts, and refines once."""
     settings = dataclasses.replace(small_config.refinement, enabled=False, period=50, context=8)
     base = dataclasses.replace(small_config, refinement=settings, windows=WindowConfig(6, 3, cross_window=False))
-    full = VARIANTS["full"].config(base, limited_trunk=False)
+    full = VARIANTS["full"].config(base)
     assert full.windows == WindowConfig(6, 3)
     assert full.refinement == small_config.refinement
-    assert VARIANTS["gccr_online"].config(base, limited_trunk=True).refinement.period == 3
-    assert VARIANTS["windows_8_4"].config(base, limited_trunk=True).refinement.context == 8
-    assert VARIANTS["gccr_every_50"].config(base, limited_trunk=False).refinement.period == 50
+    assert VARIANTS["gccr_online"].config(base, context=6).refinement.period == 3
+    assert VARIANTS["gccr_every_50"].config(base).refinement.period == 50
 
 
 def test_every_variant_is_a_valid_model() -> None:
-    configs = {VARIANTS[name].config(ModelConfig(), limited_trunk=limited) for name in VARIANTS for limited in (0, 1)}
+    configs = {VARIANTS[name].config(ModelConfig(), context=context) for name in VARIANTS for context in (None, 16)}
     # cache_output and windows_4_2 are the full model at the paper's configuration.
     assert len(configs) == 2 * (len(VARIANTS) - 2)
 
