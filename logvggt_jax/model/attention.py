@@ -170,8 +170,8 @@ def _cudnn_forward(query: jax.Array, key: jax.Array, value: jax.Array, lengths: 
         lengths = jnp.full(key.shape[0], key.shape[1], jnp.int32)
 
     def padded(query: jax.Array, key: jax.Array, value: jax.Array) -> jax.Array:
-        even = [jnp.pad(x, ((0, 0), (0, x.shape[1] % 2), (0, 0), (0, 0))) for x in (query, key, value)]
-        return _cudnn_call(*even, lengths)[:, : query.shape[1]]
+        q, k, v = (jnp.pad(x, ((0, 0), (0, x.shape[1] % 2), (0, 0), (0, 0))) for x in (query, key, value))
+        return _cudnn_call(q, k, v, lengths)[:, : query.shape[1]]
 
     return jax.vjp(padded, query, key, value)
 
