@@ -9,11 +9,12 @@ Frames of reference are OpenCV's throughout: x right, y down, z forward, pixel c
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import jax
-import numpy as np
 from flax import struct
+
+from logvggt_jax.frames import Frames
+
+__all__ = ["Frames", "Predictions", "WindowOutput"]
 
 
 @struct.dataclass
@@ -69,21 +70,3 @@ class WindowOutput:
     frame_mask: jax.Array
     points: jax.Array | None = None
     points_confidence: jax.Array | None = None
-
-
-class Frames(NamedTuple):
-    """Frames of one sequence as a dataset hands them out, numpy arrays.
-
-    Attributes:
-      images: [T, H, W, 3] uint8 RGB.
-      depth: [T, H, W] float32 z-depth, metres where `metric`, 0 where invalid.
-      intrinsics: [T, 3, 3] float32, pixels of `images`.
-      extrinsics: [T, 4, 4] float32, world-to-camera (OpenCV), NaN where the set has no poses.
-      metric: whether lengths are metres.
-    """
-
-    images: np.ndarray
-    depth: np.ndarray
-    intrinsics: np.ndarray
-    extrinsics: np.ndarray
-    metric: bool

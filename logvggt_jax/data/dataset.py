@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from typing import Protocol
+import abc
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
-from logvggt_jax.types import Frames
-
-SPLITS = ("train", "val", "test", "all")
+from logvggt_jax.errors import InputError
+from logvggt_jax.frames import Frames
 
 
 class Dataset(Protocol):
@@ -41,10 +42,62 @@ class Dataset(Protocol):
         ...
 
 
-def check_split(split: str) -> None:
-    """Raises ValueError unless `split` is one of `SPLITS`."""
-    if split not in SPLITS:
-        raise ValueError(f"unknown split {split!r}: choose one of {', '.join(SPLITS)}")
+@dataclass(frozen=True)
+class About:
+    """What people need to know of a data set before they fetch it.
+
+    "Inferred" and "unknown" are meant: nobody read it in the set's own documents.
+
+    Attributes:
+      source: how one gets it.
+      licence: its terms.
+      size: bytes and counts, as far as known.
+      roles: `training`, `evaluation` or both, in the paper.
+      extra: extra of this package that its files need; None = none.
+    """
+
+    source: str
+    licence: str
+    size: str
+    roles: tuple[str, ...]
+    extra: str | None = None
+
+
+TRAINING, EVALUATION = "training", "evaluation"
+LICENCE_NOT_READ = "not read for this list: see the set's site"
+
+
+class Reader(abc.ABC):
+    """A `Dataset` that says what it is, made from its folder (where it needs one), a split, and options of its own.
+
+    Attributes:
+      name: as in `DATASETS`.
+      title: as its owners write it.
+      expects: what the root folder should hold.
+      metric: whether lengths are metres.
+      splits: those of `train`, `val`, `test` and `all` that it has.
+      about: where it comes from.
+      needs_root: whether it lies in a folder, the constructor's argument `root`; the others are made when read.
+    """
+
+    name: ClassVar[str]
+    title: ClassVar[str]
+    expects: ClassVar[str]
+    metric: ClassVar[bool]
+    splits: ClassVar[tuple[str, ...]]
+    about: ClassVar[About]
+    needs_root: ClassVar[bool] = True
+
+    @property
+    @abc.abstractmethod
+    def identity(self) -> Mapping[str, Any]:
+        """What decides the frames of a sequence besides the set's files; JSON values."""
+
+
+def check_split(split: str, reader: Reader) -> None:
+    """Raises InputError unless `reader` has `split`."""
+    if split not in reader.splits:
+        raise InputError(f"{reader.title} has no split {split!r}: choose one of {', '.join(reader.splits)}")
 
 
 def check_sequence(sequence: str, sequences: Collection[str], where: str) -> None:
@@ -66,7 +119,7 @@ def check_indices(indices: Sequence[int], num_frames: int, where: str) -> list[i
 
 
 def check_frames(frames: Frames, where: str, *, poses: bool = True) -> None:
-    """Raises ValueError, naming `where` and the frame, unless `frames` can be trained or evaluated on.
+    """Raises an error that names `where` and the frame unless `frames` can be trained or evaluated on.
 
     Checked: shapes and dtypes as `Frames` documents them, depth finite and not negative, intrinsics finite with
     positive focal lengths, extrinsics finite and rigid (rotation orthonormal to 1e-3, determinant +1).
@@ -76,6 +129,10 @@ def check_frames(frames: Frames, where: str, *, poses: bool = True) -> None:
       where: data set and sequence, for messages.
       poses: whether poses are needed. If not, extrinsics may be NaN throughout, as those of sets without poses are;
         extrinsics of which only a part is NaN are refused all the same.
+
+    Raises:
+      ValueError: wrong shapes or dtypes.
+      InputError: wrong values.
     """
     if frames.images.ndim != 4 or frames.images.shape[3] != 3 or frames.images.dtype != np.uint8:
         raise ValueError(f"{where}: images must be uint8 [T, H, W, 3], got {frames.images.dtype} {frames.images.shape}")
@@ -104,4 +161,4 @@ def check_frames(frames: Frames, where: str, *, poses: bool = True) -> None:
     for requirement, passed in checks.items():
         if not passed.all():
             frame = int(np.argmin(passed))
-            raise ValueError(f"{where}: {requirement}; frame {frame} of this read fails: repair or drop that frame")
+            raise InputError(f"{where}: {requirement}; frame {frame} of this read fails: repair or drop that frame")

@@ -1,20 +1,23 @@
 """What can be wrong with a copy of a data set, as exceptions that a check counts by kind.
 
-They are ValueErrors or FileNotFoundErrors, as callers expect of bad input; their message names the file and the mend.
+All are `InputError`; their message names the file and the mend.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import ClassVar
 
+from logvggt_jax.errors import InputError
 
-class MissingFiles(FileNotFoundError):
-    """Files that a sequence lacks; made by `missing_files`."""
+
+class MissingFiles(InputError, FileNotFoundError):
+    """Files or folders that are not there."""
 
     kind: ClassVar[str] = "missing file"
-    reasons: Mapping[Path, str]  # why each of them is needed, and the mend
+    reasons: Mapping[Path, str] = MappingProxyType({})  # of a sequence's files: why each is needed, and the mend
 
 
 def missing_files(reasons: Mapping[Path, str]) -> MissingFiles:
@@ -27,43 +30,52 @@ def missing_files(reasons: Mapping[Path, str]) -> MissingFiles:
     return error
 
 
-class BrokenPicture(ValueError):
+def missing_file(path: str | Path) -> MissingFiles:
+    """The error for a picture or depth file that was listed and is no longer there."""
+    return MissingFiles(f"{path}: no such file; fetch it again or remove the frame's other files")
+
+
+class MissingPackage(InputError, ImportError):
+    """A package that a data set's files need; the message names the extra that brings it."""
+
+
+class BrokenPicture(InputError):
     """A picture or depth file that is truncated, damaged, or of another type than the set's."""
 
     kind: ClassVar[str] = "broken picture"
 
 
-class UnequalSizes(ValueError):
+class UnequalSizes(InputError):
     """Pictures and depth whose sizes do not belong together."""
 
     kind: ClassVar[str] = "unequal sizes"
 
 
-class UnequalCounts(ValueError):
+class UnequalCounts(InputError):
     """Pictures, depth or cameras that are not equal in number."""
 
     kind: ClassVar[str] = "unequal counts"
 
 
-class AbsurdIntrinsics(ValueError):
+class AbsurdIntrinsics(InputError):
     """Intrinsics that cannot belong to their picture."""
 
     kind: ClassVar[str] = "absurd intrinsics"
 
 
-class BadPose(ValueError):
+class BadPose(InputError):
     """A stored pose that is no rigid transform."""
 
     kind: ClassVar[str] = "pose that is no rotation"
 
 
-class EmptySequence(ValueError):
+class EmptySequence(InputError):
     """A sequence without any frame that counts."""
 
     kind: ClassVar[str] = "empty sequence"
 
 
-class EmptySplit(FileNotFoundError):
+class EmptySplit(InputError, FileNotFoundError):
     """A split whose lists are there and name none of the sequences that this copy has."""
 
     kind: ClassVar[str] = "empty split"

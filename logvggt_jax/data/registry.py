@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import inspect
 from pathlib import Path
+from typing import Any
 
-from logvggt_jax.data.dataset import Dataset, check_split
+from logvggt_jax.data.dataset import Dataset, Reader
 from logvggt_jax.data.readers.arkitscenes import ARKitScenes
 from logvggt_jax.data.readers.blendedmvs import BlendedMVS
 from logvggt_jax.data.readers.bonn import Bonn
 from logvggt_jax.data.readers.co3dv2 import Co3Dv2
-from logvggt_jax.data.readers.folder_dataset import FolderDataset
 from logvggt_jax.data.readers.hypersim import HyperSim
 from logvggt_jax.data.readers.kitti import KITTI
 from logvggt_jax.data.readers.mvs_synth import MVSSynth
@@ -24,8 +25,9 @@ from logvggt_jax.data.readers.tum import TUM
 from logvggt_jax.data.readers.virtual_kitti import VirtualKITTI
 from logvggt_jax.data.readers.wildrgbd import WildRGBD
 from logvggt_jax.data.rooms.rooms import Rooms
+from logvggt_jax.errors import InputError
 
-_FOR_TRAINING: tuple[type[FolderDataset], ...] = (
+_READERS: tuple[type[Reader], ...] = (
     Co3Dv2,
     BlendedMVS,
     ARKitScenes,
@@ -37,35 +39,46 @@ _FOR_TRAINING: tuple[type[FolderDataset], ...] = (
     Spring,
     HyperSim,
     Replica,
+    SevenScenes,
+    NRGBD,
+    Sintel,
+    Bonn,
+    KITTI,
+    TUM,
+    Rooms,
 )
-_FOR_EVALUATION: tuple[type[FolderDataset], ...] = (SevenScenes, NRGBD, Sintel, Bonn, KITTI, TUM)
-READERS: dict[str, type[FolderDataset]] = {reader.name: reader for reader in (*_FOR_TRAINING, *_FOR_EVALUATION)}
-"""Readers of the sets on disk, by name; the paper's training sets first."""
+READERS: dict[str, type[Reader]] = {reader.name: reader for reader in _READERS}
+"""Readers by name; the paper's training sets first, then those that it only evaluates on."""
 
-DATASETS: tuple[str, ...] = (*READERS, "rooms")
+DATASETS: tuple[str, ...] = tuple(READERS)
 """All names that `open_dataset` knows."""
 
 
-def open_dataset(name: str, root: str | Path | None, split: str = "all") -> Dataset:
+def open_dataset(name: str, root: str | Path | None, split: str = "all", **options: Any) -> Dataset:
     """Opens data set `name` (one of `DATASETS`) in folder `root`.
 
     Args:
       name: for example `seven_scenes`.
       root: the data set's folder; None for `rooms`, which are procedural.
       split: `train`, `val`, `test` or `all`, of those the set has; `all` needs no list file.
+      **options: further arguments of the set's reader; `rooms` has several, `arkitscenes` one.
 
     Raises:
-      ValueError: unknown name, a split that the set does not have, or a wrong `root`.
-      FileNotFoundError: the folder or a file in it is missing; named.
+      InputError: unknown name or option, a split that the set does not have, or a wrong `root`.
+      MissingFiles: the folder or a file in it is missing; named.
     """
-    check_split(split)
-    if name == "rooms":
-        if root is not None:
-            raise ValueError(f"rooms are procedural and have no folder, got root={root}: pass root=None")
-        return Rooms(split)
     if name not in READERS:
-        raise ValueError(f"unknown data set {name!r}: choose one of {', '.join(DATASETS)}")
+        raise InputError(f"unknown data set {name!r}: choose one of {', '.join(DATASETS)}")
     reader = READERS[name]
+    make: Any = reader
+    known = [option for option in inspect.signature(make).parameters if option not in ("root", "split")]
+    for option in options:
+        if option not in known:
+            raise InputError(f"{name}: unknown option {option!r}; known are {', '.join(known) or 'none'}")
+    if not reader.needs_root:
+        if root is not None:
+            raise InputError(f"{name} are made when they are read and have no folder, got root={root}: pass root=None")
+        return make(split=split, **options)
     if root is None:
-        raise ValueError(f"{name} needs root, the folder that holds {reader.expects}")
-    return reader(root, split)
+        raise InputError(f"{name} needs root, the folder that holds {reader.expects}")
+    return make(root=root, split=split, **options)

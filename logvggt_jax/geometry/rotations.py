@@ -4,10 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import jax
-import jax.numpy as jnp
-import numpy as np
-
 
 def namespace(array: Any) -> Any:
     """The array API namespace (numpy or jax.numpy) of an array."""
@@ -80,9 +76,9 @@ def rotation_angle(rotation_a: Any, rotation_b: Any) -> Any:
     return 2.0 * xp.arctan2(sine, quaternion[..., 3])
 
 
-def nearest_rotation(matrix: np.ndarray | jax.Array) -> Any:
+def nearest_rotation(matrix: Any) -> Any:
     """The rotation [..., 3, 3] nearest to a matrix [..., 3, 3] in the Frobenius norm (determinant +1)."""
-    xp: Any = np if isinstance(matrix, np.ndarray) else jnp
+    xp = namespace(matrix)
     u, _, vt = xp.linalg.svd(matrix)
     determinant = xp.sign(xp.linalg.det(u) * xp.linalg.det(vt))
     signs = xp.stack([xp.ones_like(determinant), xp.ones_like(determinant), determinant], axis=-1)

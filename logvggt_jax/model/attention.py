@@ -39,8 +39,8 @@ def attention(
       query: [B, queries, heads, head_dim].
       key: [B, keys, heads, head_dim], the query's dtype.
       value: [B, keys, heads, head_dim].
-      key_valid: bool [B, keys], False for keys that nothing may attend to; None for all. A row of B without any
-        valid key gets finite values without meaning.
+      key_valid: bool [B, keys], False for keys that nothing may attend to, or int32 [B], the first so many count;
+        None for all. A row of B without any valid key gets finite values without meaning.
       implementation: `auto` (by the default device), `xla`, `cudnn` or `tpu_flash` (the Pallas kernel). What the
         last two cannot do takes `xla`, with one warning for each reason unless it is small.
 
@@ -55,12 +55,20 @@ def attention(
     }.get(implementation, (None, None))
     if kernel is not None and obstacle is None:
         return kernel(query, key, value, key_valid)
+    key_valid = _as_mask(key_valid, key.shape[1])
     batch, queries, heads, _ = query.shape
     if batch * heads * queries * key.shape[1] <= _SMALL_SCORES:
         return _batched(query, key, value, key_valid)
     if obstacle is not None:
         _warn_once(f"attention falls back from {implementation} to the general form, which is slower: {obstacle}")
     return _blockwise(query, key, value, key_valid)
+
+
+def _as_mask(key_valid: jax.Array | None, keys: int) -> jax.Array | None:
+    """bool [B, keys] of either form of validity."""
+    if key_valid is None or key_valid.ndim == 2:
+        return key_valid
+    return jnp.arange(keys) < key_valid[:, None]
 
 
 def _weights(scores: jax.Array, valid: jax.Array | None) -> jax.Array:
@@ -146,7 +154,9 @@ def _cudnn(query: jax.Array, key: jax.Array, value: jax.Array, key_valid: jax.Ar
     """cuDNN flash attention. Validity becomes a length: attention does not care about the order of keys, so
     valid ones go first; a dense mask would cost a bias of queries x keys."""
     lengths = None
-    if key_valid is not None:
+    if key_valid is not None and key_valid.ndim == 1:
+        lengths = jnp.maximum(key_valid, 1).astype(jnp.int32)
+    elif key_valid is not None:
         order = jnp.argsort(~key_valid, axis=1, stable=True)[..., None, None]
         key = jnp.take_along_axis(key, order, axis=1)
         value = jnp.take_along_axis(value, order, axis=1)
@@ -191,15 +201,16 @@ def _tpu_flash(query: jax.Array, key: jax.Array, value: jax.Array, key_valid: ja
     batch, queries, _, head_dim = query.shape
     keys = key.shape[1]
     q_block, k_block = _least_padding(queries), _least_padding(keys)
-    if key_valid is None:
-        key_valid = jnp.ones((batch, keys), bool)
+    valid = _as_mask(key_valid, keys)
+    if valid is None:
+        valid = jnp.ones((batch, keys), bool)
 
     def pad(x: jax.Array, block: int) -> jax.Array:
         return jnp.pad(x, ((0, 0), (0, -x.shape[1] % block)) + ((0, 0),) * (x.ndim - 2))
 
-    query, key, value, key_valid = pad(query, q_block), *(pad(x, k_block) for x in (key, value, key_valid))
+    query, key, value, valid = pad(query, q_block), *(pad(x, k_block) for x in (key, value, valid))
     segments = pallas.SegmentIds(
-        q=jnp.ones(query.shape[:2], jnp.int32), kv=jnp.where(key_valid, 1, 0).astype(jnp.int32)
+        q=jnp.ones(query.shape[:2], jnp.int32), kv=jnp.where(valid, 1, 0).astype(jnp.int32)
     )
     sizes = pallas.BlockSizes(
         block_q=q_block,

@@ -22,15 +22,8 @@ from logvggt_jax.training.config import DataConfig, SourceConfig, StageConfig
 
 
 def open_source(source: SourceConfig) -> Dataset:
-    """The data set of one source; options make a `Rooms` of that description."""
-    if source.name != "rooms":
-        if source.options:
-            raise InputError(f"data set {source.name!r} takes no options, got {dict(source.options)}; remove them")
-        return open_dataset(source.name, source.root, source.split)
-    try:
-        return Rooms(source.split, **dict(source.options))
-    except TypeError as error:
-        raise InputError(f"options of the data set 'rooms': {error}") from error
+    """The data set of one source, made with its options."""
+    return open_dataset(source.name, source.root, source.split, **dict(source.options))
 
 
 def open_sources(config: DataConfig, validation: SourceConfig | None = None) -> dict[str, Dataset]:

@@ -15,6 +15,7 @@ from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.processes import any_process
 from logvggt_jax.training.state import TrainState
 from logvggt_jax.weights.checkpoints import check_destination, digests, save_model, verify_digests
+from logvggt_jax.weights.provenance import Provenance
 
 # How fast, from where and with how many broken clips the data come; the data stream checks that they are the same.
 FREE_DATA_SETTINGS = ("worker_count", "num_threads", "cache_dir", "max_broken")
@@ -66,7 +67,7 @@ class RunCheckpoints:
         failure: Exception | None = None
         if jax.process_index() == 0:
             try:
-                save_model(self.model_folder, self.config.model, params)
+                save_model(self.model_folder, self.config.model, params, self._provenance())
             except Exception as error:
                 failure = error
         # The others would wait for the first one in the checkpoint below.
@@ -89,6 +90,11 @@ class RunCheckpoints:
             ),
             force=True,
         )
+
+    def _provenance(self) -> Provenance:
+        longer_edge = max(max(size) for stage in self.config.stages for size in stage.sizes)
+        start = self.config.initial_weights or "random parameters"
+        return Provenance("windows", longer_edge, source=f"trained from {start} in {self.folder.parent}")
 
     def restore(self, like: TrainState, *, step: int | None = None) -> tuple[TrainState, Position]:
         """The state at `step` (None: the latest), with the shapes and placement of `like`.

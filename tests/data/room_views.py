@@ -8,7 +8,7 @@ import numpy as np
 from analytic_room import camera_to_world, disagreement, view
 
 from logvggt_jax.data.dataset import check_frames
-from logvggt_jax.types import Frames
+from logvggt_jax.frames import Frames
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import pytest
 from analytic_room import camera_to_world, pinhole, view
 
 from logvggt_jax.data.dataset import check_frames
-from logvggt_jax.types import Frames
+from logvggt_jax.frames import Frames
 
 SIZE = (12, 16)
 

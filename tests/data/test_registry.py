@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
 
 from logvggt_jax.data import DATASETS, open_dataset
 from logvggt_jax.data.registry import READERS
+from logvggt_jax.errors import InputError
 
 
 def test_every_name_has_a_reader_of_that_name():
@@ -20,7 +22,7 @@ def test_every_name_has_a_reader_of_that_name():
         assert reader.title and reader.expects
 
 
-@pytest.mark.parametrize("name", READERS)
+@pytest.mark.parametrize("name", [name for name, reader in READERS.items() if reader.needs_root])
 def test_an_empty_or_missing_folder_is_named(name: str, tmp_path: Path):
     with pytest.raises(FileNotFoundError, match=f"{tmp_path}.*nowhere"):
         open_dataset(name, tmp_path / "nowhere")
@@ -47,3 +49,20 @@ def test_wrong_names_splits_and_roots_are_refused(tmp_path: Path):
         open_dataset("rooms", tmp_path)
     with pytest.raises(ValueError, match="needs root"):
         open_dataset("seven_scenes", None)
+
+
+def test_options_go_to_the_reader_and_unknown_ones_are_refused(tmp_path: Path):
+    rooms = open_dataset("rooms", None, "test", height=28, width=42, num_frames=3, num_rooms=1)
+    assert rooms.read(rooms.sequences[0], range(3)).images.shape == (3, 28, 42, 3)
+    with pytest.raises(InputError, match="rooms: unknown option 'hight'; known are height, width"):
+        open_dataset("rooms", None, hight=28)
+    with pytest.raises(InputError, match="replica: unknown option 'height'; known are none"):
+        open_dataset("replica", tmp_path, height=28)
+
+
+def test_identities_tell_apart_what_gives_other_frames():
+    rooms = [
+        open_dataset("rooms", None, "test", num_rooms=1, **options) for options in ({}, {"seed": 1}, {"width": 70})
+    ]
+    assert len({json.dumps(each.identity) for each in rooms}) == 3
+    assert rooms[0].identity == open_dataset("rooms", None, "test", num_rooms=1).identity

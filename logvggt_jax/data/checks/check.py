@@ -19,7 +19,8 @@ from logvggt_jax.data.checks.report import CheckReport, DepthRange, Problem, Seq
 from logvggt_jax.data.dataset import check_frames
 from logvggt_jax.data.errors import MissingFiles
 from logvggt_jax.data.readers.folder_dataset import FolderDataset
-from logvggt_jax.data.registry import DATASETS, READERS, open_dataset
+from logvggt_jax.data.registry import READERS, open_dataset
+from logvggt_jax.errors import InputError
 
 INCONSISTENT = 0.1
 """Relative difference above which depth, intrinsics and poses are said not to belong together.
@@ -60,17 +61,17 @@ def check_copy(
       progress: show a progress bar on stderr.
 
     Raises:
-      ValueError: unknown name or split, `max_sequences` below 1, or `picture` is no PNG file's name.
-      FileNotFoundError: no such folder, nothing of the set in it, or its list of sequences is missing.
-      ImportError: a package is missing that the set or the picture needs; names the extra that brings it.
+      InputError: unknown name or split, `max_sequences` below 1, or `picture` is no PNG file's name.
+      MissingFiles: no such folder, nothing of the set in it, or its list of sequences is missing.
+      MissingPackage: a package is missing that the set or the picture needs; names the extra that brings it.
     """
-    if name in set(DATASETS) - set(READERS):
-        raise ValueError(f"{name} are made when they are read: there is no copy to check")
+    if name in READERS and not READERS[name].needs_root:
+        raise InputError(f"{name} are made when they are read: there is no copy to check")
     if max_sequences is not None and max_sequences < 1:
-        raise ValueError(f"max_sequences must be at least 1, got {max_sequences}")
+        raise InputError(f"max_sequences must be at least 1, got {max_sequences}")
     picture = None if picture is None else check_picture_path(picture)
     dataset = open_dataset(name, root, split)
-    assert isinstance(dataset, FolderDataset)  # as all READERS
+    assert isinstance(dataset, FolderDataset)  # as all in folders
     chosen = dataset.sequences
     if max_sequences is not None and max_sequences < len(chosen):
         chosen = tuple(chosen[i] for i in _spread(len(chosen), max_sequences))
@@ -124,14 +125,13 @@ class _Problems:
         """Files an error of a reader; one that is no fault of the copy is raised again."""
         if isinstance(error, ImportError | MemoryError):
             raise error
-        if isinstance(error, MissingFiles):
+        if isinstance(error, MissingFiles) and error.reasons:
             for path, reason in error.reasons.items():
                 self.add(error.kind, f"{path}: no such file, {reason}")
             return
         message = " ".join(str(error).split())
-        if isinstance(error, ValueError | FileNotFoundError | NotADirectoryError):
-            other = "damaged file" if isinstance(error, ValueError) else MissingFiles.kind
-            self.add(getattr(error, "kind", other), message)
+        if isinstance(error, InputError):
+            self.add(getattr(error, "kind", "damaged file"), message)
         elif isinstance(error, OSError):
             self.add("unreadable file", message)
         else:

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from logvggt_jax.frames import Frames
 from logvggt_jax.geometry import project, unproject
-from logvggt_jax.types import Frames
 
 # Enough to tell how much of a picture another camera sees.
 _POINTS = 2000

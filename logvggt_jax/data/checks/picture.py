@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,9 +9,12 @@ from typing import Any
 import numpy as np
 
 from logvggt_jax.data.checks.report import SequenceReport
+from logvggt_jax.data.errors import MissingFiles, MissingPackage
 from logvggt_jax.data.readers.folder_dataset import FolderDataset
+from logvggt_jax.errors import InputError
+from logvggt_jax.files import atomic_file
+from logvggt_jax.frames import Frames
 from logvggt_jax.geometry import camera_centres, unproject
-from logvggt_jax.types import Frames
 
 _ARROWS = 40  # headings along a path
 _POINTS = 3000  # of a frame, in the view from above
@@ -22,16 +24,16 @@ def check_picture_path(path: str | Path) -> Path:
     """`path` as `write_check_picture` needs it, checked before hours of work.
 
     Raises:
-      ValueError: not the name of a PNG file.
-      FileNotFoundError: no such folder to write it to.
-      ImportError: matplotlib is missing; names the extra that brings it.
+      InputError: not the name of a PNG file.
+      MissingFiles: no such folder to write it to.
+      MissingPackage: matplotlib is missing; names the extra that brings it.
     """
     _figure_class()
     path = Path(path)
     if path.suffix.lower() != ".png":
-        raise ValueError(f"{path}: expected the name of a PNG file for the picture, such as check.png")
+        raise InputError(f"{path}: expected the name of a PNG file for the picture, such as check.png")
     if not path.absolute().parent.is_dir():
-        raise FileNotFoundError(f"{path.absolute().parent}: no such folder for the picture; make it or choose another")
+        raise MissingFiles(f"{path.absolute().parent}: no such folder for the picture; make it or choose another")
     return path
 
 
@@ -54,12 +56,8 @@ def write_check_picture(path: Path, dataset: FolderDataset, sequences: Sequence[
         )
         _draw_from_above(row[4], dataset.extrinsics(sequence.name), views)
     figure.suptitle(dataset.title, fontsize=10)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.png")
-    try:
+    with atomic_file(path) as temporary:
         figure.savefig(temporary, dpi=110)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def view_from_above(extrinsics: np.ndarray) -> np.ndarray:
@@ -123,7 +121,7 @@ def _figure_class() -> Any:
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise ImportError(
+        raise MissingPackage(
             f'the picture of a check needs matplotlib ({error}): pip install "logvggt-jax[eval]"'
         ) from error
     return Figure

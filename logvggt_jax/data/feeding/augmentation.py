@@ -7,6 +7,8 @@ from dataclasses import dataclass, fields
 import cv2
 import numpy as np
 
+from logvggt_jax.errors import InputError
+
 _LUMA = np.array([0.299, 0.587, 0.114])  # ITU-R BT.601
 _GREY_AXIS = np.array([[0.0, -1.0, 1.0], [1.0, 0.0, -1.0], [-1.0, 1.0, 0.0]]) / np.sqrt(3.0)
 
@@ -43,9 +45,9 @@ class ColourAugmentation:
         for name in (field.name for field in fields(self) if field.name != "blur_sigma"):
             value, limit = getattr(self, name), limits.get(name, 1.0)
             if not 0 <= value <= limit:
-                raise ValueError(f"augmentation.{name} must lie in [0, {limit:g}], got {value}")
+                raise InputError(f"augmentation.{name} must lie in [0, {limit:g}], got {value}")
         if len(self.blur_sigma) != 2 or not 0 < self.blur_sigma[0] <= self.blur_sigma[1]:
-            raise ValueError(f"augmentation.blur_sigma must be a pair 0 < low <= high, got {self.blur_sigma}")
+            raise InputError(f"augmentation.blur_sigma must be a pair 0 < low <= high, got {self.blur_sigma}")
 
     def __call__(self, images: np.ndarray, rng: np.random.Generator) -> None:
         """Changes `images`, uint8 RGB [T, H, W, 3] in C order, in place."""

@@ -6,122 +6,24 @@ together to batches, so that neither the batches nor what a worker holds in memo
 
 from __future__ import annotations
 
-import hashlib
 import signal
-import sys
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import cv2
 import grain
 import numpy as np
-from absl import flags, logging
+from absl import flags
 
-from logvggt_jax.data.dataset import Dataset, check_frames
+from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.data.feeding.augmentation import ColourAugmentation
-from logvggt_jax.data.feeding.broken_clips import BrokenClips, describe
-from logvggt_jax.data.feeding.sampling import Sampler, example_rng, sampler_for
-from logvggt_jax.data.feeding.transforms import fit_each, nearest_size
+from logvggt_jax.data.feeding.broken_clips import BrokenClips
+from logvggt_jax.data.feeding.clips import BROKEN, FIELDS, Size
+from logvggt_jax.data.feeding.mixture import mixture
+from logvggt_jax.data.feeding.sampling import sampler_for
+from logvggt_jax.errors import InputError
 
 Batch = dict[str, np.ndarray]
-Size = tuple[int, int]
-
-_FIELDS = ("images", "depth", "intrinsics", "extrinsics")
-_BROKEN = "broken"
-# So many clips in a row are broken only if nearly all of those sequences are.
-_MOST_REPLACEMENTS = 16
-_SHOWN = 16
-_SIZE_READERS = 16
-
-
-class _ClipReader:
-    """Reads example `index` of one data set in one size; a class, so that worker processes can unpickle it."""
-
-    def __init__(
-        self,
-        name: str,
-        dataset: Dataset,
-        sampler: Sampler,
-        size: Size,
-        seed: int,
-        augmentation: ColourAugmentation | None,
-        min_valid_depth: float,
-    ) -> None:
-        self.name, self.dataset, self.sampler, self.size, self.seed = name, dataset, sampler, size, seed
-        self.augmentation, self.min_valid_depth = augmentation, min_valid_depth
-
-    def __call__(self, index: int, sequence: str) -> Batch:
-        rng = example_rng(self.seed, index)
-        indices = [int(i) for i in self.sampler.draw(self.dataset, sequence, rng)]
-        # One frame at a time: a clip of large pictures would take a gigabyte.
-        frames = (self.dataset.read(sequence, [index]) for index in indices)
-        clip = fit_each(frames, len(indices), self.size)
-        where = f"{self.name}, {sequence}, frames {' '.join(map(str, indices))}"
-        check_frames(clip, where)
-        valid = np.count_nonzero(clip.depth > 0) / clip.depth.size
-        if valid < self.min_valid_depth:
-            raise ValueError(
-                f"{where}: {valid:.2%} of the pixels have depth, min_valid_depth={self.min_valid_depth:g} asks for more"
-            )
-        if self.augmentation is not None:
-            self.augmentation(clip.images, rng)
-        return {name: getattr(clip, name) for name in _FIELDS}
-
-
-class _ReplaceBroken:
-    """Reads from the first of `streams`; where that fails, the clip of the next index takes the clip's place.
-
-    Where many in a row fail, the next stream goes on from the same index.
-
-    Args:
-      streams: (reader, its sequences: index to name) each, all of one size.
-    """
-
-    def __init__(self, streams: Sequence[tuple[_ClipReader, grain.MapDataset]]) -> None:
-        self.streams = tuple(streams)
-
-    def __call__(self, index: int, sequence: str) -> dict[str, Any]:
-        broken: list[str] = []
-        for read, sequences in self.streams:
-            for position in range(index, index + _MOST_REPLACEMENTS):
-                try:
-                    # Of the clips passed over, later ones are reported in their own turn.
-                    return {**read(position, sequences[position]), _BROKEN: broken[:1]}
-                # Whatever a decoder raises: a run of a week is not to end for one file.
-                except Exception as error:
-                    broken.append(describe(error))
-        names = ", ".join(dict.fromkeys(read.name for read, _ in self.streams))
-        height, width = self.streams[0][0].size
-        raise ValueError(
-            f"{names}, pictures for {height} x {width}: {len(broken)} clips in a row are broken: "
-            f"{'; '.join(list(dict.fromkeys(broken))[:_SHOWN])}"
-        )
-
-
-class _OneSizeABatch:
-    """Examples of several sizes in such an order that each run of `batch_size` has one size.
-
-    Batch b holds the next examples of size `turns[b]` = (size, how many batches of that size came before).
-    """
-
-    def __init__(self, examples: Sequence[grain.MapDataset], turns: grain.MapDataset, batch_size: int) -> None:
-        self.examples, self.turns, self.batch_size = examples, turns, batch_size
-
-    def __len__(self) -> int:
-        return sys.maxsize
-
-    def __getitem__(self, index: int) -> dict[str, Any]:
-        batch, place = divmod(index, self.batch_size)
-        size, before = self.turns[batch]
-        return self.examples[size][before * self.batch_size + place]
-
-
-class _Turn:
-    """(size, number of its batch), for Grain's mixing of sizes."""
-
-    def __call__(self, index: int, size: int) -> tuple[int, int]:
-        return size, index
 
 
 class BatchIterator(Iterator[Batch]):
@@ -163,9 +65,9 @@ class BatchIterator(Iterator[Batch]):
             self.close()
             raise
         self._consumed += self._batch_size
-        messages = [message for clip in clips for message in clip.get(_BROKEN, ())]
+        messages = [message for clip in clips for message in clip.get(BROKEN, ())]
         self.broken.add(messages, clips=len(clips))
-        return {name: np.stack([np.asarray(clip[name]) for clip in clips]) for name in _FIELDS}
+        return {name: np.stack([np.asarray(clip[name]) for clip in clips]) for name in FIELDS}
 
     def __enter__(self) -> BatchIterator:
         return self
@@ -190,17 +92,17 @@ class BatchIterator(Iterator[Batch]):
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Continues after the examples that `state` counts.
 
-        Raises ValueError if the state is of another seed, clip or mixture, whose examples would differ.
+        Raises InputError if the state is of another seed, clip or mixture, whose examples would differ.
         """
         expected = {"examples", "broken", *self._identity}
         if set(state) != expected:
-            raise ValueError(
+            raise InputError(
                 f"data state has fields {sorted(state)}, expected {sorted(expected)}: "
                 "it was written by another version or is damaged"
             )
         for name, value in self._identity.items():
             if state[name] != value:
-                raise ValueError(
+                raise InputError(
                     f"data state was written with {name}={state[name]}, this run has {value}: "
                     "resume with the same data settings, or start a new run"
                 )
@@ -284,101 +186,50 @@ def training_batches(
       B = batch_size / process_count.
 
     Raises:
-      ValueError: an argument is out of range, or a data set has no sequence long enough. While iterating:
+      InputError: an argument is out of range, or a data set has no sequence long enough. While iterating:
         `TooManyBrokenClips`, or with max_broken=0 the error of bad data, named.
     """
     if not datasets:
         raise ValueError("no data sets given: pass a mapping from name to data set")
     if batch_size < 1 or process_count < 1 or batch_size % process_count:
-        raise ValueError(
+        raise InputError(
             f"batch_size must be a positive multiple of process_count, got {batch_size} and {process_count}"
         )
     if not 0 <= process_index < process_count:
         raise ValueError(f"process_index must lie in [0, {process_count}), got {process_index}")
     if seed < 0 or worker_count < 0 or num_threads < 0:
-        raise ValueError(
+        raise InputError(
             f"seed, worker_count and num_threads must not be negative, got {seed}, {worker_count} and {num_threads}"
         )
     if weights is not None and (set(weights) != set(datasets) or min(weights.values()) <= 0):
-        raise ValueError(f"weights must give a positive number for each of {', '.join(datasets)}, got {dict(weights)}")
+        raise InputError(f"weights must give a positive number for each of {', '.join(datasets)}, got {dict(weights)}")
     for name, share in {"min_valid_depth": min_valid_depth, "max_broken": max_broken}.items():
         if not 0 <= share < 1:
-            raise ValueError(f"{name} must lie in [0, 1), got {share}")
+            raise InputError(f"{name} must lie in [0, 1), got {share}")
     sizes = [(int(height), int(width)) for height, width in sizes]
     if not sizes or len(set(sizes)) < len(sizes):
-        raise ValueError(f"sizes must be different (height, width), at least one, got {sizes}")
+        raise InputError(f"sizes must be different (height, width), at least one, got {sizes}")
     strides = dict(strides or {})
     if not strides.keys() <= datasets.keys():
-        raise ValueError(f"strides must be of {', '.join(datasets)}, got those of {', '.join(strides)}")
+        raise InputError(f"strides must be of {', '.join(datasets)}, got those of {', '.join(strides)}")
     samplers = {
         name: sampler_for(dataset, length=clip_length, stride=strides.get(name, stride), reverse=reverse)
         for name, dataset in datasets.items()
     }
     shares = {name: 1.0 if weights is None else float(weights[name]) for name in datasets}
-    sequences = {
-        name: _by_size(
-            name,
-            dataset,
-            _long_enough(name, dataset, samplers[name], skip_broken=max_broken > 0),
-            sizes,
-            skip_broken=max_broken > 0,
-        )
-        for name, dataset in datasets.items()
-    }
-
-    # Each data set and size draws from its own stream, so that equal numbers do not mean equal choices.
-    own_seeds, names = {}, {}
-    for position, name in enumerate(datasets):
-        for size_index, part in enumerate(sequences[name]):
-            if part:
-                own_seed = int(np.random.SeedSequence([seed, position, size_index]).generate_state(1)[0])
-                own_seeds[name, size_index] = own_seed
-                names[name, size_index] = grain.MapDataset.source(part).seed(own_seed).shuffle().repeat()
-
-    def clips(name: str, size_index: int) -> grain.MapDataset:
-        def stream(name: str, part: int) -> tuple[_ClipReader, grain.MapDataset]:
-            own_seed = own_seeds[name, part]
-            return (
-                _ClipReader(
-                    name, datasets[name], samplers[name], sizes[size_index], own_seed, augmentation, min_valid_depth
-                ),
-                names[name, part],
-            )
-
-        read, own = stream(name, size_index)
-        if max_broken == 0:
-            return own.map_with_index(read)
-        # Where all of its own is broken: of the same set in other shapes, cut to this one, then of the other sets.
-        order = sorted(names, key=lambda key: (key != (name, size_index), key[0] != name))
-        return own.map_with_index(_ReplaceBroken([stream(*key) for key in order]))
-
-    examples: list[grain.MapDataset] = []
-    size_shares: list[float] = []
-    for size_index in range(len(sizes)):
-        parts, part_shares = [], []
-        for name in datasets:
-            if count := len(sequences[name][size_index]):
-                parts.append(clips(name, size_index))
-                part_shares.append(shares[name] * count / sum(map(len, sequences[name])))
-        if parts:
-            examples.append(parts[0] if len(parts) == 1 else grain.MapDataset.mix(parts, weights=part_shares))
-            size_shares.append(sum(part_shares))
-    identity = {
-        "seed": seed,
-        "samplers": {name: repr(sampler) for name, sampler in samplers.items()},
-        "sizes": [list(size) for size in sizes],
-        "sequences": {name: [_fingerprint(part) for part in parts] for name, parts in sequences.items()},
-        "weights": shares,
-        "augmentation": repr(augmentation),
-        "min_valid_depth": float(min_valid_depth),
-    }
-    if len(examples) > 1:
-        turns = [grain.MapDataset.source([size]).repeat().map_with_index(_Turn()) for size in range(len(examples))]
-        schedule = grain.MapDataset.mix(turns, weights=size_shares)
-        examples = [grain.MapDataset.source(_OneSizeABatch(examples, schedule, batch_size))]
-        identity["batch_size"] = batch_size
+    examples, identity = mixture(
+        datasets,
+        samplers,
+        shares,
+        sizes,
+        batch_size=batch_size,
+        seed=seed,
+        augmentation=augmentation,
+        min_valid_depth=min_valid_depth,
+        replace_broken=max_broken > 0,
+    )
     return BatchIterator(
-        examples[0],
+        examples,
         identity,
         BrokenClips(max_broken),
         batch_size=batch_size,
@@ -387,68 +238,6 @@ def training_batches(
         worker_count=worker_count,
         num_threads=num_threads,
     )
-
-
-def _long_enough(name: str, dataset: Dataset, sampler: Sampler, *, skip_broken: bool) -> list[str]:
-    """The sequences that hold a clip; ValueError if there are none.
-
-    With `skip_broken` a sequence that cannot be listed stays: its clips are then broken and counted, and the examples
-    are the same ones when it has been mended.
-    """
-
-    def fits(sequence: str) -> bool:
-        try:
-            return sampler.fits(dataset, sequence)
-        except Exception as error:
-            if not skip_broken:
-                raise
-            logging.warning("%s, %s: cannot be listed: %s", name, sequence, describe(error))
-            return True
-
-    names = [sequence for sequence in dataset.sequences if fits(sequence)]
-    if not names:
-        raise ValueError(
-            f"{name}: none of {len(dataset.sequences)} sequences has {sampler.requirement}: shorten the clips"
-        )
-    if len(names) < len(dataset.sequences):
-        short = len(dataset.sequences) - len(names)
-        logging.warning("%s: %d sequences do not have %s, left out", name, short, sampler.requirement)
-    return names
-
-
-def _by_size(
-    name: str, dataset: Dataset, sequences: Sequence[str], sizes: Sequence[Size], *, skip_broken: bool
-) -> list[list[str]]:
-    """For each of `sizes` the sequences whose pictures have the nearest aspect ratio.
-
-    With `skip_broken` those whose pictures cannot be read have the first size, where their clips will be broken.
-    """
-    if len(sizes) == 1:
-        return [list(sequences)]
-
-    def size_of(sequence: str) -> Size | None:
-        try:
-            return dataset.image_size(sequence)
-        except Exception as error:
-            if not skip_broken:
-                raise
-            logging.warning("%s, %s: size of the pictures unknown: %s", name, sequence, describe(error))
-            return None
-
-    parts: dict[Size, list[str]] = {size: [] for size in sizes}
-    # The first start opens a picture of every sequence, which takes long over a network; readers keep the sizes.
-    with ThreadPoolExecutor(_SIZE_READERS) as executor:
-        found = list(executor.map(size_of, sequences))
-    for sequence, size in zip(sequences, found, strict=True):
-        parts[sizes[0] if size is None else nearest_size(size, sizes)].append(sequence)
-    if not any(found):
-        raise ValueError(f"{name}: no picture of {len(sequences)} sequences can be read; the log names them")
-    return list(parts.values())
-
-
-def _fingerprint(sequences: Sequence[str]) -> str:
-    """Number and digest of sequence names: other sequences would make other examples."""
-    return f"{len(sequences)} {hashlib.sha256(chr(10).join(sequences).encode()).hexdigest()[:12]}"
 
 
 def _start_worker(index: int, count: int) -> None:

@@ -7,12 +7,14 @@ from typing import Any
 
 from absl import logging
 
+from logvggt_jax.errors import InputError
+
 # The share is of this many clips at least, so that one broken file among the first few does not end a run.
 FEWEST_CLIPS = 1000
 _KEPT = 100
 
 
-class TooManyBrokenClips(ValueError):
+class TooManyBrokenClips(InputError):
     """More clips than allowed could not be read; lists them."""
 
 
@@ -60,4 +62,4 @@ class BrokenClips:
 def describe(error: Exception) -> str:
     """One line that says what was wrong; errors that are not made for readers are named by their type."""
     text = " ".join(str(error).split())
-    return text if isinstance(error, (ValueError, FileNotFoundError)) else f"{type(error).__name__}: {text}"
+    return text if isinstance(error, InputError) else f"{type(error).__name__}: {text}"

@@ -10,6 +10,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 
+from logvggt_jax.errors import InputError
+
 _SHOWN = 10
 
 
@@ -29,7 +31,7 @@ class HoldOut:
     def __post_init__(self) -> None:
         object.__setattr__(self, "names", tuple(self.names))
         if not self.names and self.split is None:
-            raise ValueError("a hold-out needs names or a split; leave the data set out of hold_out otherwise")
+            raise InputError("a hold-out needs names or a split; leave the data set out of hold_out otherwise")
 
     def matches(self, sequence: str) -> bool:
         """Whether `names` hold `sequence` out."""
@@ -49,7 +51,7 @@ PUBLISHED = {
 def check_held_out(
     name: str, sequences: Sequence[str], rule: HoldOut, split_sequences: Callable[[str], Sequence[str]]
 ) -> None:
-    """Raises ValueError naming the training `sequences` of data set `name` that `rule` holds out.
+    """Raises InputError naming the training `sequences` of data set `name` that `rule` holds out.
 
     Args:
       name: of the data set.
@@ -60,18 +62,18 @@ def check_held_out(
     of_split = set() if rule.split is None else set(split_sequences(rule.split))
     shared = [sequence for sequence in sequences if sequence in of_split or rule.matches(sequence)]
     if shared:
-        raise ValueError(
+        raise InputError(
             f"{name}: {len(shared)} of {len(sequences)} training sequences are held out for evaluation "
             f"({shown(shared)}): train on another split, or change data.hold_out.{name}"
         )
 
 
 def check_disjoint(name: str, sequences: Sequence[str], evaluated: Sequence[str]) -> None:
-    """Raises ValueError naming what training `sequences` of data set `name` share with the `evaluated` ones."""
+    """Raises InputError naming what training `sequences` of data set `name` share with the `evaluated` ones."""
     kept = set(evaluated)
     shared = [sequence for sequence in sequences if sequence in kept]
     if shared:
-        raise ValueError(
+        raise InputError(
             f"{name}: {len(shared)} sequences are trained on and validated on ({shown(shared)}): "
             "choose other splits for data.sources and validation.source"
         )

@@ -9,6 +9,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from logvggt_jax.data.dataset import Dataset
+from logvggt_jax.errors import InputError
 
 Covisibility = Mapping[int, Sequence[tuple[int, float]]]
 
@@ -57,9 +58,9 @@ class ClipSampler:
     def __post_init__(self) -> None:
         _check_length(self.length)
         if len(self.stride) != 2 or not 1 <= self.stride[0] <= self.stride[1]:
-            raise ValueError(f"clip stride must be a pair 1 <= low <= high, got {self.stride}")
+            raise InputError(f"clip stride must be a pair 1 <= low <= high, got {self.stride}")
         if not 0 <= self.reverse <= 1:
-            raise ValueError(f"the probability of reversed clips must lie in [0, 1], got {self.reverse}")
+            raise InputError(f"the probability of reversed clips must lie in [0, 1], got {self.reverse}")
 
     @property
     def shortest(self) -> int:
@@ -181,7 +182,7 @@ def example_rng(seed: int, index: int) -> np.random.Generator:
 
 def _check_length(length: int) -> None:
     if length < 1:
-        raise ValueError(f"clip length must be at least 1, got {length}")
+        raise InputError(f"clip length must be at least 1, got {length}")
 
 
 def _graph(dataset: Dataset, sequence: str) -> Covisibility:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from logvggt_jax.data.errors import AbsurdIntrinsics, BadPose
+from logvggt_jax.errors import InputError
 from logvggt_jax.geometry import invert, nearest_rotation
 
 # Camera axes x right, y up, z back to x right, y down, z forward, and the reverse; multiplied from the right onto
@@ -20,14 +21,14 @@ _FOCAL_RANGE = (0.1, 50.0)
 def numbers(text: str, where: str | Path, *, count: int | None = None) -> np.ndarray:
     """All numbers of a text, float64 [n]; nan and inf are numbers.
 
-    Raises ValueError naming `where` for other words, or another number than `count`.
+    Raises InputError naming `where` for other words, or another number than `count`.
     """
     try:
         values = np.array([float(word) for word in text.replace(",", " ").split()])
     except ValueError as error:
-        raise ValueError(f"{where}: expected numbers: {error}; fetch the file again") from error
+        raise InputError(f"{where}: expected numbers: {error}; fetch the file again") from error
     if count is not None and len(values) != count:
-        raise ValueError(f"{where}: expected {count} numbers, got {len(values)}: fetch the file again")
+        raise InputError(f"{where}: expected {count} numbers, got {len(values)}: fetch the file again")
     return values
 
 
@@ -54,7 +55,7 @@ def world_to_camera(pose: np.ndarray, where: str | Path, *, stored: str) -> np.n
       The extrinsics, or None where `pose` is not finite (lost tracking).
 
     Raises:
-      ValueError: not a rotation to 0.01, mirrored, or a last row other than 0 0 0 1.
+      InputError: not a rotation to 0.01, mirrored, or a last row other than 0 0 0 1.
     """
     if not np.isfinite(pose).all():
         return None
@@ -75,7 +76,7 @@ def world_to_camera(pose: np.ndarray, where: str | Path, *, stored: str) -> np.n
 
 
 def check_intrinsics(intrinsics: np.ndarray, size: tuple[int, int], where: str | Path) -> None:
-    """Raises ValueError naming `where` unless intrinsics [3, 3] can belong to a picture of `size` (H, W).
+    """Raises InputError naming `where` unless intrinsics [3, 3] can belong to a picture of `size` (H, W).
 
     Expected: finite, focal lengths of 0.1 to 50 times the longer edge, a principal point within half a picture of
     the picture, no more than a little skew, the last row 0 0 1.

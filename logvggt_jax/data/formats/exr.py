@@ -6,23 +6,23 @@ from pathlib import Path
 
 import numpy as np
 
-from logvggt_jax.data.errors import BrokenPicture
+from logvggt_jax.data.errors import BrokenPicture, MissingPackage, missing_file
 
 
 def read_exr(path: str | Path) -> np.ndarray:
     """The only channel of an OpenEXR file, [H, W] float32, in the file's own unit; half floats are widened.
 
     Raises:
-      ImportError: the OpenEXR package is missing; names the extra that brings it.
-      FileNotFoundError: no such file.
-      ValueError: truncated or damaged file, several parts or channels, or integer pixels; names the file.
+      MissingPackage: the OpenEXR package is missing; names the extra that brings it.
+      MissingFiles: no such file.
+      InputError: truncated or damaged file, several parts or channels, or integer pixels; names the file.
     """
     try:
         import OpenEXR
     except ImportError as error:
-        raise ImportError(f'{path}: reading EXR needs OpenEXR: pip install "logvggt-jax[data]"') from error
+        raise MissingPackage(f'{path}: reading EXR needs OpenEXR: pip install "logvggt-jax[data]"') from error
     if not Path(path).is_file():
-        raise FileNotFoundError(f"{path}: no such file; fetch it again or remove the frame's other files")
+        raise missing_file(path)
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             count = len(file.parts)

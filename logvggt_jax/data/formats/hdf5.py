@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from logvggt_jax.data.errors import BrokenPicture
+from logvggt_jax.data.errors import BrokenPicture, MissingPackage, missing_file
 
 
 def read_hdf5(
@@ -22,16 +22,16 @@ def read_hdf5(
       content: the file's bytes, where they have been read already.
 
     Raises:
-      ImportError: the h5py package is missing; names the extra that brings it.
-      FileNotFoundError: no such file.
-      ValueError: not an HDF5 file, truncated or damaged, no such array, not numbers or another shape; names the file.
+      MissingPackage: the h5py package is missing; names the extra that brings it.
+      MissingFiles: no such file.
+      InputError: not an HDF5 file, truncated or damaged, no such array, not numbers or another shape; names the file.
     """
     try:
         import h5py
     except ImportError as error:
-        raise ImportError(f'{path}: reading HDF5 needs h5py: pip install "logvggt-jax[data]"') from error
+        raise MissingPackage(f'{path}: reading HDF5 needs h5py: pip install "logvggt-jax[data]"') from error
     if content is None and not Path(path).is_file():
-        raise FileNotFoundError(f"{path}: no such file; fetch it again or remove the frame's other files")
+        raise missing_file(path)
     try:
         with h5py.File(path if content is None else io.BytesIO(content), "r") as file:
             names = list(file)

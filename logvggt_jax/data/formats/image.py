@@ -13,7 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from logvggt_jax.data.errors import BrokenPicture
+from logvggt_jax.data.errors import BrokenPicture, missing_file
 
 _JPEG_START = b"\xff\xd8"
 _PNG_START = b"\x89PNG\r\n\x1a\n"
@@ -28,8 +28,8 @@ def read_rgb(path: str | Path) -> np.ndarray:
     Orientation tags are ignored: calibrations belong to the pixels as stored.
 
     Raises:
-      FileNotFoundError: no such file.
-      ValueError: truncated, damaged or undecodable file, or not 8 bits a channel; names the file.
+      MissingFiles: no such file.
+      InputError: truncated, damaged or undecodable file, or not 8 bits a channel; names the file.
     """
     picture = _decode(Path(path))
     if picture.dtype != np.uint8:
@@ -46,8 +46,8 @@ def read_depth(path: str | Path) -> np.ndarray:
     """16-bit single-channel picture [H, W] uint16, in the file's own unit.
 
     Raises:
-      FileNotFoundError: no such file.
-      ValueError: truncated, damaged or undecodable file, or not 16-bit with one channel; names the file.
+      MissingFiles: no such file.
+      InputError: truncated, damaged or undecodable file, or not 16-bit with one channel; names the file.
     """
     picture = _decode(Path(path))
     if picture.dtype != np.uint16 or picture.ndim != 2:
@@ -60,7 +60,7 @@ def read_depth(path: str | Path) -> np.ndarray:
 
 def _decode(path: Path) -> np.ndarray:
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; fetch it again or remove the frame's other files")
+        raise missing_file(path)
     data = path.read_bytes()
     if data.startswith(_JPEG_START):
         complete = _jpeg_is_complete(data)

@@ -6,8 +6,8 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
-from logvggt_jax.data.errors import missing_files
-from logvggt_jax.data.formats.listing_index import SourceFiles
+from logvggt_jax.data.errors import MissingFiles, missing_files
+from logvggt_jax.data.formats.source_files import SourceFiles
 
 _PLACE = re.compile(r"\{[^}]*\}")
 
@@ -21,7 +21,7 @@ def numbered_files(files: SourceFiles, folder: Path, template: str) -> dict[int,
       template: format of the names with one number, `frame{:06d}.jpg` or, unpadded, `{}.jpg`.
 
     Raises:
-      FileNotFoundError: no such folder, or no such file in it.
+      MissingFiles: no such folder, or no such file in it.
     """
     before, after = _PLACE.split(template)
     pattern = re.compile(f"{re.escape(before)}([0-9]+){re.escape(after)}")
@@ -29,7 +29,7 @@ def numbered_files(files: SourceFiles, folder: Path, template: str) -> dict[int,
     numbers = (int(match[1]) for match in matches if match and template.format(int(match[1])) == match[0])
     found = {number: folder / template.format(number) for number in sorted(numbers)}
     if not found:
-        raise FileNotFoundError(f"{folder}: no files like {template.format(0)}; fetch or unpack the sequence again")
+        raise MissingFiles(f"{folder}: no files like {template.format(0)}; fetch or unpack the sequence again")
     return found
 
 
@@ -41,7 +41,7 @@ def numbered_frames(files: SourceFiles, *kinds: tuple[Path, str]) -> dict[int, t
       *kinds: folder and template of each kind, as in `numbered_files`.
 
     Raises:
-      FileNotFoundError: no such folder, no such file in it, or a frame that lacks a kind; names the missing file.
+      MissingFiles: no such folder, no such file in it, or a frame that lacks a kind; names the missing file.
     """
     found = [numbered_files(files, folder, template) for folder, template in kinds]
     numbers = sorted(set().union(*found))
@@ -59,11 +59,11 @@ def numbered_frames(files: SourceFiles, *kinds: tuple[Path, str]) -> dict[int, t
 def without_gaps(frames: Mapping[int, tuple[Path, ...]]) -> list[tuple[Path, ...]]:
     """The paths of `numbered_frames`, where frame follows frame as in a pose file that has no numbers.
 
-    Raises FileNotFoundError naming the first missing frame.
+    Raises MissingFiles naming the first missing frame.
     """
     first = next(iter(frames))
     for number in range(first, first + len(frames)):
         if number not in frames:
             folder = frames[first][0].parent
-            raise FileNotFoundError(f"{folder}: frame {number} is missing among the others: fetch the sequence again")
+            raise MissingFiles(f"{folder}: frame {number} is missing among the others: fetch the sequence again")
     return list(frames.values())

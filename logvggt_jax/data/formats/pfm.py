@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from logvggt_jax.data.errors import BrokenPicture
+from logvggt_jax.data.errors import BrokenPicture, missing_file
 
 # One white space ends the header; what follows belongs to the numbers.
 _HEADER = re.compile(rb"(P[fF])\s+(\d+)\s+(\d+)\s+([+-]?[0-9.]+(?:[eE][+-]?\d+)?)\s")
@@ -19,12 +19,12 @@ def read_pfm(path: str | Path) -> np.ndarray:
     A negative scale in the header means little-endian numbers; its size is no unit and is ignored.
 
     Raises:
-      FileNotFoundError: no such file.
-      ValueError: no header of a single-channel map, or another number of bytes than it promises; names the file.
+      MissingFiles: no such file.
+      InputError: no header of a single-channel map, or another number of bytes than it promises; names the file.
     """
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; fetch it again or remove the frame's other files")
+        raise missing_file(path)
     data = path.read_bytes()
     header = _HEADER.match(data)
     if header is None or header[1] != b"Pf":

@@ -8,7 +8,7 @@ import numpy as np
 
 from logvggt_jax.data.errors import UnequalCounts
 from logvggt_jax.data.formats.calibration import numbers
-from logvggt_jax.data.formats.listing_index import SourceFiles
+from logvggt_jax.data.formats.source_files import SourceFiles
 
 
 def read_pose_list(files: SourceFiles, path: Path, *, count: int, numbers_per_line: int = 16) -> np.ndarray:
@@ -21,8 +21,8 @@ def read_pose_list(files: SourceFiles, path: Path, *, count: int, numbers_per_li
       numbers_per_line: 16, or 4 where a matrix takes four lines.
 
     Raises:
-      FileNotFoundError: no such file.
-      ValueError: a line with other words or another number of them, or another number of matrices than `count`;
+      MissingFiles: no such file.
+      InputError: a line with other words or another number of them, or another number of matrices than `count`;
         names the file and the line.
     """
     lines = enumerate(files.text(path, "the poses of the sequence's frames").splitlines(), 1)

@@ -15,21 +15,23 @@ are. `confidence` tells how much the sensor trusts depth that it nevertheless gi
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
+from logvggt_jax.data.dataset import TRAINING, About
 from logvggt_jax.data.errors import UnequalSizes
 from logvggt_jax.data.formats.calibration import numbers, pinhole
 from logvggt_jax.data.formats.image import read_depth, read_rgb
-from logvggt_jax.data.formats.listing_index import SourceFiles
 from logvggt_jax.data.formats.pose_track import PoseTrack
 from logvggt_jax.data.formats.quarter_turns import turned_extrinsics, turned_intrinsics, turns_to_upright
 from logvggt_jax.data.formats.relative_intrinsics import in_pixels, relative
-from logvggt_jax.data.readers.folder_dataset import NO_POSES, FolderDataset, FrameRecord, Listing
+from logvggt_jax.data.formats.source_files import SourceFiles
+from logvggt_jax.data.readers.folder_dataset import NO_POSES, Dropped, FolderDataset, FrameRecord
+from logvggt_jax.errors import InputError
 
 _FOLDS = {"train": ("Training",), "val": ("Validation",), "all": ("Training", "Validation")}
 _VIDEO = re.compile(r"\d+")
@@ -57,11 +59,24 @@ class ARKitScenes(FolderDataset):
     expects = "raw/Training/<video>/vga_wide (the folder that the set's download script was given)"
     metric = True
     splits = ("train", "val", "all")
+    about = About(
+        source="download script of the repository apple/ARKitScenes, raw data",
+        licence="Apple's own: personal, non-commercial; a second clause covers commercial use by companies with fewer "
+        "than 700 million monthly users",
+        size="5,071 videos (4,520 Training, 551 Validation); bytes of the raw form unknown (the 3DOD subset has "
+        "623.4 GB)",
+        roles=(TRAINING,),
+    )
 
     def __init__(self, root: str | Path, split: str = "all", *, upright: bool = True) -> None:
         """As `FolderDataset`; `upright=False` hands pictures out in their stored orientation."""
         self.upright = upright
-        super().__init__(root, split, variant="" if upright else "stored")
+        super().__init__(root, split)
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """As `FolderDataset`; the orientation turns frames."""
+        return {**super().identity, "upright": self.upright}
 
     def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
         places: dict[str, Path] = {}
@@ -72,42 +87,35 @@ class ARKitScenes(FolderDataset):
                 places |= {f"{fold}/{name}": folder / name for name in videos if (folder / name).is_dir()}
         return places
 
-    def _list_frames(self, sequence: str, folder: Path, files: SourceFiles) -> Listing:
+    def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
         pictures = _by_time(files, folder, "vga_wide", "png")
         depths = _by_time(files, folder, "lowres_depth", "png")
         calibrations = _by_time(files, folder, "vga_wide_intrinsics", "pincam")
         path = folder / "lowres_wide.traj"
         track = _trajectory(files.text(path, "the video's poses; download it again"), path)
-        frames = []
-        dropped = {"no depth": 0, "no calibration": 0, "no pose": 0}
-        for time in sorted(pictures):
+        cameras = {time: track.at(time) for time in sorted(pictures)}
+        turns = 0
+        if self.upright and (counted := [pose for pose in cameras.values() if pose is not None]):
+            turns = turns_to_upright(np.stack(counted))
+        for time, extrinsics in cameras.items():
             near = next((t for t in (time, time - 1, time + 1) if t in calibrations), None)
-            extrinsics = track.at(time)
             if time not in depths:
-                dropped["no depth"] += 1
+                yield Dropped("no depth")
             elif near is None:
-                dropped["no calibration"] += 1
+                yield Dropped("no calibration")
             elif extrinsics is None:
-                dropped["no pose"] += 1
+                yield Dropped("no pose")
             else:
-                frames.append(
-                    FrameRecord(
-                        name=pictures[time].stem,
-                        image=pictures[time],
-                        depth=depths[time],
-                        # Millions of one-line files: opened with their pictures, not to list them.
-                        companion=calibrations[near],
-                        intrinsics=_WITH_THE_PICTURE,
-                        extrinsics=extrinsics,
-                    )
+                yield FrameRecord(
+                    name=pictures[time].stem,
+                    image=pictures[time],
+                    depth=depths[time],
+                    # Millions of one-line files: opened with their pictures, not to list them.
+                    companion=calibrations[near],
+                    intrinsics=_WITH_THE_PICTURE,
+                    extrinsics=turned_extrinsics(extrinsics, turns),
+                    quarter_turns=turns,
                 )
-        if self.upright and frames:
-            turns = turns_to_upright(np.stack([frame.extrinsics for frame in frames]))
-            frames = [
-                replace(frame, quarter_turns=turns, extrinsics=turned_extrinsics(frame.extrinsics, turns))
-                for frame in frames
-            ]
-        return Listing(frames, {reason: count for reason, count in dropped.items() if count})
 
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         image = read_rgb(record.image)
@@ -136,11 +144,11 @@ def _trajectory(text: str, path: Path) -> PoseTrack:
             continue
         time, *vectors = numbers(row, f"{path}, line {line}", count=7)
         if not np.isfinite(time):
-            raise ValueError(f"{path}, line {line}: expected a time in seconds first, got {time}: download it again")
+            raise InputError(f"{path}, line {line}: expected a time in seconds first, got {time}: download it again")
         times.append(_milliseconds(time))
         poses.append(_pose(np.array(vectors)))
     if not times:
-        raise ValueError(f"{path}: no poses; download it again")
+        raise InputError(f"{path}: no poses; download it again")
     return PoseTrack(np.array(times), np.stack(poses))
 
 
@@ -158,7 +166,7 @@ def _calibration(path: Path) -> np.ndarray:
     text = SourceFiles().text(path, "the picture's calibration; download the video again")
     width, height, *values = numbers(text, path, count=6)
     if not (width >= 1 and height >= 1):
-        raise ValueError(f"{path}: expected a width and height above 0, got {width:g} x {height:g}: download it again")
+        raise InputError(f"{path}: expected a width and height above 0, got {width:g} x {height:g}: download it again")
     return relative(pinhole(*values), (int(height), int(width)))
 
 

@@ -14,25 +14,22 @@ empty.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 
-from logvggt_jax.data.errors import missing_files
+from logvggt_jax.data.dataset import TRAINING, About
 from logvggt_jax.data.formats.calibration import numbers, world_to_camera
 from logvggt_jax.data.formats.image import read_rgb
-from logvggt_jax.data.formats.listing_index import SourceFiles
+from logvggt_jax.data.formats.numbered_files import numbered_frames
 from logvggt_jax.data.formats.pfm import read_pfm
+from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.data.formats.split_lists import sequences_present
-from logvggt_jax.data.readers.folder_dataset import FolderDataset, FrameRecord, Listing
+from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame
+from logvggt_jax.errors import InputError
 
 _SCENE = re.compile(r"[0-9a-f]{24}")
-_FILES = {
-    "image": ("blended_images", re.compile(r"(\d{8})\.jpg"), "{}.jpg"),
-    "camera": ("cams", re.compile(r"(\d{8})_cam\.txt"), "{}_cam.txt"),
-    "depth": ("rendered_depth_maps", re.compile(r"(\d{8})\.pfm"), "{}.pfm"),
-}
 _LIST_FILES = {"train": "BlendedMVG_training.txt", "val": "validation_list.txt"}
 
 
@@ -49,6 +46,13 @@ class BlendedMVS(FolderDataset):
     expects = "<24 hexadecimal digits>/blended_images (unpack the three sets' zip files into one folder)"
     metric = False
     splits = ("train", "val", "all")
+    about = About(
+        source="release files of the repository YoYo000/BlendedMVS: BlendedMVS, BlendedMVS+ and BlendedMVS++; for "
+        "splits BlendedMVG_training.txt and validation_list.txt of its folder project_lists",
+        licence="CC BY 4.0",
+        size="27.5 + 81.5 + 80 GB at 768 x 576; 502 scenes, more than 110,000 pictures",
+        roles=(TRAINING,),
+    )
 
     def covisibility(self, sequence: str) -> dict[int, list[tuple[int, float]]]:
         """For every frame that has some, its neighbours (frame index, score), the best first.
@@ -58,8 +62,8 @@ class BlendedMVS(FolderDataset):
         that do not count as frames are left out.
 
         Raises:
-          FileNotFoundError: no `pair.txt`.
-          ValueError: it is damaged.
+          MissingFiles: no `pair.txt`.
+          InputError: it is damaged.
         """
         index = {int(name): i for i, name in enumerate(self.frame_names(sequence))}
         path = self._places[sequence] / "cams" / "pair.txt"
@@ -89,42 +93,19 @@ class BlendedMVS(FolderDataset):
         listed = text.split()
         for name in listed:
             if not _SCENE.fullmatch(name):
-                raise ValueError(f"{path}: expected lines of 24 hexadecimal digits, got {name!r}: restore the file")
+                raise InputError(f"{path}: expected lines of 24 hexadecimal digits, got {name!r}: restore the file")
         return sequences_present(listed, scenes, path)
 
-    def _list_frames(self, sequence: str, folder: Path, files: SourceFiles) -> Listing:
-        found: dict[str, set[str]] = {}
-        for kind, (place, pattern, _) in _FILES.items():
-            names = files.names(folder / place, f"the scene's {place}; unpack its zip file again")
-            for match in filter(None, map(pattern.fullmatch, names)):
-                found.setdefault(match[1], set()).add(kind)
-        absent = {
-            folder / place / form.format(name): f"but frame {name} has {', '.join(sorted(kinds))}; fetch it or remove "
-            "the frame"
-            for name, kinds in sorted(found.items())
-            for kind, (place, _, form) in _FILES.items()
-            if kind not in kinds
-        }
-        if absent:
-            raise missing_files(absent)
-        frames, lost = [], 0
-        for name in sorted(found):
-            paths = {kind: folder / place / form.format(name) for kind, (place, _, form) in _FILES.items()}
-            intrinsics, stored = _camera(files.text(paths["camera"], "the frame's camera"), paths["camera"])
-            extrinsics = world_to_camera(stored, paths["camera"], stored="world_to_camera")
-            if extrinsics is None:
-                lost += 1
-                continue
-            frames.append(
-                FrameRecord(
-                    name=name,
-                    image=paths["image"],
-                    depth=paths["depth"],
-                    intrinsics=intrinsics,
-                    extrinsics=extrinsics,
-                )
-            )
-        return Listing(frames, {"no pose": lost} if lost else {})
+    def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
+        kinds = (
+            ("blended_images", "{:08d}.jpg"),
+            ("rendered_depth_maps", "{:08d}.pfm"),
+            ("cams", "{:08d}_cam.txt"),
+        )
+        paths = numbered_frames(files, *((folder / place, template) for place, template in kinds))
+        for image, depth, camera in paths.values():
+            intrinsics, stored = _camera(files.text(camera, "the frame's camera"), camera)
+            yield frame(image, depth, intrinsics, world_to_camera(stored, camera, stored="world_to_camera"))
 
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         depth = read_pfm(record.depth)
@@ -138,7 +119,7 @@ def _camera(text: str, path: Path) -> tuple[np.ndarray, np.ndarray]:
     """
     words = text.split()
     if len(words) not in (29, 30, 31) or words[0] != "extrinsic" or words[17] != "intrinsic":
-        raise ValueError(
+        raise InputError(
             f"{path}: expected 'extrinsic', 16 numbers, 'intrinsic', 9 numbers and 2 to 4 for the depth range, "
             f"got {len(words)} words: fetch the file again"
         )
@@ -161,7 +142,7 @@ def _pairs(text: str, path: Path) -> list[tuple[int, list[tuple[int, float]]]]:
     except (IndexError, ValueError):
         complete = False
     if not complete:
-        raise ValueError(
+        raise InputError(
             f"{path}: expected the number of images, then for each its number, how many neighbours, and their numbers "
             "and scores: fetch the file again"
         )

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from logvggt_jax.data.dataset import EVALUATION, LICENCE_NOT_READ, About
 from logvggt_jax.data.formats.calibration import pinhole
 from logvggt_jax.data.readers.timed_rgbd import TimedRGBD
 
@@ -33,6 +34,12 @@ class Bonn(TimedRGBD):
     folder_pattern = re.compile(r"rgbd_bonn_\w+")
     container = "rgbd_bonn_dataset"
     prepared_for = "depth"
+    about = About(
+        source="the set's site; published evaluations use balloon2, crowd2, crowd3, person_tracking2 and synchronous",
+        licence=LICENCE_NOT_READ,
+        size="unknown",
+        roles=(EVALUATION,),
+    )
 
     def _intrinsics(self, folder: Path) -> np.ndarray:
         return pinhole(542.822841, 542.576870, 315.593520, 237.756098)

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from logvggt_jax.data.formats.calibration import pinhole, world_to_camera
-from logvggt_jax.data.formats.listing_index import SourceFiles
+from logvggt_jax.data.formats.source_files import SourceFiles
+from logvggt_jax.errors import InputError
 
 # x left, y up to x right, y down.
 _PYTORCH3D_AXES = np.diag([-1.0, -1.0, 1.0])
@@ -51,7 +52,7 @@ class FrameAnnotation:
 
         PyTorch3D transforms row vectors, `X_camera = X_world R + T`, and its axes point left, up and forward.
 
-        Raises ValueError naming `where` for a matrix that is no rotation.
+        Raises InputError naming `where` for a matrix that is no rotation.
         """
         if self.camera is None:
             return None
@@ -86,13 +87,13 @@ def frame_annotations(
 ) -> dict[str, list[FrameAnnotation]]:
     """A category's frames by sequence, in time order; only the `chosen` (sequence, number) unless that is None.
 
-    Raises FileNotFoundError or ValueError naming `path`.
+    Raises MissingFiles or InputError naming `path`.
     """
     annotations: dict[str, list[FrameAnnotation]] = {}
     # Made compact while parsed: all of a category's dictionaries would take gigabytes.
     for annotation in _content(files, path, _compact):
         if not isinstance(annotation, FrameAnnotation):
-            raise ValueError(f"{path}: expected a list of frames with sequence_name and frame_number: fetch it again")
+            raise InputError(f"{path}: expected a list of frames with sequence_name and frame_number: fetch it again")
         if chosen is None or (annotation.sequence, annotation.number) in chosen:
             annotations.setdefault(annotation.sequence, []).append(annotation)
     for frames in annotations.values():
@@ -103,7 +104,7 @@ def frame_annotations(
 def quality_scores(files: SourceFiles, path: Path) -> dict[str, float]:
     """How good each sequence's cameras are (`viewpoint_quality_score`), -inf where that is unknown.
 
-    Raises FileNotFoundError or ValueError naming `path`.
+    Raises MissingFiles or InputError naming `path`.
     """
     scores = {}
     for sequence in _content(files, path, None):
@@ -111,7 +112,7 @@ def quality_scores(files: SourceFiles, path: Path) -> dict[str, float]:
             score = sequence["viewpoint_quality_score"]
             scores[str(sequence["sequence_name"])] = -np.inf if score is None else float(score)
         except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(
+            raise InputError(
                 f"{path}: expected sequences with sequence_name and viewpoint_quality_score ({error!r}): fetch it again"
             ) from error
     return scores
@@ -122,13 +123,13 @@ def _content(files: SourceFiles, path: Path, hook: Callable[[dict], Any] | None)
     try:
         content = json.loads(gzip.decompress(data), object_hook=hook)
     except (OSError, EOFError, zlib.error) as error:
-        raise ValueError(f"{path}: truncated or damaged gzip file ({error}): fetch it again") from error
+        raise InputError(f"{path}: truncated or damaged gzip file ({error}): fetch it again") from error
     except json.JSONDecodeError as error:
-        raise ValueError(f"{path}: not JSON ({error}): fetch it again") from error
+        raise InputError(f"{path}: not JSON ({error}): fetch it again") from error
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: not the frame annotations of Co3Dv2 ({error!r}): fetch it again") from error
+        raise InputError(f"{path}: not the frame annotations of Co3Dv2 ({error!r}): fetch it again") from error
     if not isinstance(content, list):
-        raise ValueError(f"{path}: expected a JSON list, got {type(content).__name__}: fetch it again")
+        raise InputError(f"{path}: expected a JSON list, got {type(content).__name__}: fetch it again")
     return content
 
 
@@ -139,7 +140,7 @@ def _compact(value: dict) -> dict | FrameAnnotation:
     depth, viewpoint = value.get("depth") or {}, value.get("viewpoint")
     kind = (viewpoint or {}).get("intrinsics_format", "ndc_norm_image_bounds")
     if kind not in _FORMATS:
-        raise ValueError(f"intrinsics_format {kind!r} is none of {', '.join(_FORMATS)}")
+        raise InputError(f"intrinsics_format {kind!r} is none of {', '.join(_FORMATS)}")
     height, width = value["image"]["size"]
     return FrameAnnotation(
         sequence=sys.intern(value["sequence_name"]),

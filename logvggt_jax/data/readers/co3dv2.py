@@ -12,20 +12,22 @@ reconstruction, stored as the bits of 16-bit floats in 16-bit PNG files, times t
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from logvggt_jax.data.errors import EmptySplit, UnequalSizes, missing_files
+from logvggt_jax.data.dataset import EVALUATION, TRAINING, About
+from logvggt_jax.data.errors import EmptySplit, MissingFiles, UnequalSizes, missing_files
 from logvggt_jax.data.formats.image import read_depth, read_rgb
-from logvggt_jax.data.formats.listing_index import SourceFiles
 from logvggt_jax.data.formats.relative_intrinsics import in_pixels, relative
+from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.data.formats.split_lists import sequences_present
 from logvggt_jax.data.readers.co3d_annotations import FrameAnnotation, frame_annotations, quality_scores
-from logvggt_jax.data.readers.folder_dataset import FolderDataset, FrameRecord, Listing
+from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame
+from logvggt_jax.errors import InputError
 
 _FRAMES, _SEQUENCES = "frame_annotations.jgz", "sequence_annotations.jgz"
 _MIN_QUALITY = 0.5
@@ -71,13 +73,23 @@ class Co3Dv2(FolderDataset):
     expects = f"<category>/{_FRAMES} (unpack the categories' zip files into one folder)"
     metric = False
     splits = ("train", "val", "test", "all")
+    about = About(
+        source="the project's download page or script (repository facebookresearch/co3d)",
+        licence="CC BY-NC 4.0 for the code base; the same for the data (inferred)",
+        size="5.5 TB of zip files of 20 GB, 51 categories; the single-sequence subset has 8.9 GB",
+        roles=(TRAINING, EVALUATION),
+    )
 
     def __init__(self, root: str | Path, split: str = "all") -> None:
         """As `FolderDataset`; a category's annotations are read when one of its sequences is first used."""
         # Annotations take many seconds to parse: the last category's serve all of its sequences.
         self._category: _Category | None = None
-        # The same sequence can have other frames in another split.
-        super().__init__(root, split, variant=split)
+        super().__init__(root, split)
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """As `FolderDataset`; the same sequence can have other frames in another split."""
+        return {**super().identity, "split": self.split}
 
     def __getstate__(self) -> dict[str, Any]:
         """Worker processes are not sent a category's annotations."""
@@ -103,7 +115,7 @@ class Co3Dv2(FolderDataset):
                 chosen = set(sequences_present({name for name, _ in listed} & good, chosen, category / "set_lists"))
             places |= {f"{category.name}/{name}": category / name for name in sorted(chosen)}
         if categories and not places and self.split != "all":
-            error = EmptySplit if lists_name_any else FileNotFoundError
+            error = EmptySplit if lists_name_any else MissingFiles
             raise error(
                 f"{self.root}: the set lists of {len(categories)} categories name no sequence here for split "
                 f"{self.split!r}; unpack the sequences and lists (the single-sequence subset has none) or choose "
@@ -127,16 +139,17 @@ class Co3Dv2(FolderDataset):
         taken = {sequence for sequence, _ in _listed(files, train, "train") | test}
         return {frame for frame in _listed(files, dev, "val") if frame[0] not in taken}
 
-    def _list_frames(self, sequence: str, folder: Path, files: SourceFiles) -> Listing:
+    def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
         source = folder.parent / _FRAMES
-        frames = []
-        dropped = {"no pose": 0, "no depth": 0}
         present: dict[Path, set[str]] = {}
         absent: list[Path] = []
         for annotation in self._annotations(folder.parent, files).get(folder.name, []):
             extrinsics = annotation.extrinsics(f"{source}, {annotation.image}")
-            if extrinsics is None or annotation.depth is None:
-                dropped["no pose" if extrinsics is None else "no depth"] += 1
+            if extrinsics is None:
+                yield Dropped("no pose")
+                continue
+            if annotation.depth is None:
+                yield Dropped("no depth")
                 continue
             image, depth = self.root / annotation.image, self.root / annotation.depth
             mask = self.root / annotation.depth_mask if annotation.depth_mask else None
@@ -145,20 +158,10 @@ class Co3Dv2(FolderDataset):
                     present[path.parent] = set(files.names(path.parent, f"{path.name}, which {_FRAMES} names"))
                 if path.name not in present[path.parent]:
                     absent.append(path)
-            frames.append(
-                FrameRecord(
-                    name=image.stem,
-                    image=image,
-                    depth=depth,
-                    companion=mask,
-                    intrinsics=relative(annotation.intrinsics(), annotation.size),
-                    extrinsics=extrinsics,
-                    depth_scale=annotation.depth_scale,
-                )
-            )
+            intrinsics = relative(annotation.intrinsics(), annotation.size)
+            yield frame(image, depth, intrinsics, extrinsics, companion=mask, depth_scale=annotation.depth_scale)
         if absent:
             raise missing_files(dict.fromkeys(absent, f"but {source} names it; unpack the sequence again"))
-        return Listing(frames, {reason: count for reason, count in dropped.items() if count})
 
     def _annotations(self, category: Path, files: SourceFiles) -> Mapping[str, list[FrameAnnotation]]:
         if self._category is None or self._category.folder != category or not self._category.is_current():
@@ -192,9 +195,9 @@ def _listed(files: SourceFiles, paths: list[Path], part: str) -> set[tuple[str, 
             content = json.loads(files.text(path, "the set list"))
             frames |= {(str(sequence), int(number)) for sequence, number, *_ in content[part]}
         except json.JSONDecodeError as error:
-            raise ValueError(f"{path}: not JSON ({error}): fetch it again") from error
+            raise InputError(f"{path}: not JSON ({error}): fetch it again") from error
         except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(
+            raise InputError(
                 f"{path}: expected [sequence, frame number, picture] under {part!r} ({error!r}): fetch it again"
             ) from error
     return frames

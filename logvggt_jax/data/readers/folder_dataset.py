@@ -9,20 +9,21 @@ import json
 import os
 import zipfile
 import zlib
-from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections import Counter, OrderedDict
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, NamedTuple
 
 import numpy as np
 from absl import logging
 
-from logvggt_jax.data.dataset import check_indices, check_sequence, check_split
-from logvggt_jax.data.errors import EmptySequence, UnequalSizes
+from logvggt_jax.data.dataset import Reader, check_indices, check_sequence, check_split
+from logvggt_jax.data.errors import EmptySequence, MissingFiles, UnequalSizes
 from logvggt_jax.data.formats.calibration import check_intrinsics
-from logvggt_jax.data.formats.listing_index import ListingIndex, SourceFiles
-from logvggt_jax.types import Frames
+from logvggt_jax.data.formats.source_files import SourceFiles
+from logvggt_jax.data.readers.listing_index import ListingIndex, code_digest
+from logvggt_jax.frames import Frames
 
 NO_POSES = np.full((4, 4), np.nan)
 # Listings kept in memory; a set of twenty thousand sequences would fill it with all of them.
@@ -55,6 +56,24 @@ class FrameRecord:
     quarter_turns: int = 0
 
 
+class Dropped(NamedTuple):
+    """A frame that does not count, and why: `no pose`, for example."""
+
+    reason: str
+
+
+def frame(
+    image: Path, depth: Path, intrinsics: np.ndarray, extrinsics: np.ndarray | None, **others: Any
+) -> FrameRecord | Dropped:
+    """The record of a frame, `others` being fields of it; dropped without a pose or without finite intrinsics."""
+    if extrinsics is None:
+        return Dropped("no pose")
+    if not np.isfinite(intrinsics).all():
+        return Dropped("no intrinsics")
+    fields = {"name": image.stem, **others}
+    return FrameRecord(image=image, depth=depth, intrinsics=intrinsics, extrinsics=extrinsics, **fields)
+
+
 @dataclass(frozen=True)
 class Listing:
     """The frames of a sequence that count, in time order, and how many were dropped, by reason (`no pose`)."""
@@ -63,45 +82,41 @@ class Listing:
     dropped: Mapping[str, int]
 
 
-class FolderDataset(abc.ABC):
+class FolderDataset(Reader):
     """A `Dataset` in a folder.
 
-    A reader says in `_find_sequences` which sequences a split has, in `_list_frames` which frames a sequence has, and
-    in `_read_frame` how one frame is decoded. Both listings are kept in an index (see `listing_index`), for which they
+    A reader says in `_find_sequences` which sequences a split has, in `_frames` which frames a sequence has, and in
+    `_read_frame` how one frame is decoded. Both listings are kept in an index (see `listing_index`), for which they
     read folders and text files through `SourceFiles`.
     """
 
-    name: ClassVar[str]  # as in DATASETS
-    title: ClassVar[str]  # as its owners write it, for messages
-    expects: ClassVar[str]  # what the root folder should hold, for messages
-    metric: ClassVar[bool]
-    splits: ClassVar[tuple[str, ...]]
-
-    def __init__(self, root: str | Path, split: str = "all", *, variant: str = "") -> None:
+    def __init__(self, root: str | Path, split: str = "all") -> None:
         """Lists the sequences; frames are listed when a sequence is first used.
 
         Args:
           root: the data set's folder.
           split: one of `splits`.
-          variant: for readers whose sequences have other frames under other settings; keeps their listings apart.
 
         Raises:
-          FileNotFoundError: no such folder, nothing of the set in it, or a list file is missing.
-          ValueError: a split that the set does not have, or a damaged list file.
+          MissingFiles: no such folder, nothing of the set in it, or a list file is missing.
+          InputError: a split that the set does not have, or a damaged list file.
         """
-        check_split(split)
-        if split not in self.splits:
-            raise ValueError(f"{self.title} has no split {split!r}: choose {', '.join(self.splits)}")
+        check_split(split, self)
         self.root, self.split = Path(root), split
         if not self.root.is_dir():
-            raise FileNotFoundError(f"{self.root}: no such folder; pass the folder that holds {self.expects}")
-        self._index = ListingIndex(f"{self.name}-{variant}" if variant else self.name, self.root)
+            raise MissingFiles(f"{self.root}: no such folder; pass the folder that holds {self.expects}")
+        self._index = ListingIndex(self.identity, self.root, code_digest(type(self)))
         self._recent: OrderedDict[str, Listing] = OrderedDict()
         self._counts: dict[str, int] = {}
         self._places = self._listed_sequences()
         if not self._places:
-            raise FileNotFoundError(f"{self.root}: no sequences of {self.title}; expected {self.expects}")
+            raise MissingFiles(f"{self.root}: no sequences of {self.title}; expected {self.expects}")
         self.sequences: tuple[str, ...] = tuple(self._places)
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """The set's name, and what besides the folder and the sequence's name decides its frames; JSON values."""
+        return {"name": self.name}
 
     def num_frames(self, sequence: str) -> int:
         """Frames with a picture, depth, a calibration and (where the set has poses) a finite pose."""
@@ -160,7 +175,7 @@ class FolderDataset(abc.ABC):
     def read(self, sequence: str, indices: Sequence[int]) -> Frames:
         """Frames `indices`, in the order asked for.
 
-        Raises ValueError or FileNotFoundError naming the file: a missing, truncated or damaged picture, a wrong type,
+        Raises InputError naming the file: a missing, truncated or damaged picture, a wrong type,
         sizes that do not belong together, intrinsics that cannot belong to the picture.
         """
         records = self._listing(sequence).frames
@@ -199,8 +214,8 @@ class FolderDataset(abc.ABC):
         """Unique names of the split's sequences, in a fixed order, each with its folder."""
 
     @abc.abstractmethod
-    def _list_frames(self, sequence: str, folder: Path, files: SourceFiles) -> Listing:
-        """The frames of one sequence; raises naming the file for whatever is missing or damaged."""
+    def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterable[FrameRecord | Dropped]:
+        """The frames of one sequence in time order; raises naming the file for whatever is missing or damaged."""
 
     @abc.abstractmethod
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -233,7 +248,11 @@ class FolderDataset(abc.ABC):
         listing = None if payload is None else _unpacked(payload, self.root)
         if listing is None:
             files = SourceFiles()
-            listing = self._list_frames(sequence, self._places[sequence], files)
+            found = list(self._frames(sequence, self._places[sequence], files))
+            listing = Listing(
+                frames=[each for each in found if isinstance(each, FrameRecord)],
+                dropped=Counter(each.reason for each in found if isinstance(each, Dropped)),
+            )
             if not listing.frames:
                 raise EmptySequence(
                     f"{self._places[sequence]}: no frame of {self.title} counts here "

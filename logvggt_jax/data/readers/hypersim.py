@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import csv
 import re
-from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,12 +27,14 @@ import cv2
 import numpy as np
 from absl import logging
 
+from logvggt_jax.data.dataset import TRAINING, About
 from logvggt_jax.data.errors import UnequalCounts
 from logvggt_jax.data.formats.calibration import OPENGL_AXES, world_to_camera
 from logvggt_jax.data.formats.hdf5 import read_hdf5
-from logvggt_jax.data.formats.listing_index import SourceFiles
 from logvggt_jax.data.formats.numbered_files import numbered_frames
-from logvggt_jax.data.readers.folder_dataset import FolderDataset, FrameRecord, Listing
+from logvggt_jax.data.formats.source_files import SourceFiles
+from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame
+from logvggt_jax.errors import InputError
 
 _CAMERA_TABLE = "metadata_camera_parameters.csv"
 _SPLIT_TABLE = "metadata_images_split_scene_v1.csv"
@@ -62,6 +63,15 @@ class HyperSim(FolderDataset):
     expects = f"ai_VVV_NNN with _detail and images, and {_CAMERA_TABLE} from the set's repository"
     metric = True
     splits = ("train", "val", "test", "all")
+    about = About(
+        source="download script of the repository apple/ml-hypersim, a zip file a scene (parts of scenes: "
+        "contrib/99991); metadata_camera_parameters.csv from contrib/mikeroberts3000 and, for splits, "
+        "metadata_images_split_scene_v1.csv from evermotion_dataset/analysis",
+        licence="CC BY-SA 3.0",
+        size="1.9 TB; 74,619 pictures of 457 scenes",
+        roles=(TRAINING,),
+        extra="data",
+    )
 
     def skewed_sequences(self) -> list[str]:
         """Sequences of the split that are on disk and left out because of skewed pixels."""
@@ -74,7 +84,7 @@ class HyperSim(FolderDataset):
             logging.info("%s: %d cameras with skewed pixels are left out", self.title, len(found) - len(kept))
         return kept
 
-    def _list_frames(self, sequence: str, folder: Path, files: SourceFiles) -> Listing:
+    def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
         scene, camera_name = sequence.split("/")
         camera = _camera(_table_lines(files, self.root / _CAMERA_TABLE), scene, self.root / _CAMERA_TABLE)
         scale = _metres_per_unit(files, folder / "_detail" / "metadata_scene.csv")
@@ -95,19 +105,14 @@ class HyperSim(FolderDataset):
             )
         turn = np.eye(4)
         turn[:3, :3] = camera.rotation
-        frames: list[FrameRecord] = []
-        dropped: Counter[str] = Counter()
         for number, (image, distance, entities) in paths.items():
             pose = np.eye(4)
             pose[:3, :3], pose[:3, 3] = orientations[number], positions[number]
             where = f"{detail}, keyframe {number}"
-            extrinsics = world_to_camera(pose @ OPENGL_AXES, where, stored="camera_to_world")
-            if extrinsics is None:
-                dropped["no pose"] += 1
-                continue
+            stored = world_to_camera(pose @ OPENGL_AXES, where, stored="camera_to_world")
+            extrinsics = None if stored is None else turn @ stored
             name = f"frame.{number:04d}"
-            frames.append(FrameRecord(name, image, distance, camera.intrinsics, turn @ extrinsics, companion=entities))
-        return Listing(frames, dropped)
+            yield frame(image, distance, camera.intrinsics, extrinsics, name=name, companion=entities)
 
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         colour = read_hdf5(record.image, "dataset", shape=(None, None, 3)).astype(np.float32)
@@ -136,7 +141,7 @@ class HyperSim(FolderDataset):
                 if match := _FINAL_FOLDER.fullmatch(folder):
                     name = f"{scene}/{match[1]}"
                     if self.split != "all" and name not in partition:
-                        raise ValueError(
+                        raise InputError(
                             f"{self.root / _SPLIT_TABLE}: no row for {name}, which is on disk: fetch the table again"
                         )
                     if self.split == "all" or self.split in partition[name]:
@@ -167,22 +172,22 @@ def _table_lines(files: SourceFiles, path: Path) -> dict[str, list[str]]:
 
 def _camera(table: Mapping[str, list[str]], scene: str, path: Path) -> _Camera:
     if scene not in table:
-        raise ValueError(f"{path}: no row for {scene}, which is on disk: fetch the table again")
+        raise InputError(f"{path}: no row for {scene}, which is on disk: fetch the table again")
     (row,) = csv.DictReader(table[scene])
     try:
         camera_from_uv = np.array([[float(row[f"M_cam_from_uv_{i}{j}"]) for j in range(3)] for i in range(3)])
         width = float(row["settings_output_img_width"])
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(
+        raise InputError(
             f"{path}: expected M_cam_from_uv_00 ... 22 and settings_output_img_width of {scene} "
             f"({type(error).__name__}: {error}): fetch the table again"
         ) from error
     if not np.isfinite(camera_from_uv).all() or np.linalg.matrix_rank(camera_from_uv) < 3:
-        raise ValueError(f"{path}: M_cam_from_uv of {scene} has no inverse: fetch the table again")
+        raise InputError(f"{path}: M_cam_from_uv of {scene} has no inverse: fetch the table again")
     # From OpenCV's axes to OpenGL's, to (u, v) with v up, to v down.
     plane_from_camera = np.diag([1.0, -1.0, 1.0]) @ np.linalg.inv(camera_from_uv) @ OPENGL_AXES[:3, :3]
     if np.linalg.det(plane_from_camera) <= 0:
-        raise ValueError(f"{path}: M_cam_from_uv of {scene} mirrors the picture: fetch the table again")
+        raise InputError(f"{path}: M_cam_from_uv of {scene} mirrors the picture: fetch the table again")
     # With a positive determinant the triangular factor has a positive diagonal and the other is a rotation.
     _, upper, rotation, *_ = cv2.RQDecomp3x3(plane_from_camera)
     intrinsics = upper / upper[2, 2]
@@ -204,7 +209,7 @@ def _metres_per_unit(files: SourceFiles, path: Path) -> float:
     except ValueError:
         scale = np.nan
     if not (np.isfinite(scale) and scale > 0):
-        raise ValueError(f"{path}: expected a row meters_per_asset_unit with a length, got {stored}: fetch it again")
+        raise InputError(f"{path}: expected a row meters_per_asset_unit with a length, got {stored}: fetch it again")
     return scale
 
 
@@ -224,7 +229,7 @@ def _partition(files: SourceFiles, path: Path) -> dict[str, set[str]]:
             if row["included_in_public_release"] == "True":
                 of_path.add(row["split_partition_name"])
     except KeyError as error:
-        raise ValueError(f"{path}: no column {error}: fetch the table again") from error
+        raise InputError(f"{path}: no column {error}: fetch the table again") from error
     return splits
 
 

@@ -17,17 +17,19 @@ Also read, for drives without raw pictures, is the form that published evaluatio
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 
+from logvggt_jax.data.dataset import EVALUATION, LICENCE_NOT_READ, About
 from logvggt_jax.data.errors import missing_files
 from logvggt_jax.data.formats.calibration import numbers
 from logvggt_jax.data.formats.image import read_depth, read_rgb
-from logvggt_jax.data.formats.listing_index import SourceFiles
 from logvggt_jax.data.formats.numbered_files import numbered_files, numbered_frames
-from logvggt_jax.data.readers.folder_dataset import NO_POSES, FolderDataset, FrameRecord, Listing
+from logvggt_jax.data.formats.source_files import SourceFiles
+from logvggt_jax.data.readers.folder_dataset import NO_POSES, Dropped, FolderDataset, FrameRecord, frame
+from logvggt_jax.errors import InputError
 
 _DRIVE = re.compile(r"\d{4}_\d{2}_\d{2}_drive_\d{4}_\w+")
 _GATHERED = re.compile(r"image_gathered(_\d+)?")
@@ -48,6 +50,13 @@ class KITTI(FolderDataset):
     expects = "train or val of the annotated depth, and raw recordings as <date>/<drive>/image_02/data"
     metric = True
     splits = ("train", "val", "all")
+    about = About(
+        source="the set's site: data_depth_annotated.zip, and the raw recordings (synced and rectified) of its drives "
+        "with the calibration of their dates",
+        licence=LICENCE_NOT_READ,
+        size="13 drives in val; bytes unknown",
+        roles=(EVALUATION,),
+    )
 
     def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
         places: dict[str, Path] = {}
@@ -62,10 +71,9 @@ class KITTI(FolderDataset):
         places |= {name: place for name, place in gathered.items() if name.split("/")[0] not in places}
         return dict(sorted(places.items()))
 
-    def _list_frames(self, sequence: str, folder: Path, files: SourceFiles) -> Listing:
+    def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
         drive = sequence.split("/")[0]
         intrinsics = _intrinsics(self.root / _date(drive) / "calib_cam_to_cam.txt", files)
-        dropped = 0
         if sequence == drive:
             image_folder = self._raw_pictures(drive)
             depths = numbered_files(files, folder / "proj_depth" / "groundtruth" / "image_02", _PICTURE)
@@ -77,16 +85,15 @@ class KITTI(FolderDataset):
             }
             if absent:
                 raise missing_files(absent)
-            pairs = [(images[number], depth) for number, depth in depths.items()]
-            dropped = len(images) - len(depths)
         else:
             depth_folder = folder.parent.with_name(_depth_folder(folder.parent.name)) / folder.name
-            pairs = [
-                (image, depth)
-                for image, depth in numbered_frames(files, (folder, _PICTURE), (depth_folder, _PICTURE)).values()
-            ]
-        records = [FrameRecord(image.stem, image, depth, intrinsics, NO_POSES) for image, depth in pairs]
-        return Listing(records, {"no depth": dropped} if dropped else {})
+            pairs = numbered_frames(files, (folder, _PICTURE), (depth_folder, _PICTURE))
+            images, depths = ({number: pair[kind] for number, pair in pairs.items()} for kind in (0, 1))
+        for number, image in images.items():
+            if number in depths:
+                yield frame(image, depths[number], intrinsics, NO_POSES)
+            else:
+                yield Dropped("no depth")
 
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         depth = read_depth(record.depth).astype(np.float32) / np.float32(_UNITS_PER_METRE)
@@ -122,4 +129,4 @@ def _intrinsics(path: Path, files: SourceFiles) -> np.ndarray:
     for line in text.splitlines():
         if line.startswith(_PROJECTION):
             return numbers(line.removeprefix(_PROJECTION), f"{path}, P_rect_02", count=12).reshape(3, 4)[:, :3]
-    raise ValueError(f"{path}: no line {_PROJECTION}: fetch the date's calibration again")
+    raise InputError(f"{path}: no line {_PROJECTION}: fetch the date's calibration again")

@@ -10,18 +10,19 @@ from __future__ import annotations
 
 import json
 import re
-from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 
+from logvggt_jax.data.dataset import TRAINING, About
 from logvggt_jax.data.formats.calibration import pinhole, world_to_camera
 from logvggt_jax.data.formats.exr import read_exr
 from logvggt_jax.data.formats.image import read_rgb
-from logvggt_jax.data.formats.listing_index import SourceFiles
 from logvggt_jax.data.formats.numbered_files import numbered_frames
-from logvggt_jax.data.readers.folder_dataset import FolderDataset, FrameRecord, Listing
+from logvggt_jax.data.formats.source_files import SourceFiles
+from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame
+from logvggt_jax.errors import InputError
 
 # Makes the world right-handed; which axis is flipped changes no relative pose.
 _MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
@@ -42,26 +43,24 @@ class MVSSynth(FolderDataset):
     expects = "GTAV_720/XXXX with images, depths and poses (unpack GTAV_720.tar.gz)"
     metric = False
     splits = ("all",)
+    about = About(
+        source="DeepMVS project page (repository phuang17/DeepMVS); only GTAV_720 is read",
+        licence="unknown",
+        size="120 sequences of 100 frames; bytes unknown",
+        roles=(TRAINING,),
+        extra="data",
+    )
 
     def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
         folder = self.root / "GTAV_720"
         names = files.names(folder, f"the sequences of {self.title} at 1280 x 720; other sizes are not read")
         return {name: folder / name for name in names if _SEQUENCE.fullmatch(name) and (folder / name).is_dir()}
 
-    def _list_frames(self, sequence: str, folder: Path, files: SourceFiles) -> Listing:
+    def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
         kinds = (("images", "{:04d}.png"), ("depths", "{:04d}.exr"), ("poses", "{:04d}.json"))
-        frames: list[FrameRecord] = []
-        dropped: Counter[str] = Counter()
         paths = numbered_frames(files, *((folder / kind, template) for kind, template in kinds))
         for image, depth, pose in paths.values():
-            intrinsics, extrinsics = _camera(files.text(pose, "the frame's camera"), pose)
-            if extrinsics is None:
-                dropped["no pose"] += 1
-            elif not np.isfinite(intrinsics).all():
-                dropped["no intrinsics"] += 1
-            else:
-                frames.append(FrameRecord(image.stem, image, depth, intrinsics, extrinsics))
-        return Listing(frames, dropped)
+            yield frame(image, depth, *_camera(files.text(pose, "the frame's camera"), pose))
 
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         depth = read_exr(record.depth)
@@ -76,14 +75,14 @@ def _camera(text: str, path: Path) -> tuple[np.ndarray, np.ndarray | None]:
         pose = np.array(stored["extrinsic"], np.float64)
         intrinsics = pinhole(*(float(stored[key]) for key in _NUMBERS))
     except (ValueError, TypeError, KeyError) as error:
-        raise ValueError(
+        raise InputError(
             f"{path}: expected JSON with 'extrinsic' and {', '.join(_NUMBERS)}, got {type(error).__name__} "
             f"({error}): fetch it again"
         ) from error
     if pose.shape != (4, 4):
-        raise ValueError(f"{path}: expected an extrinsic of 4 x 4 numbers, got {pose.shape}: fetch it again")
+        raise InputError(f"{path}: expected an extrinsic of 4 x 4 numbers, got {pose.shape}: fetch it again")
     if np.isfinite(pose).all() and np.linalg.det(pose) > 0:
-        raise ValueError(
+        raise InputError(
             f"{path}: expected a left-handed world (determinant -1), got determinant "
             f"{np.linalg.det(pose):+.3g}: replace it with the data set's original file"
         )

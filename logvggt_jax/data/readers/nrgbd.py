@@ -9,17 +9,18 @@ without a pose. `focal.txt` is the focal length for 640 x 480; the principal poi
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 
+from logvggt_jax.data.dataset import EVALUATION, About
 from logvggt_jax.data.formats.calibration import OPENGL_AXES, numbers, pinhole, scaled, world_to_camera
 from logvggt_jax.data.formats.image import read_depth, read_rgb
-from logvggt_jax.data.formats.listing_index import SourceFiles
 from logvggt_jax.data.formats.numbered_files import numbered_frames, without_gaps
 from logvggt_jax.data.formats.pose_lists import read_pose_list
-from logvggt_jax.data.readers.folder_dataset import FolderDataset, FrameRecord, Listing
+from logvggt_jax.data.formats.source_files import SourceFiles
+from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame
 
 _CENTRE, _SIZE = (320.0, 240.0), (480, 640)
 _MAX_DEPTH = 10.0  # metres, valid itself
@@ -37,6 +38,12 @@ class NRGBD(FolderDataset):
     expects = "<scene>/{images,depth,focal.txt,poses.txt}"
     metric = True
     splits = ("all",)
+    about = About(
+        source="repository dazinovic/neural-rgbd-surface-reconstruction",
+        licence="CC BY or CC0, by scene",
+        size="7.25 GB",
+        roles=(EVALUATION,),
+    )
 
     def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
         folders = {name: self.root / name for name in files.names(self.root, "scenes")}
@@ -46,21 +53,18 @@ class NRGBD(FolderDataset):
             if files.exists(folder / "images") or files.exists(folder / "poses.txt")
         }
 
-    def _list_frames(self, sequence: str, folder: Path, files: SourceFiles) -> Listing:
+    def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
         kinds = ((folder / "images", "img{}.png"), (folder / "depth", "depth{}.png"))
         paths = without_gaps(numbered_frames(files, *kinds))
         pose_list = folder / "poses.txt"
         poses = read_pose_list(files, pose_list, count=len(paths), numbers_per_line=4)
         path = folder / "focal.txt"
         (focal,) = numbers(files.text(path, "the focal length"), path, count=1)
-        records = []
+        intrinsics = pinhole(focal, focal, *_CENTRE)
         for (image, depth), pose in zip(paths, poses, strict=True):
             opencv = pose * OPENGL_AXES.diagonal()
             extrinsics = world_to_camera(opencv, f"{pose_list}, pose of {image.name}", stored="camera_to_world")
-            if extrinsics is not None:
-                records.append(FrameRecord(image.stem, image, depth, pinhole(focal, focal, *_CENTRE), extrinsics))
-        lost = len(paths) - len(records)
-        return Listing(records, {"no pose": lost} if lost else {})
+            yield frame(image, depth, intrinsics, extrinsics)
 
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         image = read_rgb(record.image)

@@ -9,18 +9,19 @@ from __future__ import annotations
 
 import zipfile
 import zlib
-from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 
-from logvggt_jax.data.errors import UnequalCounts
+from logvggt_jax.data.dataset import TRAINING, About
+from logvggt_jax.data.errors import MissingFiles, UnequalCounts
 from logvggt_jax.data.formats.calibration import world_to_camera
 from logvggt_jax.data.formats.image import read_depth, read_rgb
-from logvggt_jax.data.formats.listing_index import SourceFiles
 from logvggt_jax.data.formats.numbered_files import numbered_frames
-from logvggt_jax.data.readers.folder_dataset import FolderDataset, FrameRecord, Listing
+from logvggt_jax.data.formats.source_files import SourceFiles
+from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame
+from logvggt_jax.errors import InputError
 
 _FULL_SCALE, _FAR = 65535, 1000.0  # the stored value of `_FAR` metres
 _SPLITS = ("train", "val", "test")
@@ -41,6 +42,12 @@ class PointOdyssey(FolderDataset):
     expects = "train, val or test with <sequence>/rgbs, depths and anno.npz of v1.2"
     metric = True
     splits = (*_SPLITS, "all")
+    about = About(
+        source="project page (repository y-zheng18/point_odyssey), release v1.2; v1.0 is refused",
+        licence="CC BY-NC-SA 4.0",
+        size="159 videos (131 train, 15 val, 13 test); bytes unknown",
+        roles=(TRAINING,),
+    )
 
     def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
         folders = [self.root / split for split in _SPLITS]
@@ -55,7 +62,7 @@ class PointOdyssey(FolderDataset):
             if (folder / name).is_dir()
         }
 
-    def _list_frames(self, sequence: str, folder: Path, files: SourceFiles) -> Listing:
+    def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
         intrinsics, extrinsics = _cameras(files, folder)
         paths = numbered_frames(files, (folder / "rgbs", "rgb_{:05d}.jpg"), (folder / "depths", "depth_{:05d}.png"))
         if list(paths) != list(range(len(extrinsics))):
@@ -63,18 +70,10 @@ class PointOdyssey(FolderDataset):
                 f"{folder}: expected frames 0 to {len(extrinsics) - 1}, as many as anno.npz has cameras, got "
                 f"{len(paths)} frames from {min(paths)} to {max(paths)}: fetch the sequence again or remove its folder"
             )
-        frames: list[FrameRecord] = []
-        dropped: Counter[str] = Counter()
         for number, (image, depth) in paths.items():
             where = f"{folder / 'anno.npz'}, extrinsics of frame {number}"
             pose = world_to_camera(extrinsics[number], where, stored="world_to_camera")
-            if pose is None:
-                dropped["no pose"] += 1
-            elif not np.isfinite(intrinsics[number]).all():
-                dropped["no intrinsics"] += 1
-            else:
-                frames.append(FrameRecord(image.stem, image, depth, intrinsics[number], pose))
-        return Listing(frames, dropped)
+            yield frame(image, depth, intrinsics[number], pose)
 
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         raw = read_depth(record.depth)
@@ -87,20 +86,20 @@ def _cameras(files: SourceFiles, folder: Path) -> tuple[np.ndarray, np.ndarray]:
     path = folder / "anno.npz"
     if not files.exists(path):
         older = files.exists(folder / "annotations.npz")
-        raise FileNotFoundError(
+        raise MissingFiles(
             f"{path}: no such file; "
             + ("annotations.npz is of an older release with other cameras: fetch v1.2" if older else "fetch it again")
         )
     if not zipfile.is_zipfile(path):
-        raise ValueError(f"{path}: truncated or damaged npz file (no zip directory): fetch it again")
+        raise InputError(f"{path}: truncated or damaged npz file (no zip directory): fetch it again")
     try:
         with np.load(path, allow_pickle=False) as archive:
             names = archive.files
             found = {name: archive[name] for name in ("intrinsics", "extrinsics") if name in names}
     except (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(f"{path}: truncated or damaged npz file ({error}): fetch it again") from error
+        raise InputError(f"{path}: truncated or damaged npz file ({error}): fetch it again") from error
     if len(found) < 2 or _LATER_ARRAY not in names:
-        raise ValueError(
+        raise InputError(
             f"{path}: expected the arrays intrinsics, extrinsics and {_LATER_ARRAY} of v1.2, got {', '.join(names)}; "
             "older releases have other cameras: fetch v1.2"
         )
@@ -108,7 +107,7 @@ def _cameras(files: SourceFiles, folder: Path) -> tuple[np.ndarray, np.ndarray]:
     for name, size in (("intrinsics", 3), ("extrinsics", 4)):
         array = found[name]
         if array.shape != (count, size, size) or not count or array.dtype.kind not in "iuf":
-            raise ValueError(
+            raise InputError(
                 f"{path}: expected {name} of {size} x {size} numbers for each frame, got {array.dtype} {array.shape}: "
                 "fetch it again"
             )

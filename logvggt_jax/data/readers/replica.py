@@ -9,17 +9,19 @@ OpenCV axes. Depth is uint16, `scale` a metre, 0 where invalid. Other renderings
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 
+from logvggt_jax.data.dataset import TRAINING, About
 from logvggt_jax.data.formats.calibration import pinhole, scaled, world_to_camera
 from logvggt_jax.data.formats.image import read_depth, read_rgb
-from logvggt_jax.data.formats.listing_index import SourceFiles
 from logvggt_jax.data.formats.numbered_files import numbered_frames, without_gaps
 from logvggt_jax.data.formats.pose_lists import read_pose_list
-from logvggt_jax.data.readers.folder_dataset import FolderDataset, FrameRecord, Listing
+from logvggt_jax.data.formats.source_files import SourceFiles
+from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame
+from logvggt_jax.errors import InputError
 
 # The rendering's own, for downloads that lack the file.
 _CAMERA = {"w": 1200.0, "h": 680.0, "fx": 600.0, "fy": 600.0, "cx": 599.5, "cy": 339.5, "scale": 6553.5}
@@ -37,6 +39,13 @@ class Replica(FolderDataset):
     expects = "cam_params.json and <scene>/{traj.txt,results} (the rendering that NICE-SLAM distributes)"
     metric = True
     splits = ("all",)
+    about = About(
+        source="the rendering that the download script of the repository cvg/nice-slam fetches; the official meshes "
+        "hold no pictures",
+        licence="Replica's research terms: non-commercial research or education",
+        size="8 scenes of 2,000 frames each (inferred); bytes unknown",
+        roles=(TRAINING,),
+    )
 
     def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
         folders = {name: self.root / name for name in files.names(self.root, "scenes")}
@@ -46,25 +55,18 @@ class Replica(FolderDataset):
             if files.exists(folder / "results") or files.exists(folder / "traj.txt")
         }
 
-    def _list_frames(self, sequence: str, folder: Path, files: SourceFiles) -> Listing:
+    def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
         camera = _camera(self.root / "cam_params.json", files)
-        results = folder / "results"
+        results, trajectory = folder / "results", folder / "traj.txt"
         paths = without_gaps(numbered_frames(files, (results, "frame{:06d}.jpg"), (results, "depth{:06d}.png")))
-        trajectory = folder / "traj.txt"
         poses = read_pose_list(files, trajectory, count=len(paths))
         # At 1 x 1 the intrinsics fit pictures of any size.
         intrinsics = scaled(
             pinhole(camera["fx"], camera["fy"], camera["cx"], camera["cy"]), 1 / camera["w"], 1 / camera["h"]
         )
-        records = []
         for line, ((image, depth), pose) in enumerate(zip(paths, poses, strict=True), 1):
             extrinsics = world_to_camera(pose, f"{trajectory}, line {line}", stored="camera_to_world")
-            if extrinsics is not None:
-                records.append(
-                    FrameRecord(image.stem, image, depth, intrinsics, extrinsics, depth_scale=1 / camera["scale"])
-                )
-        lost = len(paths) - len(records)
-        return Listing(records, {"no pose": lost} if lost else {})
+            yield frame(image, depth, intrinsics, extrinsics, depth_scale=1 / camera["scale"])
 
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         image = read_rgb(record.image)
@@ -79,9 +81,9 @@ def _camera(path: Path, files: SourceFiles) -> Mapping[str, float]:
         camera = json.loads(files.text(path, "the camera"))["camera"]
         values = {key: float(camera[key]) for key in _CAMERA}
     except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(
+        raise InputError(
             f'{path}: expected {{"camera": {{{", ".join(_CAMERA)}}}}} with numbers ({error!r}): fetch the file again'
         ) from error
     if not all(np.isfinite(values[key]) and values[key] > 0 for key in ("w", "h", "scale")):
-        raise ValueError(f"{path}: w, h and scale must be positive, got {values}: fetch the file again")
+        raise InputError(f"{path}: w, h and scale must be positive, got {values}: fetch the file again")
     return values

@@ -9,18 +9,19 @@ set does not register: depth has focal length 585, colour 525, and lies 25 mm to
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from logvggt_jax.data.dataset import check_indices
-from logvggt_jax.data.errors import missing_files
+from logvggt_jax.data.dataset import EVALUATION, LICENCE_NOT_READ, About, check_indices
+from logvggt_jax.data.errors import MissingFiles, missing_files
 from logvggt_jax.data.formats.calibration import numbers, pinhole, scaled, world_to_camera
 from logvggt_jax.data.formats.image import read_depth, read_rgb
-from logvggt_jax.data.formats.listing_index import SourceFiles
-from logvggt_jax.data.readers.folder_dataset import NO_POSES, FolderDataset, FrameRecord, Listing
+from logvggt_jax.data.formats.source_files import SourceFiles
+from logvggt_jax.data.readers.folder_dataset import NO_POSES, Dropped, FolderDataset, FrameRecord, frame
 from logvggt_jax.data.readers.sfm_poses import read_sfm_poses
+from logvggt_jax.errors import InputError
 from logvggt_jax.geometry import compose, unproject
 
 COLOUR_FROM_DEPTH = np.array([-0.025, 0.0, 0.0])  # metres, identity rotation
@@ -49,6 +50,12 @@ class SevenScenes(FolderDataset):
     expects = "<scene>/seq-XX or seq-XX with frame-XXXXXX.color.png (unpack the sequences' zip files)"
     metric = True
     splits = ("train", "test", "all")
+    about = About(
+        source="the set's site: a zip file a scene, zip files of sequences within",
+        licence=LICENCE_NOT_READ,
+        size="7 scenes; bytes unknown",
+        roles=(EVALUATION,),
+    )
 
     def sfm_extrinsics(self, sequence: str, indices: Sequence[int]) -> np.ndarray | None:
         """Structure-from-motion poses [T, 4, 4] float32 of frames, world-to-camera of the colour camera.
@@ -75,13 +82,13 @@ class SevenScenes(FolderDataset):
             folders |= {f"{scene.resolve().name}/{folder.name}": folder for folder in listed}
         return folders
 
-    def _list_frames(self, sequence: str, folder: Path, files: SourceFiles) -> Listing:
+    def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
         kinds: dict[str, set[str]] = {}
         for name in files.names(folder, "a sequence's frames"):
             if match := _FRAME_FILE.fullmatch(name):
                 kinds.setdefault(match[1], set()).add(match[2])
         if not kinds:
-            raise FileNotFoundError(f"{folder}: no files like frame-000000.color.png; unpack the sequence's zip file")
+            raise MissingFiles(f"{folder}: no files like frame-000000.color.png; unpack the sequence's zip file")
         absent = {
             folder / f"{name}.{choices[-1]}": f"but frame {name} has {', '.join(sorted(present))}; fetch it or remove "
             "the frame"
@@ -91,26 +98,16 @@ class SevenScenes(FolderDataset):
         }
         if absent:
             raise missing_files(absent)
-        frames, lost = [], 0
         for name, present in sorted(kinds.items()):
             path = folder / f"{name}.pose.txt"
             values = numbers(files.text(path, "the frame's pose"), path, count=16)
             pose = world_to_camera(values.reshape(4, 4), path, stored="camera_to_world")
-            if pose is None:
-                lost += 1
-                continue
             colour = "color.png" if "color.png" in present else "color.jpg"
             depth = "depth.proj.png" if "depth.proj.png" in present else "depth.png"
-            frames.append(
-                FrameRecord(
-                    name=name,
-                    image=folder / f"{name}.{colour}",
-                    depth=folder / f"{name}.{depth}",
-                    intrinsics=pinhole(_COLOUR_FOCAL, _COLOUR_FOCAL, *_CENTRE),
-                    extrinsics=pose if depth == "depth.proj.png" else _shifted(pose),
-                )
-            )
-        return Listing(frames, {"no pose": lost} if lost else {})
+            if pose is not None and depth == "depth.png":
+                pose = _shifted(pose)
+            intrinsics = pinhole(_COLOUR_FOCAL, _COLOUR_FOCAL, *_CENTRE)
+            yield frame(folder / f"{name}.{colour}", folder / f"{name}.{depth}", intrinsics, pose, name=name)
 
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         image, depth = read_rgb(record.image), _metres(read_depth(record.depth))
@@ -125,7 +122,7 @@ def _scenes(root: Path, files: SourceFiles) -> list[Path]:
     folders = [root / name for name in files.names(root, "scenes") if (root / name).is_dir()]
     scenes = [folder for folder in folders if _sequence_folders(folder, files)]
     if own and scenes:
-        raise ValueError(
+        raise InputError(
             f"{root} holds sequences ({own[0].name}) and scenes ({scenes[0].name}) side by side: "
             "pass the folder that holds only scenes, or one scene's folder"
         )
@@ -144,10 +141,10 @@ def _listed_folders(scene: Path, split: str, files: SourceFiles) -> list[Path]:
     for line in filter(None, map(str.strip, text.splitlines())):
         match = _LIST_LINE.fullmatch(line)
         if match is None:
-            raise ValueError(f"{path}: expected lines like 'sequence1', got {line!r}: restore the original file")
+            raise InputError(f"{path}: expected lines like 'sequence1', got {line!r}: restore the original file")
         folder = scene / f"seq-{int(match[1]):02d}"
         if not folder.is_dir():
-            raise FileNotFoundError(f"{folder}: no such folder, but {path.name} lists it; unpack it or edit the list")
+            raise MissingFiles(f"{folder}: no such folder, but {path.name} lists it; unpack it or edit the list")
         folders.append(folder)
     return sorted(set(folders))
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from logvggt_jax.errors import InputError
 from logvggt_jax.geometry import quaternion_to_matrix
 
 _COLUMNS = 9
@@ -19,7 +20,7 @@ def read_sfm_poses(path: Path) -> dict[str, np.ndarray]:
     """World-to-camera matrices [4, 4] float64 by `seq-01/frame-000591`.
 
     Raises:
-      ValueError: a line of another form, or numbers that are no pose; names file and line.
+      InputError: a line of another form, or numbers that are no pose; names file and line.
     """
     poses: dict[str, np.ndarray] = {}
     for number, line in enumerate(path.read_text().splitlines(), start=1):
@@ -31,7 +32,7 @@ def read_sfm_poses(path: Path) -> dict[str, np.ndarray]:
         except ValueError:
             numbers = np.array([])
         if len(numbers) != _COLUMNS - 1 or not np.isfinite(numbers).all() or not np.linalg.norm(numbers[:4]) > 0.5:
-            raise ValueError(
+            raise InputError(
                 f"{path}, line {number}: expected `seq-01/frame-000000.color.png qw qx qy qz tx ty tz focal` with a "
                 f"unit quaternion, got {line[:80]!r}; fetch the file again"
             )

@@ -9,18 +9,19 @@ world-to-camera matrix, OpenCV axes, rows first.
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 
-from logvggt_jax.data.errors import BrokenPicture
+from logvggt_jax.data.dataset import EVALUATION, LICENCE_NOT_READ, About
+from logvggt_jax.data.errors import BrokenPicture, missing_file
 from logvggt_jax.data.formats.calibration import world_to_camera
 from logvggt_jax.data.formats.image import read_rgb
-from logvggt_jax.data.formats.listing_index import SourceFiles
 from logvggt_jax.data.formats.numbered_files import numbered_frames
-from logvggt_jax.data.readers.folder_dataset import FolderDataset, FrameRecord, Listing
+from logvggt_jax.data.formats.source_files import SourceFiles
+from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame
+from logvggt_jax.errors import InputError
 
 _TAG = np.array(202021.25, "<f4").tobytes()
 _SKY = 1000.0  # metres; the film's sky is a huge number
@@ -40,13 +41,19 @@ class Sintel(FolderDataset):
     expects = "training/final, training/depth and training/camdata_left (unpack both archives into one folder)"
     metric = True
     splits = ("train", "all")
+    about = About(
+        source="the set's site: the archive of pictures and that of depth and cameras",
+        licence=LICENCE_NOT_READ,
+        size="23 training sequences, of which published evaluations use 14; bytes unknown",
+        roles=(EVALUATION,),
+    )
 
     def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
         folder = self.root / "training" / "final"
         names = files.names(folder, "the pictures of the pass 'final'")
         return {name: folder / name for name in names if (folder / name).is_dir()}
 
-    def _list_frames(self, sequence: str, folder: Path, files: SourceFiles) -> Listing:
+    def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
         training = self.root / "training"
         paths = numbered_frames(
             files,
@@ -54,18 +61,9 @@ class Sintel(FolderDataset):
             (training / "depth" / sequence, "frame_{:04d}.dpt"),
             (training / "camdata_left" / sequence, "frame_{:04d}.cam"),
         )
-        frames: list[FrameRecord] = []
-        dropped: Counter[str] = Counter()
         for image, depth, camera in paths.values():
             intrinsics, pose = _camera(files.content(camera, "the frame's camera"), camera)
-            extrinsics = world_to_camera(pose, camera, stored="world_to_camera")
-            if extrinsics is None:
-                dropped["no pose"] += 1
-            elif not np.isfinite(intrinsics).all():
-                dropped["no intrinsics"] += 1
-            else:
-                frames.append(FrameRecord(image.stem, image, depth, intrinsics, extrinsics))
-        return Listing(frames, dropped)
+            yield frame(image, depth, intrinsics, world_to_camera(pose, camera, stored="world_to_camera"))
 
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         depth = _depth(record.depth)
@@ -79,9 +77,9 @@ class Sintel(FolderDataset):
 
 def _camera(content: bytes, path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Intrinsics [3, 3] and world-to-camera [3, 4], float64, of a `.cam` file."""
-    _check_tag(content, path, ValueError)
+    _check_tag(content, path, InputError)
     if len(content) != _CAMERA_BYTES:
-        raise ValueError(f"{path}: expected {_CAMERA_BYTES} bytes, got {len(content)}: fetch it again")
+        raise InputError(f"{path}: expected {_CAMERA_BYTES} bytes, got {len(content)}: fetch it again")
     values = np.frombuffer(content, "<f8", offset=4).astype(np.float64)
     return values[:9].reshape(3, 3), values[9:].reshape(3, 4)
 
@@ -89,7 +87,7 @@ def _camera(content: bytes, path: Path) -> tuple[np.ndarray, np.ndarray]:
 def _depth(path: Path) -> np.ndarray:
     """z-depth [H, W] float32 of a `.dpt` file, as stored."""
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; fetch it again or remove the frame's other files")
+        raise missing_file(path)
     content = path.read_bytes()
     _check_tag(content, path, BrokenPicture)
     width, height = (int(size) for size in np.frombuffer(content[4:12].ljust(8, b"\0"), "<i4"))
@@ -101,6 +99,6 @@ def _depth(path: Path) -> np.ndarray:
     return np.frombuffer(content, "<f4", offset=12).astype(np.float32).reshape(height, width)
 
 
-def _check_tag(content: bytes, path: Path, error: type[ValueError]) -> None:
+def _check_tag(content: bytes, path: Path, error: type[InputError]) -> None:
     if content[:4] != _TAG:
         raise error(f"{path}: expected the tag 202021.25 in the first four bytes: fetch it again")

@@ -9,19 +9,20 @@ pixels, and sixteen numbers of the world-to-camera matrix of the left camera, ro
 from __future__ import annotations
 
 import re
-from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 
+from logvggt_jax.data.dataset import TRAINING, About
 from logvggt_jax.data.errors import UnequalCounts
 from logvggt_jax.data.formats.calibration import numbers, pinhole, world_to_camera
 from logvggt_jax.data.formats.hdf5 import read_hdf5
 from logvggt_jax.data.formats.image import read_rgb
-from logvggt_jax.data.formats.listing_index import SourceFiles
 from logvggt_jax.data.formats.numbered_files import numbered_frames
-from logvggt_jax.data.readers.folder_dataset import FolderDataset, FrameRecord, Listing
+from logvggt_jax.data.formats.source_files import SourceFiles
+from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame
+from logvggt_jax.errors import InputError
 
 _BASELINE = 0.065  # metres between the two cameras
 _SEQUENCE = re.compile(r"\d{4}")
@@ -40,13 +41,20 @@ class Spring(FolderDataset):
     expects = "train/XXXX with frame_left, disp1_left and cam_data (unpack these three archives into one folder)"
     metric = True
     splits = ("train", "all")
+    about = About(
+        source="the benchmark's site or DaRUS (doi 10.18419/darus-3376): frame_left, disp1_left and cam_data",
+        licence="CC BY 4.0 (inferred)",
+        size="37 training sequences, 5,000 frames; the 10 test sequences have no depth; bytes unknown",
+        roles=(TRAINING,),
+        extra="data",
+    )
 
     def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
         folder = self.root / "train"
         names = files.names(folder, "the training sequences")
         return {name: folder / name for name in names if _SEQUENCE.fullmatch(name) and (folder / name).is_dir()}
 
-    def _list_frames(self, sequence: str, folder: Path, files: SourceFiles) -> Listing:
+    def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
         paths = numbered_frames(
             files,
             (folder / "frame_left", "frame_left_{:04d}.png"),
@@ -62,21 +70,13 @@ class Spring(FolderDataset):
                     "fetch the sequence's cam_data again"
                 )
         if 0 in paths:
-            raise ValueError(f"{paths[0][0]}: frames are numbered from 1: restore the original names")
-        frames: list[FrameRecord] = []
-        dropped: Counter[str] = Counter()
+            raise InputError(f"{paths[0][0]}: frames are numbered from 1: restore the original names")
         for number, (image, disparity) in paths.items():
             row = number - 1
             extrinsics = world_to_camera(
                 matrices[row].reshape(4, 4), f"{poses}, row {number}", stored="world_to_camera"
             )
-            if extrinsics is None:
-                dropped["no pose"] += 1
-            elif not np.isfinite(pinholes[row]).all():
-                dropped["no intrinsics"] += 1
-            else:
-                frames.append(FrameRecord(image.stem, image, disparity, pinhole(*pinholes[row]), extrinsics))
-        return Listing(frames, dropped)
+            yield frame(image, disparity, pinhole(*pinholes[row]), extrinsics)
 
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         image = read_rgb(record.image)
@@ -92,5 +92,5 @@ def _rows(files: SourceFiles, path: Path, columns: int, expected: str) -> np.nda
     """Rows [N, columns] float64 of a text file."""
     lines = [line for line in files.text(path, expected).splitlines() if line.strip()]
     if not lines:
-        raise ValueError(f"{path}: empty; expected {expected}: fetch it again")
+        raise InputError(f"{path}: empty; expected {expected}: fetch it again")
     return np.stack([numbers(line, f"{path}, row {row}", count=columns) for row, line in enumerate(lines, 1)])

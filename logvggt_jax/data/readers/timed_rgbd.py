@@ -14,11 +14,12 @@ from typing import ClassVar
 
 import numpy as np
 
-from logvggt_jax.data.errors import BadPose, UnequalCounts, missing_files
+from logvggt_jax.data.errors import BadPose, MissingFiles, UnequalCounts, missing_files
 from logvggt_jax.data.formats.calibration import numbers, scaled, world_to_camera
 from logvggt_jax.data.formats.image import read_depth, read_rgb
-from logvggt_jax.data.formats.listing_index import SourceFiles
-from logvggt_jax.data.readers.folder_dataset import NO_POSES, FolderDataset, FrameRecord, Listing
+from logvggt_jax.data.formats.source_files import SourceFiles
+from logvggt_jax.data.readers.folder_dataset import NO_POSES, Dropped, FolderDataset, FrameRecord, frame
+from logvggt_jax.errors import InputError
 from logvggt_jax.geometry import quaternion_to_matrix
 
 TOLERANCE = 0.02  # seconds
@@ -78,7 +79,7 @@ class TimedRGBD(FolderDataset):
                 if not self.folder_pattern.fullmatch(name) or not (parent / name).is_dir():
                     continue
                 if name in folders:
-                    raise ValueError(f"{parent / name} and {folders[name]} are the same sequence: remove one of them")
+                    raise InputError(f"{parent / name} and {folders[name]} are the same sequence: remove one of them")
                 folders[name] = parent / name
         places: dict[str, Path] = {}
         for name, folder in sorted(folders.items()):
@@ -89,27 +90,22 @@ class TimedRGBD(FolderDataset):
                 places |= {f"{name}/{part}": folder / part for part in held if _PREPARED.fullmatch(part)}
         return places
 
-    def _list_frames(self, sequence: str, folder: Path, files: SourceFiles) -> Listing:
+    def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
         if match := _PREPARED.fullmatch(folder.name):
-            return self._list_prepared(folder.parent, match[1], files)
+            yield from self._prepared_frames(folder.parent, match[1], files)
+            return
         times, images = _listed_files(folder / "rgb.txt", files)
         depth_times, depths = _listed_files(folder / "depth.txt", files)
         trajectory = _Trajectory(folder / "groundtruth.txt", files)
         depth_of, pose_of = associate(times, depth_times), associate(times, trajectory.times)
-        dropped = {"no depth": 0, "no pose": 0}
-        records = []
         for image, depth_index, pose_index in zip(images, depth_of, pose_of, strict=True):
-            extrinsics = trajectory.extrinsics(pose_index) if pose_index >= 0 else None
             if depth_index < 0:
-                dropped["no depth"] += 1
-            elif extrinsics is None:
-                dropped["no pose"] += 1
+                yield Dropped("no depth")
             else:
-                depth = depths[depth_index]
-                records.append(FrameRecord(image.stem, image, depth, self._intrinsics(folder), extrinsics))
-        return Listing(records, {reason: count for reason, count in dropped.items() if count})
+                extrinsics = trajectory.extrinsics(pose_index) if pose_index >= 0 else None
+                yield frame(image, depths[depth_index], self._intrinsics(folder), extrinsics)
 
-    def _list_prepared(self, folder: Path, count: str, files: SourceFiles) -> Listing:
+    def _prepared_frames(self, folder: Path, count: str, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
         times, images = _named_files(folder / f"rgb_{count}", files)
         depth_folder = folder / f"depth_{count}"
         if self.prepared_for == "poses" and not files.exists(depth_folder):
@@ -124,18 +120,13 @@ class TimedRGBD(FolderDataset):
         trajectory = _Trajectory(folder / f"groundtruth_{count}.txt", files)
         pose_of = associate(times, trajectory.times)
         if (pose_of < 0).any() and self.prepared_for == "poses":
-            raise ValueError(
+            raise InputError(
                 f"{trajectory.path}: expected a pose within {TOLERANCE} s of each picture, got none for "
                 f"{images[int(np.argmin(pose_of))].name}: prepare both again"
             )
-        records, lost = [], 0
         for image, depth, pose_index in zip(images, depths, pose_of, strict=True):
             extrinsics = NO_POSES if (pose_of < 0).any() else trajectory.extrinsics(pose_index)
-            if extrinsics is None:
-                lost += 1
-            else:
-                records.append(FrameRecord(image.stem, image, depth, self._intrinsics(folder), extrinsics))
-        return Listing(records, {"no pose": lost} if lost else {})
+            yield frame(image, depth, self._intrinsics(folder), extrinsics)
 
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         image = read_rgb(record.image)
@@ -155,7 +146,7 @@ class _Trajectory:
             lines.append(line)
             rows.append(numbers(text, f"{path}, line {line}", count=8))
         if not rows:
-            raise ValueError(f"{path}: expected lines 'time tx ty tz qx qy qz qw', got none: fetch the file again")
+            raise InputError(f"{path}: expected lines 'time tx ty tz qx qy qz qw', got none: fetch the file again")
         values = np.array(rows)
         order = np.argsort(values[:, 0], kind="stable")
         self.path = path
@@ -163,7 +154,7 @@ class _Trajectory:
         self.times = values[order, 0]
 
     def extrinsics(self, index: int) -> np.ndarray | None:
-        """World-to-camera [4, 4] of pose `index`; None where it is not finite. ValueError for no unit quaternion."""
+        """World-to-camera [4, 4] of pose `index`; None where it is not finite. BadPose for no unit quaternion."""
         position, quaternion = self._poses[index, :3], self._poses[index, 3:]
         where = f"{self.path}, line {self._lines[index]}"
         if not np.isfinite(self._poses[index]).all():
@@ -180,13 +171,13 @@ def _listed_files(path: Path, files: SourceFiles) -> tuple[np.ndarray, list[Path
     for line, text in _lines(files.text(path, "lines 'time file'")):
         words = text.split()
         if len(words) != 2:
-            raise ValueError(f"{path}, line {line}: expected 'time file', got {text!r}: fetch the file again")
+            raise InputError(f"{path}, line {line}: expected 'time file', got {text!r}: fetch the file again")
         file = path.parent / words[1]
         if file in entries:
-            raise ValueError(f"{path}, line {line}: {words[1]} is listed twice: fetch the file again")
+            raise InputError(f"{path}, line {line}: {words[1]} is listed twice: fetch the file again")
         entries[file] = float(numbers(words[0], f"{path}, line {line}")[0])
     if not entries:
-        raise ValueError(f"{path}: expected lines 'time file', got none: fetch the file again")
+        raise InputError(f"{path}: expected lines 'time file', got none: fetch the file again")
     present = {
         folder: set(files.names(folder, f"the files that {path.name} lists"))
         for folder in {file.parent for file in entries}
@@ -203,7 +194,7 @@ def _named_files(folder: Path, files: SourceFiles) -> tuple[np.ndarray, list[Pat
     matches = map(_TIMED_FILE.fullmatch, files.names(folder, "pictures named by their time, 1305031102.1753.png"))
     entries = sorted((float(match[1]), folder / match[0]) for match in matches if match)
     if not entries:
-        raise FileNotFoundError(f"{folder}: no pictures named by their time, as 1305031102.1753.png; prepare it again")
+        raise MissingFiles(f"{folder}: no pictures named by their time, as 1305031102.1753.png; prepare it again")
     return np.array([time for time, _ in entries]), [file for _, file in entries]
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from logvggt_jax.data.dataset import EVALUATION, LICENCE_NOT_READ, About
 from logvggt_jax.data.formats.calibration import pinhole
 from logvggt_jax.data.readers.timed_rgbd import TimedRGBD
 
@@ -36,6 +37,12 @@ class TUM(TimedRGBD):
     folder_pattern = re.compile(r"rgbd_dataset_freiburg([123])_\w+")
     container = None
     prepared_for = "poses"
+    about = About(
+        source="the set's site: an archive a sequence",
+        licence=LICENCE_NOT_READ,
+        size="unknown",
+        roles=(EVALUATION,),
+    )
 
     def _intrinsics(self, folder: Path) -> np.ndarray:
         match = self.folder_pattern.fullmatch(folder.name)

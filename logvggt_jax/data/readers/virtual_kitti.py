@@ -10,17 +10,18 @@ interleaved. Depth is 16-bit z in centimetres, 65535 in the sky and beyond 655.3
 from __future__ import annotations
 
 import re
-from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 
+from logvggt_jax.data.dataset import EVALUATION, TRAINING, About
 from logvggt_jax.data.formats.calibration import numbers, pinhole, world_to_camera
 from logvggt_jax.data.formats.image import read_depth, read_rgb
-from logvggt_jax.data.formats.listing_index import SourceFiles
 from logvggt_jax.data.formats.numbered_files import numbered_frames
-from logvggt_jax.data.readers.folder_dataset import FolderDataset, FrameRecord, Listing
+from logvggt_jax.data.formats.source_files import SourceFiles
+from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame
+from logvggt_jax.errors import InputError
 
 _SCENE = re.compile(r"Scene\d{2}")
 _VARIATIONS = (
@@ -52,6 +53,12 @@ class VirtualKITTI(FolderDataset):
     expects = "SceneXX/<variation>/frames with rgb and depth (unpack rgb, depth and textgt into one folder)"
     metric = True
     splits = ("train", "test", "all")
+    about = About(
+        source="its owners' page: the archives of pictures, depth and text ground truth of version 2.0.3",
+        licence="CC BY-NC-SA 3.0",
+        size="21,260 stereo pairs: 5 scenes in 10 variations, 2 cameras; bytes unknown",
+        roles=(TRAINING, EVALUATION),
+    )
 
     def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
         scenes = [name for name in files.names(self.root, "the scenes") if _SCENE.fullmatch(name)]
@@ -66,7 +73,7 @@ class VirtualKITTI(FolderDataset):
             if camera in _CAMERAS
         }
 
-    def _list_frames(self, sequence: str, folder: Path, files: SourceFiles) -> Listing:
+    def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
         camera = sequence.rpartition("/")[2]
         index = int(camera.removeprefix("Camera_"))
         paths = numbered_frames(
@@ -77,23 +84,15 @@ class VirtualKITTI(FolderDataset):
         calibration, poses = folder / "intrinsic.txt", folder / "extrinsic.txt"
         pinholes = _rows(files, calibration, index, columns=4)
         matrices = _rows(files, poses, index, columns=16)
-        frames: list[FrameRecord] = []
-        dropped: Counter[str] = Counter()
         for number, (image, depth) in paths.items():
             for path, rows in ((calibration, pinholes), (poses, matrices)):
                 if number not in rows:
-                    raise ValueError(
+                    raise InputError(
                         f"{path}: no row for frame {number} of {camera}: fetch the text ground truth again"
                     )
             where = f"{poses}, frame {number} of {camera}"
             extrinsics = world_to_camera(matrices[number].reshape(4, 4), where, stored="world_to_camera")
-            if extrinsics is None:
-                dropped["no pose"] += 1
-            elif not np.isfinite(pinholes[number]).all():
-                dropped["no intrinsics"] += 1
-            else:
-                frames.append(FrameRecord(image.stem, image, depth, pinhole(*pinholes[number]), extrinsics))
-        return Listing(frames, dropped)
+            yield frame(image, depth, pinhole(*pinholes[number]), extrinsics)
 
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         raw = read_depth(record.depth)
@@ -106,7 +105,7 @@ def _rows(files: SourceFiles, path: Path, camera: int, *, columns: int) -> dict[
     rows: dict[int, np.ndarray] = {}
     header, *lines = files.text(path, "the text ground truth (archive textgt)").splitlines() or [""]
     if not header.startswith("frame cameraID"):
-        raise ValueError(f"{path}: expected a header 'frame cameraID ...', got {header[:40]!r}: fetch it again")
+        raise InputError(f"{path}: expected a header 'frame cameraID ...', got {header[:40]!r}: fetch it again")
     for line_number, line in enumerate(lines, 2):
         if line.strip():
             values = numbers(line, f"{path}, line {line_number}", count=2 + columns)

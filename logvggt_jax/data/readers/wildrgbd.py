@@ -11,21 +11,23 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 
+from logvggt_jax.data.dataset import TRAINING, About
 from logvggt_jax.data.errors import missing_files
 from logvggt_jax.data.formats.calibration import numbers, world_to_camera
 from logvggt_jax.data.formats.image import read_depth, read_rgb
-from logvggt_jax.data.formats.listing_index import SourceFiles
+from logvggt_jax.data.formats.numbered_files import numbered_frames
 from logvggt_jax.data.formats.relative_intrinsics import in_pixels, relative
+from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.data.formats.split_lists import sequences_present
-from logvggt_jax.data.readers.folder_dataset import FolderDataset, FrameRecord, Listing
+from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame
+from logvggt_jax.errors import InputError
 
 _SCENE = re.compile(r"scene_\d+")
-_FRAME = re.compile(r"(\d+)\.png")
 _LISTED = re.compile(r"scenes/scene_\d+")
 _LIST_FILES = ("nvs_list.json", "camera_eval_list.json")
 # Left out by published training code.
@@ -46,6 +48,12 @@ class WildRGBD(FolderDataset):
     expects = "<category>/scenes/scene_XXX/rgb (unpack the categories' zip files)"
     metric = True
     splits = ("train", "test", "all")
+    about = About(
+        source="zip files by category (repository wildrgbd/wildrgbd)",
+        licence="unknown: not stated in the repository",
+        size="3.37 TB of zip files, about 4 TB unpacked; 46 categories",
+        roles=(TRAINING,),
+    )
 
     def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
         places: dict[str, Path] = {}
@@ -64,34 +72,15 @@ class WildRGBD(FolderDataset):
             places |= {name: scenes / name.partition("/")[2] for name in sorted(present, key=_number)}
         return places
 
-    def _list_frames(self, sequence: str, folder: Path, files: SourceFiles) -> Listing:
+    def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
         intrinsics = _intrinsics(files, folder / "metadata")
         poses = _poses(files, folder / "cam_poses.txt")
-        pictures, depths = (_frames(files, folder / kind) for kind in ("rgb", "depth"))
-        absent = {
-            folder / kind / f"{number:05d}.png": "but the frame has other files or a pose; fetch it or remove them"
-            for number in sorted(pictures.keys() | depths.keys() | poses.keys())
-            for kind, present in (("rgb", pictures), ("depth", depths))
-            if number not in present
-        }
+        paths = numbered_frames(files, (folder / "rgb", "{:05d}.png"), (folder / "depth", "{:05d}.png"))
+        absent = [folder / "rgb" / f"{number:05d}.png" for number in poses if number not in paths]
         if absent:
-            raise missing_files(absent)
-        frames = []
-        for number in sorted(pictures):
-            pose = poses.get(number)
-            if pose is None:
-                continue
-            frames.append(
-                FrameRecord(
-                    name=pictures[number].stem,
-                    image=pictures[number],
-                    depth=depths[number],
-                    intrinsics=intrinsics,
-                    extrinsics=pose,
-                )
-            )
-        lost = len(pictures) - len(frames)
-        return Listing(frames, {"no pose": lost} if lost else {})
+            raise missing_files(dict.fromkeys(absent, "but the frame has a pose; fetch it or remove that"))
+        for number, (image, depth) in paths.items():
+            yield frame(image, depth, intrinsics, poses.get(number))
 
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         image = read_rgb(record.image)
@@ -113,14 +102,9 @@ def _training_scenes(category: Path, files: SourceFiles) -> set[str]:
         content = _json(files.text(path, "the category's list file; fetch it or choose split='all'"), path)
         train = content.get("train")
         if not isinstance(train, list) or not all(isinstance(s, str) and _LISTED.fullmatch(s) for s in train):
-            raise ValueError(f"{path}: expected names like 'scenes/scene_000' under 'train': restore the original file")
+            raise InputError(f"{path}: expected names like 'scenes/scene_000' under 'train': restore the original file")
         listed.append({f"{category.name}/{scene.partition('/')[2]}" for scene in train})
     return set.intersection(*listed)
-
-
-def _frames(files: SourceFiles, folder: Path) -> dict[int, Path]:
-    names = files.names(folder, "the scene's frames; unpack its zip file again")
-    return {int(match[1]): folder / match[0] for match in filter(None, map(_FRAME.fullmatch, names))}
 
 
 def _intrinsics(files: SourceFiles, path: Path) -> np.ndarray:
@@ -131,9 +115,9 @@ def _intrinsics(files: SourceFiles, path: Path) -> np.ndarray:
         # Column by column.
         matrix = np.array(content["K"], np.float64).reshape(3, 3).T
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: expected w, h and the nine numbers K: {error!r}; fetch it again") from error
+        raise InputError(f"{path}: expected w, h and the nine numbers K: {error!r}; fetch it again") from error
     if not (width > 0 and height > 0):
-        raise ValueError(f"{path}: expected a width and height above 0, got {width} x {height}: fetch it again")
+        raise InputError(f"{path}: expected a width and height above 0, got {width} x {height}: fetch it again")
     return relative(matrix, (height, width))
 
 
@@ -141,9 +125,9 @@ def _json(text: str, path: Path) -> dict:
     try:
         content = json.loads(text)
     except json.JSONDecodeError as error:
-        raise ValueError(f"{path}: not JSON ({error}): fetch it again") from error
+        raise InputError(f"{path}: not JSON ({error}): fetch it again") from error
     if not isinstance(content, dict):
-        raise ValueError(f"{path}: expected a JSON object, got {type(content).__name__}: fetch it again")
+        raise InputError(f"{path}: expected a JSON object, got {type(content).__name__}: fetch it again")
     return content
 
 
@@ -157,6 +141,6 @@ def _poses(files: SourceFiles, path: Path) -> dict[int, np.ndarray | None]:
         where = f"{path}, line {line}"
         values = numbers(row, where, count=17)
         if not values[0].is_integer():
-            raise ValueError(f"{where}: expected a frame number first, got {values[0]:g}: fetch the file again")
+            raise InputError(f"{where}: expected a frame number first, got {values[0]:g}: fetch the file again")
         poses[int(values[0])] = world_to_camera(values[1:].reshape(4, 4), where, stored="camera_to_world")
     return poses

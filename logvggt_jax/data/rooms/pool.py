@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import multiprocessing
 import os
-import shutil
-import uuid
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
@@ -18,9 +17,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from logvggt_jax.data.dataset import check_indices, check_sequence
 from logvggt_jax.data.rooms.rooms import Rooms
-from logvggt_jax.types import Frames
+from logvggt_jax.errors import InputError, OutputExists
+from logvggt_jax.files import atomic_folder
+from logvggt_jax.frames import Frames
 
-RENDERER_VERSION = 1  # part of the cache's key; raise it whenever the same options give other frames
 _ARRAYS = ("images", "depth", "intrinsics", "extrinsics")
 _SERIAL_PIXELS = 3e7  # fewer than this are rendered sooner than worker processes start
 
@@ -88,12 +88,12 @@ def render_pool(
       progress: show a progress bar.
 
     Raises:
-      ValueError: the pool is larger than `max_bytes`, or the cache is damaged.
+      InputError: the pool is larger than `max_bytes`, or the cache is damaged.
     """
     shapes = _shapes(rooms)
     size = sum(int(np.prod(shape)) * dtype.itemsize for shape, dtype in shapes.values())
     if size > max_bytes:
-        raise ValueError(
+        raise InputError(
             f"a pool of {len(rooms.sequences)} rooms takes {size:,} bytes, more than max_bytes={max_bytes:,}: "
             "use fewer rooms, fewer frames or smaller images, or raise max_bytes"
         )
@@ -104,10 +104,8 @@ def render_pool(
 
     folder = Path(cache_dir).absolute() / f"rooms-{_digest(rooms)}"
     if not folder.exists():
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        unfinished = folder.with_name(f".{folder.name}.{uuid.uuid4().hex}")
-        unfinished.mkdir()
-        try:
+        # Another process may finish the same pool meanwhile; its bytes are the same.
+        with contextlib.suppress(OutputExists), atomic_folder(folder) as unfinished:
             maps: dict[str, np.ndarray] = {
                 name: np.lib.format.open_memmap(unfinished / f"{name}.npy", "w+", dtype, shape)
                 for name, (shape, dtype) in shapes.items()
@@ -116,24 +114,12 @@ def render_pool(
             for array in maps.values():
                 array.flush()  # type: ignore[attr-defined]
             del maps
-            (unfinished / "options.json").write_text(json.dumps(_identity(rooms), indent=2) + "\n")
-            try:
-                unfinished.rename(folder)
-            except OSError:
-                # Another process may have finished the same pool meanwhile; its bytes are the same.
-                if not folder.exists():
-                    raise
-        finally:
-            shutil.rmtree(unfinished, ignore_errors=True)
+            (unfinished / "options.json").write_text(json.dumps(rooms.identity, indent=2) + "\n")
     return RoomPool(rooms, _open_arrays(folder, rooms), folder)
 
 
-def _identity(rooms: Rooms) -> dict[str, Any]:
-    return {"renderer": RENDERER_VERSION, **rooms.options}
-
-
 def _digest(rooms: Rooms) -> str:
-    return hashlib.sha256(json.dumps(_identity(rooms), sort_keys=True).encode()).hexdigest()[:16]
+    return hashlib.sha256(json.dumps(rooms.identity, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def _shapes(rooms: Rooms) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
@@ -153,9 +139,9 @@ def _open_arrays(folder: Path, rooms: Rooms) -> dict[str, np.ndarray]:
         try:
             array = np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False)
         except (OSError, ValueError) as error:
-            raise ValueError(f"{folder / name}.npy cannot be read ({error}): delete {folder} to render anew") from error
+            raise InputError(f"{folder / name}.npy cannot be read ({error}): delete {folder} to render anew") from error
         if array.shape != shape or array.dtype != dtype:
-            raise ValueError(
+            raise InputError(
                 f"{folder / name}.npy holds {array.dtype} {array.shape}, expected {dtype} {shape}: "
                 f"delete {folder} to render anew"
             )

@@ -9,15 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from logvggt_jax.data.dataset import check_indices, check_sequence, check_split
+from logvggt_jax.data.dataset import EVALUATION, TRAINING, About, Reader, check_indices, check_sequence, check_split
 from logvggt_jax.data.rooms.layout import STYLES, Room, random_room
 from logvggt_jax.data.rooms.ray_caster import render
-from logvggt_jax.types import Frames
+from logvggt_jax.errors import InputError
+from logvggt_jax.frames import Frames
 
+_RENDERER_VERSION = 1  # raise it whenever the same options give other frames
 _DEFAULT_ROOMS = {"train": 1500, "val": 32, "test": 32}
 
 
-class Rooms:
+class Rooms(Reader):
     """Furnished box rooms seen along smooth closed camera paths, rendered when read.
 
     A room is a function of (`seed`, `style`, its number) and each of its frames one of the options and the
@@ -25,6 +27,19 @@ class Rooms:
     validation rooms, in 9 test rooms, the rest training rooms, so the splits share no room. Intrinsics have the
     principal point (W/2, H/2), pixel centres at integers; depth is z in metres and valid everywhere.
     """
+
+    name = "rooms"
+    title = "procedural rooms"
+    expects = "none: rooms are rendered when they are read"
+    metric = True
+    splits = ("train", "val", "test", "all")
+    needs_root = False
+    about = About(
+        source="comes with this package",
+        licence="Apache-2.0, this package's",
+        size="1,500 rooms to train on, 32 to validate, 32 to test",
+        roles=(TRAINING, EVALUATION),
+    )
 
     def __init__(
         self,
@@ -57,28 +72,33 @@ class Rooms:
             alone says anything of it, and learning starts late. About one wall each of them does.
 
         Raises:
-          ValueError: an option is out of range; names it.
+          InputError: an option is out of range; names it.
         """
-        check_split(split)
+        check_split(split, self)
         if style not in STYLES:
-            raise ValueError(f"unknown room style {style!r}: choose one of {', '.join(STYLES)}")
+            raise InputError(f"unknown room style {style!r}: choose one of {', '.join(STYLES)}")
         sizes = {"height": height, "width": width, "num_frames": num_frames, "period": period}
         for name, value in (sizes if num_rooms is None else {**sizes, "num_rooms": num_rooms}).items():
             if value < 1:
-                raise ValueError(f"rooms: {name} must be at least 1, got {value}")
+                raise InputError(f"rooms: {name} must be at least 1, got {value}")
         if seed < 0:
-            raise ValueError(f"rooms: seed must not be negative, got {seed}")
+            raise InputError(f"rooms: seed must not be negative, got {seed}")
         low, high = speed if isinstance(speed, Sequence) else (speed, speed)
         if not 0 < low <= high:
-            raise ValueError(f"rooms: speed must be positive or a pair low <= high, got {speed}")
+            raise InputError(f"rooms: speed must be positive or a pair low <= high, got {speed}")
         if not 0 <= facing_north <= 1:
-            raise ValueError(f"rooms: facing_north must lie in [0, 1], got {facing_north}")
+            raise InputError(f"rooms: facing_north must lie in [0, 1], got {facing_north}")
         self.facing_north = float(facing_north)
         self.split, self.height, self.width, self.style = split, height, width, style
         self.seed, self.speed, self.period = seed, (float(low), float(high)), period
         self._num_frames = num_frames
         self._numbers = _room_numbers(split, num_rooms)
         self.sequences: tuple[str, ...] = tuple(self._numbers)
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """Everything that decides the frames: the options and the version of what renders them."""
+        return {"renderer": _RENDERER_VERSION, **self.options}
 
     @property
     def options(self) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from analytic_room import camera_to_world, disagreement, pinhole, view
 
 from logvggt_jax.data import open_dataset
 from logvggt_jax.data.checks.consistency import depth_consistency, visible_shares
-from logvggt_jax.types import Frames
+from logvggt_jax.frames import Frames
 
 SIZE = (48, 64)
 

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 from absl import logging
 
+from logvggt_jax.data.errors import MissingFiles
 from logvggt_jax.data.feeding.augmentation import ColourAugmentation
 from logvggt_jax.data.feeding.batches import training_batches
 from logvggt_jax.data.feeding.broken_clips import TooManyBrokenClips
 from logvggt_jax.data.rooms.rooms import Rooms
-from logvggt_jax.types import Frames
+from logvggt_jax.errors import InputError
+from logvggt_jax.frames import Frames
 
 
 class Numbered:
@@ -308,7 +310,7 @@ def test_too_many_broken_clips_end_the_run_with_their_names():
 def test_a_set_that_cannot_be_read_at_all_ends_the_run():
     class Gone(Numbered):
         def read(self, sequence: str, indices) -> Frames:
-            raise FileNotFoundError(f"{sequence}.png: no such file")
+            raise MissingFiles(f"{sequence}.png: no such file")
 
     with (
         batches({"gone": Gone(8)}, max_broken=0.9) as iterator,
@@ -322,7 +324,7 @@ class WithoutUpright(Shaped):
 
     def read(self, sequence: str, indices) -> Frames:
         if int(sequence[1:]) % 3 == 0:
-            raise ValueError(f"{sequence}/calibration.txt: missing")
+            raise InputError(f"{sequence}/calibration.txt: missing")
         return super().read(sequence, indices)
 
 
@@ -354,7 +356,7 @@ def test_a_shape_of_which_all_is_broken_is_replaced_by_the_other_shapes_of_its_s
 def test_a_set_of_which_all_is_broken_is_replaced_by_the_others_until_too_many_are():
     class Gone(Numbered):
         def read(self, sequence: str, indices) -> Frames:
-            raise FileNotFoundError(f"{sequence}.png: no such file")
+            raise MissingFiles(f"{sequence}.png: no such file")
 
     options = {"datasets": {"gone": Gone(3), "numbered": Numbered(8)}, "weights": {"gone": 0.1, "numbered": 0.9}}
     with batches(**options, max_broken=0.2) as iterator:
@@ -380,7 +382,7 @@ def test_a_sequence_that_cannot_be_listed_changes_no_other_clip():
     class Unlisted(Numbered):
         def num_frames(self, sequence: str) -> int:
             if sequence == "s3":
-                raise ValueError("s3/poses.txt: expected 16 numbers")
+                raise InputError("s3/poses.txt: expected 16 numbers")
             return super().num_frames(sequence)
 
     with batches(max_broken=0.5) as iterator:

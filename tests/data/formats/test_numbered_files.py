@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from logvggt_jax.data.errors import MissingFiles
-from logvggt_jax.data.formats.listing_index import SourceFiles
 from logvggt_jax.data.formats.numbered_files import numbered_files, numbered_frames, without_gaps
+from logvggt_jax.data.formats.source_files import SourceFiles
 
 
 def write(folder: Path, *names: str) -> Path:

@@ -193,8 +193,8 @@ def test_damaged_depth_is_named(root: Path, content: bytes, complaint: str):
 def test_an_empty_scene_is_named(root: Path):
     for folder in ("blended_images", "cams", "rendered_depth_maps"):
         (root / OTHER / folder).mkdir(parents=True)
-    with pytest.raises(ValueError, match=f"{OTHER}: no frame of BlendedMVS counts"):
+    with pytest.raises(FileNotFoundError, match=rf"{OTHER}/blended_images: no files like 00000000\.jpg"):
         BlendedMVS(root).num_frames(OTHER)
-    (root / OTHER / "cams").rmdir()
-    with pytest.raises(FileNotFoundError, match="cams: no such folder"):
+    (root / OTHER / "blended_images").rmdir()
+    with pytest.raises(FileNotFoundError, match="blended_images: no such folder"):
         BlendedMVS(root).num_frames(OTHER)

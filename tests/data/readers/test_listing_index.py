@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import sqlite3
+import sys
 from collections import Counter
 from contextlib import closing
 from pathlib import Path
@@ -13,7 +15,8 @@ import pytest
 from absl import logging
 from test_replica import CAMERA, write_scene
 
-from logvggt_jax.data.formats.listing_index import ListingIndex, SourceFiles
+from logvggt_jax.data.formats.source_files import SourceFiles
+from logvggt_jax.data.readers.listing_index import ListingIndex, code_digest
 from logvggt_jax.data.readers.replica import Replica
 
 
@@ -153,7 +156,53 @@ def test_copies_and_readers_do_not_share_an_index(root: Path):
     other = root.parent / "other"
     write_scene(other / "room0", 2)
     assert names(root) == ALL and names(other) == ALL[:2] and names(root) == ALL
-    paths = {ListingIndex(kind, folder).path for kind in ("replica", "nrgbd") for folder in (root, other)}
-    assert len(paths) == 4
+    identities = ({"name": "replica"}, {"name": "nrgbd"}, {"name": "replica", "upright": False})
+    paths = {ListingIndex(identity, folder, "code").path for identity in identities for folder in (root, other)}
+    assert len(paths) == 6
     # However the folder is spelt.
-    assert ListingIndex("replica", root / ".." / root.name).path == ListingIndex("replica", root).path
+    assert ListingIndex(identities[0], root / ".." / root.name, "code").path in paths
+
+
+READER = """
+from logvggt_jax.data.readers.replica import Replica
+
+class Renamed(Replica):
+    def _frames(self, sequence, folder, files):
+        for number, record in enumerate(super()._frames(sequence, folder, files)):
+            yield dataclasses.replace(record, name=f"PREFIX{number}")
+
+import dataclasses
+"""
+
+
+def test_a_changed_reader_lists_anew_and_an_unchanged_one_does_not(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reads: Counter[str]
+):
+    monkeypatch.syspath_prepend(tmp_path / "code")
+    source = tmp_path / "code" / "a_changing_reader.py"
+    source.parent.mkdir()
+
+    def names_with(prefix: str) -> list[str]:
+        source.write_text(READER.replace("PREFIX", prefix))
+        sys.modules.pop("a_changing_reader", None)
+        importlib.invalidate_caches()
+        return importlib.import_module("a_changing_reader").Renamed(root).frame_names("room0")
+
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    assert names_with("old") == ["old0", "old1", "old2"]
+    reads.clear()
+    assert names_with("old") == ["old0", "old1", "old2"] and not reads
+    assert names_with("new") == ["new0", "new1", "new2"] and reads
+    assert index_file(root)  # the old listing has been replaced
+
+
+def test_the_digest_knows_the_modules_that_a_reader_uses_by_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    before = code_digest(Replica)
+    for name in ("readers.folder_dataset", "formats.pose_lists", "formats.calibration"):
+        module = importlib.import_module(f"logvggt_jax.data.{name}")
+        changed = tmp_path / f"{name}.py"
+        changed.write_text(Path(module.__file__).read_text() + "# changed")
+        with monkeypatch.context() as patch:
+            patch.setattr(module, "__file__", str(changed))
+            assert code_digest(Replica) != before
+    assert code_digest(Replica) == before

@@ -1,0 +1,25 @@
+"""Frames of a data set, the one value that crosses package borders without JAX."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Frames(NamedTuple):
+    """Frames of one sequence as a dataset hands them out, numpy arrays.
+
+    Attributes:
+      images: [T, H, W, 3] uint8 RGB.
+      depth: [T, H, W] float32 z-depth, metres where `metric`, 0 where invalid.
+      intrinsics: [T, 3, 3] float32, pixels of `images`.
+      extrinsics: [T, 4, 4] float32, world-to-camera (OpenCV), NaN where the set has no poses.
+      metric: whether lengths are metres.
+    """
+
+    images: np.ndarray
+    depth: np.ndarray
+    intrinsics: np.ndarray
+    extrinsics: np.ndarray
+    metric: bool
