@@ -12,7 +12,7 @@ CPU := JAX_PLATFORMS=cpu
 .DEFAULT_GOAL := help
 
 help:
-	@echo "make demo      train, evaluate and reconstruct on procedural rooms (about 15 minutes on two cores)"
+	@echo "make demo      train, evaluate and reconstruct on procedural rooms; README says how long it takes"
 	@echo "make test      linter, type checker and tests (under 10 minutes)"
 	@echo "make test-all  the slow tests as well: 1B parity, compilation for TPUs, long streams"
 	@echo "make lint      linter, formatter check and type checker alone"

@@ -3,14 +3,15 @@
     python train.py --config=configs/tiny.py --workdir=runs/tiny
 
 Run the same command again to go on after an interruption. On several machines start it on each of them with
---distributed. Any field of the configuration can be changed on the
-command line: --config.optimizer.learning_rate=5e-4.
+--distributed. Any field of the configuration can be changed on the command line:
+--config.optimizer.learning_rate=5e-4.
 """
 
 from __future__ import annotations
 
 import os
 import sys
+import traceback
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from absl import app, flags, logging
 from ml_collections import config_flags
 
 from logvggt_jax.compile import enable_compilation_cache
+from logvggt_jax.errors import InputError
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.loop import NonFiniteTraining, train
 from logvggt_jax.training.processes import join_processes
@@ -53,11 +55,14 @@ def main(arguments: Sequence[str]) -> None:
                 coordinator=_COORDINATOR.value, num_processes=_NUM_PROCESSES.value, process_id=_PROCESS_ID.value
             )
         train(config, Path(_WORKDIR.value), mesh=data_mesh(), resume_step=_RESUME_STEP.value)
-    except (ValueError, OSError, ImportError, NonFiniteTraining) as error:
-        # Errors of settings, data and checkpoints say in one line what to mend; -v 1 shows where they arose.
-        if flags.FLAGS.verbosity > 0:
+    except Exception as error:
+        # What a user can mend is one line (-v 1 shows where it arose); anything else is a fault of ours.
+        if isinstance(error, InputError | NonFiniteTraining) and flags.FLAGS.verbosity <= 0:
+            message = f"train.py: {' '.join(str(error).split())}"
+        elif jax.process_count() > 1:
+            message = traceback.format_exc()
+        else:
             raise
-        message = f"train.py: {' '.join(str(error).split())}"
         if jax.process_count() > 1:
             # At once: the others wait for this process's share of a step, and it would wait for them at the exit.
             print(f"process {jax.process_index()}: {message}", file=sys.stderr, flush=True)

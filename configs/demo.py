@@ -1,4 +1,4 @@
-"""The tiny model for `make demo`: about six minutes of training on two CPU cores, compilation included.
+"""The tiny model for `make demo`.
 
 python train.py --config=configs/demo.py --workdir=runs/demo/training
 """

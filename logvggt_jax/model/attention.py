@@ -180,8 +180,8 @@ def _cudnn_forward(query: jax.Array, key: jax.Array, value: jax.Array, lengths: 
         lengths = jnp.full(key.shape[0], key.shape[1], jnp.int32)
 
     def padded(query: jax.Array, key: jax.Array, value: jax.Array) -> jax.Array:
-        even = [jnp.pad(x, ((0, 0), (0, x.shape[1] % 2), (0, 0), (0, 0))) for x in (query, key, value)]
-        return _cudnn_call(*even, lengths)[:, : query.shape[1]]
+        q, k, v = (jnp.pad(x, ((0, 0), (0, x.shape[1] % 2), (0, 0), (0, 0))) for x in (query, key, value))
+        return _cudnn_call(q, k, v, lengths)[:, : query.shape[1]]
 
     return jax.vjp(padded, query, key, value)
 
@@ -201,14 +201,16 @@ def _tpu_flash(query: jax.Array, key: jax.Array, value: jax.Array, key_valid: ja
     batch, queries, _, head_dim = query.shape
     keys = key.shape[1]
     q_block, k_block = _least_padding(queries), _least_padding(keys)
-    key_valid = jnp.ones((batch, keys), bool) if key_valid is None else _as_mask(key_valid, keys)
+    valid = _as_mask(key_valid, keys)
+    if valid is None:
+        valid = jnp.ones((batch, keys), bool)
 
     def pad(x: jax.Array, block: int) -> jax.Array:
         return jnp.pad(x, ((0, 0), (0, -x.shape[1] % block)) + ((0, 0),) * (x.ndim - 2))
 
-    query, key, value, key_valid = pad(query, q_block), *(pad(x, k_block) for x in (key, value, key_valid))
+    query, key, value, valid = pad(query, q_block), *(pad(x, k_block) for x in (key, value, valid))
     segments = pallas.SegmentIds(
-        q=jnp.ones(query.shape[:2], jnp.int32), kv=jnp.where(key_valid, 1, 0).astype(jnp.int32)
+        q=jnp.ones(query.shape[:2], jnp.int32), kv=jnp.where(valid, 1, 0).astype(jnp.int32)
     )
     sizes = pallas.BlockSizes(
         block_q=q_block,

@@ -17,6 +17,7 @@ from logvggt_jax.data.feeding.holdouts import check_disjoint, check_held_out
 from logvggt_jax.data.registry import DATASETS, open_dataset
 from logvggt_jax.data.rooms.pool import render_pool
 from logvggt_jax.data.rooms.rooms import Rooms
+from logvggt_jax.errors import InputError
 from logvggt_jax.training.config import DataConfig, SourceConfig, StageConfig
 
 
@@ -29,12 +30,12 @@ def open_sources(config: DataConfig, validation: SourceConfig | None = None) -> 
     """The mixture's data sets by name; rooms are rendered here, once, since rendering costs more than training.
 
     Raises:
-      FileNotFoundError: folders of data sets do not exist and `config.allow_missing` is off, or none exists; named.
-      ValueError: a data set would train on sequences that `config.hold_out` or the `validation` source keeps.
+      InputError: folders of data sets do not exist and `config.allow_missing` is off, or none exists; named. A data
+        set would train on sequences that `config.hold_out` or the `validation` source keeps.
     """
     rules = dict(config.hold_out)
     if unknown := sorted(rules.keys() - set(DATASETS)):
-        raise ValueError(
+        raise InputError(
             f"data.hold_out names unknown data sets: {', '.join(unknown)}; known are {', '.join(DATASETS)}"
         )
     datasets: dict[str, Dataset] = {}
@@ -67,13 +68,13 @@ def _present(config: DataConfig) -> list[SourceConfig]:
         return list(config.sources)
     named = ", ".join(f"{source.name} ({source.root})" for source in missing)
     if not config.allow_missing:
-        raise FileNotFoundError(
+        raise InputError(
             f"data sets without their folder: {named}; set data.sources.NAME.root, remove them from the mixture, or "
             "train on the others with data.allow_missing=True"
         )
     present = [source for source in config.sources if source not in missing]
     if not present:
-        raise FileNotFoundError(f"none of the data sets has its folder: {named}; set data.sources.NAME.root")
+        raise InputError(f"none of the data sets has its folder: {named}; set data.sources.NAME.root")
     total = sum(source.weight for source in present)
     shares = ", ".join(f"{source.name} {source.weight / total:.1%}" for source in present)
     logging.warning("data sets without their folder are left out: %s; clips come from %s", named, shares)

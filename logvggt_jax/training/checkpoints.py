@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import orbax.checkpoint as ocp
 
+from logvggt_jax.errors import InputError
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.processes import any_process
 from logvggt_jax.training.state import TrainState
@@ -101,13 +102,13 @@ class RunCheckpoints:
         Checkpoints of later steps are removed: the run that goes on from here will write its own.
 
         Raises:
-          ValueError: No such checkpoint, one of another configuration, or a damaged one; names the step, the
+          InputError: No such checkpoint, one of another configuration, or a damaged one; names the step, the
             path and the other steps there are.
         """
         steps = self.steps
         chosen = step if step is not None else (steps[-1] if steps else None)
         if chosen is None or chosen not in steps:
-            raise ValueError(f"{self.folder}: no checkpoint of step {chosen}; there are {steps or 'none'}")
+            raise InputError(f"{self.folder}: no checkpoint of step {chosen}; there are {steps or 'none'}")
         where = f"checkpoint of step {chosen} in {self.folder / str(chosen)}"
         others = [other for other in steps if other != chosen]
         mend = f"resume from another with --resume_step (there are {others})" if others else "start a new --workdir"
@@ -128,7 +129,7 @@ class RunCheckpoints:
             for part in ("params", "state"):
                 verify_digests(restored[part], meta["digests"][part], where)
         except ValueError as error:
-            raise ValueError(f"{error}; {mend}") from error
+            raise InputError(f"{error}; {mend}") from error
         for later in steps:
             if later > chosen:
                 self._manager.delete(later)
@@ -140,7 +141,7 @@ class RunCheckpoints:
         except Exception as error:
             # Orbax raises bare Exception, among others, for truncated and missing files.
             reason = " ".join(str(error).split())
-            raise ValueError(f"{where} cannot be read ({type(error).__name__}: {reason:.200}); {mend}") from error
+            raise InputError(f"{where} cannot be read ({type(error).__name__}: {reason:.200}); {mend}") from error
 
     def _check_configuration(self, stored: Mapping[str, Any], where: str) -> None:
         ours = self.config.to_dict()
@@ -151,7 +152,7 @@ class RunCheckpoints:
             difference = _first_difference(theirs, ours[part], part)
             if difference is not None:
                 name, theirs, mine = difference
-                raise ValueError(
+                raise InputError(
                     f"{where} was written with {name}={theirs!r}, the configuration says {mine!r}; "
                     "set it back or start a new --workdir"
                 )

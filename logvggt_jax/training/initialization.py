@@ -8,17 +8,17 @@ import jax
 import jax.numpy as jnp
 
 from logvggt_jax.config import ModelConfig
+from logvggt_jax.errors import InputError
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.weights.checkpoints import from_pretrained
 from logvggt_jax.weights.vggt import parameter_shapes
 
 
-def initial_parameters(config: ModelConfig, *, seed: int, weights: str | None) -> Any:
+def initial_parameters(config: ModelConfig, *, seed: int, weights: str | None = None) -> Any:
     """Random parameters, or those of `weights` (a path or hub repository that `from_pretrained` reads).
 
     Raises:
-      FileNotFoundError: `weights` names nothing.
-      ValueError: the weights do not fit `config`; names the first leaf that differs.
+      InputError: the weights do not fit `config`; names the first leaf that differs. What `from_pretrained` raises.
     """
     model = LogVGGT(config)
     if weights is None:
@@ -28,7 +28,7 @@ def initial_parameters(config: ModelConfig, *, seed: int, weights: str | None) -
     found, expected = _shapes(params), _shapes(parameter_shapes(config))
     for name in sorted(found.keys() | expected.keys()):
         if found.get(name) != expected.get(name):
-            raise ValueError(
+            raise InputError(
                 f"initial_weights={weights}: {name} has shape {found.get(name, 'none')}, config.model asks for "
                 f"{expected.get(name, 'none')}; give config.model the sizes of the checkpoint"
             )

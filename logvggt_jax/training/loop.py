@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from collections import deque
 from collections.abc import Mapping
@@ -53,14 +54,14 @@ def train(config: TrainConfig, workdir: Path, *, mesh: Mesh, resume_step: int | 
       The state at the end.
 
     Raises:
-      ValueError: Settings, data or a checkpoint that do not fit; one line.
+      InputError: Settings, data or a checkpoint that do not fit; one line.
       NonFiniteTraining: `config.max_skipped_in_a_row` updates in a row were not finite.
     """
     for stage in config.stages:
         check_batch_size(stage, mesh)
     run = _Run(config, workdir, mesh)
     with run.checkpoints, StopRequest() as stop:
-        first, position = run.restore(resume_step)
+        first, position = run.start(resume_step)
         check_agreement("the checkpoints", first)
         validation = None if config.validation is None else config.validation.source
         datasets = open_sources(config.data, validation)
@@ -74,26 +75,36 @@ def train(config: TrainConfig, workdir: Path, *, mesh: Mesh, resume_step: int | 
 class _Run:
     """The parts of one run and its current state."""
 
+    state: TrainState
+
     def __init__(self, config: TrainConfig, workdir: Path, mesh: Mesh) -> None:
         self.config, self.mesh = config, mesh
         self.deadline = None if config.max_minutes is None else time.monotonic() + 60 * config.max_minutes
         model = LogVGGT(config.model)
-        params = initial_parameters(config.model, seed=config.seed, weights=config.initial_weights)
-        optimizer = make_optimizer(config.optimizer, params, frozen=_frozen_modules(config))
+        # Shapes alone: a run that goes on needs no initial weights.
+        self.shapes = jax.eval_shape(functools.partial(initial_parameters, config.model, seed=config.seed))
+        self.optimizer = make_optimizer(config.optimizer, self.shapes, frozen=_frozen_modules(config))
         schedule = learning_rate_schedule(config.optimizer, config.stages)
-        self.state = jax.device_put(initial_state(params, optimizer), replicated(mesh))
         terms = make_loss_terms(model, config.loss)
-        self.step = make_train_step(terms, config.loss, optimizer, schedule, mesh)
+        self.step = make_train_step(terms, config.loss, self.optimizer, schedule, mesh)
         self.programs: dict[tuple[int, ...], jax.stages.Compiled] = {}
         self.validation = None if config.validation is None else Validation(model, config.validation, mesh)
         self.checkpoints = RunCheckpoints(workdir, config)
         self.speed = Speedometer(config.stages)
 
-    def restore(self, resume_step: int | None) -> tuple[int, Position | None]:
-        """Takes up a checkpoint, if there is one; the number of steps done and where the data stand."""
+    def start(self, resume_step: int | None) -> tuple[int, Position | None]:
+        """Takes up a checkpoint, or the initial weights if there is none.
+
+        Returns the number of steps done and where the data stand.
+        """
+        config, everywhere = self.config, replicated(self.mesh)
         if resume_step is None and not self.checkpoints.steps:
+            params = initial_parameters(config.model, seed=config.seed, weights=config.initial_weights)
+            self.state = jax.device_put(initial_state(params, self.optimizer), everywhere)
             return 0, None
-        self.state, position = self.checkpoints.restore(self.state, step=resume_step)
+        like = jax.eval_shape(functools.partial(initial_state, optimizer=self.optimizer), self.shapes)
+        like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=everywhere), like)
+        self.state, position = self.checkpoints.restore(like, step=resume_step)
         return int(self.state.step), position
 
     def train(

@@ -1,18 +1,17 @@
-"""AdamW, clipped by module, and its learning-rate schedule."""
+"""AdamW with gradients clipped in each module by itself, and the schedule of its learning rate."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import optax
 
 from logvggt_jax.training.config import OptimizerConfig, StageConfig
 
 
 def learning_rate_schedule(config: OptimizerConfig, stages: tuple[StageConfig, ...]) -> optax.Schedule:
-    """The rate at a step of the run: one schedule over the whole run, or one for each stage."""
+    """The learning rate at each step of the run: one schedule over all stages, or a new one for each stage."""
     lengths = [stage.steps for stage in stages]
     if not config.restart_each_stage:
         lengths = [sum(lengths)]
@@ -21,13 +20,16 @@ def learning_rate_schedule(config: OptimizerConfig, stages: tuple[StageConfig, .
 
 
 def make_optimizer(config: OptimizerConfig, params: Any, *, frozen: tuple[str, ...]) -> optax.GradientTransformation:
-    """Update directions for `params`, a dict of modules; the step multiplies them with the rate.
+    """AdamW without the learning rate: the training step multiplies what it returns with the rate of that step.
 
-    Every module is a group of its own, so that an exploding head is clipped without slowing the rest. `frozen`
-    modules get zero updates and no moments.
+    `params` is a dict of modules (encoder, aggregator, heads). The gradient of each module is clipped to
+    `config.clip_norm` by itself, so that one head with an exploding gradient does not slow down the others. Modules
+    named in `frozen` do not move, and no moments are kept for them.
 
-    Source: groups and clipping as in VGGT's released trainer; weight decay spares vectors unless
-    `config.decay_all`.
+    Weight decay applies to the kernels of linear layers and convolutions: not to biases, norms, gains of residual
+    branches, special tokens and the position embedding, unless `config.decay_all`.
+
+    Source: clipping by module as in VGGT's released trainer.
     """
     labels = {module: jax.tree.map(lambda _, m=module: m, tree) for module, tree in params.items()}
     groups = {module: optax.set_to_zero() if module in frozen else _module_optimizer(config) for module in params}
@@ -62,16 +64,11 @@ def _schedule(config: OptimizerConfig, steps: int) -> optax.Schedule:
 
 
 def _module_optimizer(config: OptimizerConfig) -> optax.GradientTransformation:
-    def matrices(tree: Any) -> Any:
-        return jax.tree.map(lambda x: config.decay_all or _is_matrix(x), tree)
+    def decayed(tree: Any) -> Any:
+        return jax.tree_util.tree_map_with_path(lambda path, _: config.decay_all or path[-1].key == "kernel", tree)
 
     return optax.chain(
         optax.clip_by_global_norm(config.clip_norm),
         optax.scale_by_adam(config.b1, config.b2),
-        optax.add_decayed_weights(config.weight_decay, matrices),
+        optax.add_decayed_weights(config.weight_decay, decayed),
     )
-
-
-def _is_matrix(x: jax.Array) -> bool:
-    # Special tokens are stored as [1, 1, C]: vectors, whatever their rank.
-    return sum(size > 1 for size in jnp.shape(x)) > 1

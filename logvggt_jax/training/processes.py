@@ -10,6 +10,8 @@ import jax
 import numpy as np
 from jax.experimental import multihost_utils
 
+from logvggt_jax.errors import InputError
+
 # Steps between two questions whether anybody wants to stop: each costs a round trip over the network.
 ASK_EVERY = 10
 
@@ -26,15 +28,15 @@ def join_processes(
       process_id: of this process, from 0.
 
     Raises:
-      ValueError: some of the three are missing, or the cluster does not know them.
+      InputError: some of the three are missing, or the cluster does not know them.
     """
     given = [value is not None for value in (coordinator, num_processes, process_id)]
     if any(given) and not all(given):
-        raise ValueError("give all of --coordinator, --num_processes and --process_id, or none of them")
+        raise InputError("give all of --coordinator, --num_processes and --process_id, or none of them")
     try:
         jax.distributed.initialize(coordinator, num_processes, process_id)
     except (RuntimeError, ValueError) as error:
-        raise ValueError(
+        raise InputError(
             f"cannot join the other processes ({error}); outside of Slurm, MPI, Kubernetes and TPU pods give "
             "--coordinator=HOST:PORT, --num_processes and --process_id"
         ) from error
@@ -48,7 +50,7 @@ def any_process(wants: bool) -> bool:
 
 
 def check_agreement(what: str, value: Any) -> None:
-    """Raises ValueError on every process unless `value` (JSON types) is the same on all of them.
+    """Raises InputError on every process unless `value` (JSON types) is the same on all of them.
 
     All processes have to ask at the same point.
     """
@@ -58,7 +60,7 @@ def check_agreement(what: str, value: Any) -> None:
     rows = multihost_utils.process_allgather(np.frombuffer(digest, np.uint8))
     odd = [process for process, row in enumerate(rows) if not np.array_equal(row, rows[0])]
     if odd:
-        raise ValueError(
+        raise InputError(
             f"{what} of the processes {odd} differ from those of process 0: let all see the same folders (their logs "
             "name what was left out)"
         )

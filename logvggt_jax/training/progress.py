@@ -1,4 +1,4 @@
-"""Speed and remaining time of a run, and the line that says so."""
+"""How fast a run trains, how long it will still take, and the line that the terminal shows of it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,15 @@ from logvggt_jax.training.config import StageConfig
 
 
 class Speedometer:
-    """Frames a second since the last reading, without what `pause` leaves out (compiling, validating, saving)."""
+    """Measures how many frames a second the run trains on.
+
+    The loop calls `count` after each step and `read` when it logs. After compiling, validating or saving it calls
+    `restart`, so that this time is not taken for training.
+
+    Attributes:
+      step_seconds: mean time of a step at the last reading.
+      frames_per_second: frames trained on in a second at the last reading, 0 before the first.
+    """
 
     def __init__(self, stages: tuple[StageConfig, ...]) -> None:
         self._stages = stages
@@ -16,22 +24,25 @@ class Speedometer:
         self.step_seconds, self.frames_per_second = 0.0, 0.0
 
     def count(self) -> None:
-        """One more step was taken."""
+        """Notes that one more step was started."""
         self._steps += 1
 
     def restart(self) -> None:
-        """Starts measuring anew."""
+        """Forgets the steps counted so far and starts the clock again."""
         self._steps, self._started = 0, time.perf_counter()
 
     def read(self, stage: StageConfig) -> None:
-        """Measures the steps counted since the last reading or restart, all of them of `stage` and finished."""
+        """Updates both attributes from the steps since the last reading or restart, then restarts.
+
+        Those steps must all belong to `stage`, and the last of them must have finished.
+        """
         if self._steps:
             self.step_seconds = (time.perf_counter() - self._started) / self._steps
             self.frames_per_second = _frames(stage) / max(self.step_seconds, 1e-9)
         self.restart()
 
     def remaining_seconds(self, step: int) -> float:
-        """Time that the steps after `step` need at the current number of frames a second."""
+        """Seconds until the end of the last stage, if the frames of all steps after `step` take as long as now."""
         frames, end = 0, 0
         for stage in self._stages:
             end += stage.steps
@@ -40,7 +51,7 @@ class Speedometer:
 
 
 def progress_line(step: int, total: int, stage: str, values: dict[str, float], speed: Speedometer) -> str:
-    """What the terminal shows of a logging step."""
+    """One line about a step: loss, errors of this batch, speed and remaining time; `values` as they are logged."""
     return (
         f"step {step}/{total} {stage}: loss {values['loss/total']:.4f}, abs_rel {values['train/abs_rel']:.3f}, "
         f"rotation {values['train/rotation_over_identity']:.2f} of identity's, "
@@ -50,7 +61,7 @@ def progress_line(step: int, total: int, stage: str, values: dict[str, float], s
 
 
 def duration(seconds: float) -> str:
-    """Hours, minutes and seconds as 1:02:03 or 2:03."""
+    """Seconds as hours, minutes and seconds, 1:02:03, or as minutes and seconds, 2:03."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"

@@ -11,6 +11,7 @@ import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
+from logvggt_jax.errors import InputError
 from logvggt_jax.training.config import StageConfig, TrainConfig
 
 DATA_AXIS = "data"
@@ -44,9 +45,9 @@ def split(mesh: Mesh) -> NamedSharding:
 
 
 def check_batch_size(stage: StageConfig, mesh: Mesh) -> None:
-    """Raises ValueError unless the stage's batches split evenly over the devices."""
+    """Raises InputError unless the stage's batches split evenly over the devices."""
     if stage.batch_size % mesh.size:
-        raise ValueError(
+        raise InputError(
             f"stage {stage.name!r}: batch_size={stage.batch_size} does not split over {mesh.size} devices; "
             f"use a multiple of {mesh.size}"
         )

@@ -12,10 +12,11 @@ from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 
 from logvggt_jax.model.logvggt import LogVGGT
+from logvggt_jax.training.clip_errors import clip_errors
 from logvggt_jax.training.config import LossConfig
 from logvggt_jax.training.losses import Mean
 from logvggt_jax.training.normalization import normalize_clips
-from logvggt_jax.training.objective import loss_terms, progress_figures, total_loss
+from logvggt_jax.training.objective import loss_terms, total_loss
 from logvggt_jax.training.optimizer import apply_updates, module_norms
 from logvggt_jax.training.sharding import DATA_AXIS
 from logvggt_jax.training.state import TrainState
@@ -26,7 +27,7 @@ LossTerms = Callable[[Any, Batch], tuple[dict[str, Mean], dict[str, Mean]]]
 
 
 def make_loss_terms(model: LogVGGT, config: LossConfig) -> LossTerms:
-    """A function (parameters, one device's share of a batch) -> (terms of the objective, figures to be logged).
+    """A function (parameters, one device's share of a batch) -> (terms of the objective, errors to be logged).
 
     Both are sums and counts over that share alone, so the function holds no communication and can be differentiated
     on each device by itself.
@@ -36,8 +37,8 @@ def make_loss_terms(model: LogVGGT, config: LossConfig) -> LossTerms:
         frame_mask = batch.get("frame_mask")
         predictions = model.apply({"params": params}, batch["images"], frame_mask, remat=True)
         targets = normalize_clips(batch["depth"], batch["intrinsics"], batch["extrinsics"], frame_mask=frame_mask)
-        figures = progress_figures(jax.lax.stop_gradient(predictions), targets)
-        return loss_terms(predictions, targets, config), figures
+        errors = clip_errors(jax.lax.stop_gradient(predictions), targets)
+        return loss_terms(predictions, targets, config), errors
 
     return terms
 
@@ -54,12 +55,12 @@ def loss_and_gradients(
     """
 
     def numerators(params: Any) -> tuple[dict[str, jax.Array], Any]:
-        means, figures = terms(params, batch)
+        means, errors = terms(params, batch)
         denominators = {name: mean.denominator for name, mean in means.items()}
-        return {name: mean.numerator for name, mean in means.items()}, (denominators, figures)
+        return {name: mean.numerator for name, mean in means.items()}, (denominators, errors)
 
     local, pull_back, sums = jax.vjp(numerators, params, has_aux=True)
-    summed, (denominators, figures) = jax.lax.psum((local, sums), DATA_AXIS)
+    summed, (denominators, errors) = jax.lax.psum((local, sums), DATA_AXIS)
 
     def objective(numerators: dict[str, jax.Array]) -> tuple[jax.Array, Metrics]:
         values = {name: Mean(value, denominators[name]).value() for name, value in numerators.items()}
@@ -67,7 +68,7 @@ def loss_and_gradients(
 
     (total, values), weights = jax.value_and_grad(objective, has_aux=True)(summed)
     gradients = jax.lax.psum(pull_back(weights)[0], DATA_AXIS)
-    progress = {name: mean.value() for name, mean in figures.items()}
+    progress = {name: mean.value() for name, mean in errors.items()}
     progress["rotation_over_identity"] = progress["rotation"] / jnp.maximum(progress["identity_rotation"], 1e-6)
     metrics = {f"loss/{name}": value for name, value in {"total": total, **values}.items()}
     return total, metrics | {f"train/{name}": value for name, value in progress.items()}, gradients

@@ -10,6 +10,7 @@ from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 
 from logvggt_jax.data.feeding.transforms import fit
+from logvggt_jax.errors import InputError
 from logvggt_jax.metrics.depth import depth_metrics
 from logvggt_jax.metrics.pose import pose_accuracy, relative_pose_errors
 from logvggt_jax.model.logvggt import LogVGGT
@@ -27,7 +28,7 @@ class Validation:
 
     def __init__(self, model: LogVGGT, config: ValidationConfig, mesh: Mesh) -> None:
         if config.num_clips % mesh.size:
-            raise ValueError(
+            raise InputError(
                 f"validation.num_clips={config.num_clips} does not split over {mesh.size} devices; "
                 f"use a multiple of {mesh.size}"
             )
@@ -61,7 +62,7 @@ def _read_clips(config: ValidationConfig) -> list[Frames]:
     indices = [i * config.stride for i in range(config.clip_length)]
     names = [name for name in dataset.sequences if dataset.num_frames(name) > indices[-1]]
     if len(names) < config.num_clips:
-        raise ValueError(
+        raise InputError(
             f"validation: data set {config.source.name!r} has {len(names)} sequences of at least {indices[-1] + 1} "
             f"frames, num_clips={config.num_clips} needs more; lower num_clips, clip_length or stride"
         )

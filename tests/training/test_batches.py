@@ -11,6 +11,7 @@ from absl import logging
 from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.data.errors import EmptySplit
 from logvggt_jax.data.feeding.holdouts import HoldOut
+from logvggt_jax.errors import InputError
 from logvggt_jax.training.batches import open_source, open_sources, stage_batches
 from logvggt_jax.training.config import DataConfig, SourceConfig, TrainConfig
 
@@ -63,7 +64,7 @@ def test_missing_data_sets_are_an_error_unless_allowed(
 ) -> None:
     absent = SourceConfig(name="seven_scenes", root=str(tmp_path / "none"), split="train", weight=3.0)
     sources = (rooms("train"), absent)
-    with pytest.raises(FileNotFoundError, match=r"seven_scenes \(.*none\); .*data\.allow_missing=True"):
+    with pytest.raises(InputError, match=r"seven_scenes \(.*none\); .*data\.allow_missing=True"):
         open_sources(data(sources=sources))
     config = data(sources=sources, allow_missing=True)
     logging.use_python_logging(quiet=True)
@@ -72,7 +73,7 @@ def test_missing_data_sets_are_an_error_unless_allowed(
     assert "seven_scenes" in caplog.text and "rooms 100.0%" in caplog.text
     with stage_batches(datasets, config, run_config.stages[0], seed=0) as batches:
         assert next(batches)["images"].shape == (2, 2, 28, 42, 3)
-    with pytest.raises(FileNotFoundError, match="none of the data sets"):
+    with pytest.raises(InputError, match="none of the data sets"):
         open_sources(data(sources=(absent,), allow_missing=True))
 
 

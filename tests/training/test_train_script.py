@@ -1,0 +1,62 @@
+"""`train.py` itself: one step of a real model, its validation and its files; and what it says when it ends badly."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from logvggt_jax.training.metrics_log import read_metrics
+from logvggt_jax.weights.checkpoints import load_model
+
+ROOT = Path(__file__).parents[2]
+SETTINGS = (
+    "--config=configs/tiny.py",
+    "--config.model.encoder.depth=1",
+    "--config.stages.stage_1.steps=1",
+    "--config.stages.stage_1.batch_size=2",
+    "--config.stages.stage_2.steps=1",
+    "--config.stages.stage_2.batch_size=2",
+    "--config.stages.stage_2.clip_length=4",
+    "--config.data.sources.rooms.options.num_rooms=4",
+    "--config.data.sources.rooms.options.num_frames=24",
+    "--config.validation.num_clips=2",
+    "--config.validation.clip_length=4",
+    "--config.validation.source.options.num_rooms=2",
+)
+
+
+def run_train(workdir: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "train.py", *SETTINGS, f"--workdir={workdir}", *arguments]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600, check=False)
+
+
+def test_a_real_model_is_trained_validated_and_saved(tmp_path: Path) -> None:
+    finished = run_train(tmp_path / "run")
+    assert finished.returncode == 0, finished.stderr
+    assert "step 2/2 stage_2" in finished.stdout and "validation after step 2" in finished.stdout
+    first, second, validation = read_metrics(tmp_path / "run" / "metrics.jsonl")
+    assert np.isfinite([first["loss/total"], second["loss/total"], validation["validation/abs_rel"]]).all()
+    model, variables = load_model(tmp_path / "run" / "model")
+    assert model.config.encoder.depth == 1
+    assert set(variables["params"]) >= {"encoder", "aggregator", "camera_head", "depth_head"}
+
+
+def test_a_fault_of_ours_keeps_its_traceback(tmp_path: Path) -> None:
+    """What a user can mend is one line; anything else shows where it arose."""
+    (tmp_path / "sitecustomize.py").write_text(
+        "import logvggt_jax.training.config as config\n"
+        "def fail(values):\n"
+        "    raise ValueError('a bug')\n"
+        "config.TrainConfig.from_dict = fail\n"
+    )
+    command = [sys.executable, "train.py", "--config=configs/tiny.py", f"--workdir={tmp_path / 'run'}"]
+    path = os.pathsep.join((str(tmp_path), str(ROOT)))
+    finished = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": path}, check=False
+    )
+    assert finished.returncode != 0
+    assert "Traceback" in finished.stderr and "ValueError: a bug" in finished.stderr
