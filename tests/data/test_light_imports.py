@@ -6,7 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from test_replica import write_scene
+from layouts.layout import VIEWS
+from layouts.replica import write
 
 SCRIPT = """
 import sys
@@ -24,7 +25,7 @@ assert not loaded, loaded
 
 
 def test_reading_data_loads_neither_jax_nor_grain(tmp_path: Path) -> None:
-    write_scene(tmp_path / "room0", 1)
+    write(tmp_path, VIEWS[:1])
     subprocess.run([sys.executable, "-c", SCRIPT, str(tmp_path)], check=True, capture_output=True, text=True)
 
 
