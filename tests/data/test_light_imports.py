@@ -18,7 +18,7 @@ from logvggt_jax.data import Frames, open_dataset
 for name, root in (("replica", sys.argv[1]), ("rooms", None)):
     dataset = open_dataset(name, root)
     assert isinstance(dataset.read(dataset.sequences[0], [0]), Frames)
-assert main(["data", "list"]) == 0
+assert main(["data", "list"]) == main(["data", "check", "replica", sys.argv[1]]) == 0
 loaded = {"jax", "jaxlib", "flax", "grain", "orbax"} & set(sys.modules)
 assert not loaded, loaded
 """

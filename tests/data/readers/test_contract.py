@@ -51,7 +51,7 @@ def with_second(layout: Layout, **changes: np.ndarray) -> list:
 
 
 def named(error: pytest.ExceptionInfo, path: str) -> bool:
-    """Whether the error is one for people, begins with a file of that name, survives the way out of a worker."""
+    """Whether the error names `path`; it is of one line for people, and survives the way out of a worker process."""
     message = str(error.value)
     assert isinstance(error.value, InputError) and "\n" not in message
     assert str(pickle.loads(pickle.dumps(error.value))) == message
