@@ -56,10 +56,14 @@ def get_config(data_root: str = "data") -> ConfigDict:
         "gamma": 0.6,
         "alpha": 0.2,
     }
-    config.stages = {
-        "stage_1": _stage(epochs=100, clip_length=12, clips_a_device=4),
-        "stage_2": _stage(epochs=10, clip_length=64, clips_a_device=1),
-    }
+    # In the order written: unless told so, a ConfigDict sorts its keys.
+    config.stages = ConfigDict(
+        {
+            "stage_1": _stage(epochs=100, clip_length=12, clips_a_device=4),
+            "stage_2": _stage(epochs=10, clip_length=64, clips_a_device=1),
+        },
+        sort_keys=False,
+    )
     config.optimizer = {
         "learning_rate": 5e-5,
         "final_learning_rate": 1e-8,

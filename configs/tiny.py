@@ -56,10 +56,14 @@ def get_config() -> ConfigDict:
         "gamma": 0.6,
         "alpha": 0.2,
     }
-    config.stages = {
-        "stage_1": _stage(steps=2900, clip_length=4, batch_size=8, strides=(1, 6)),
-        "stage_2": _stage(steps=2200, clip_length=12, batch_size=4, strides=(1, 4)),
-    }
+    # In the order written: unless told so, a ConfigDict sorts its keys.
+    config.stages = ConfigDict(
+        {
+            "stage_1": _stage(steps=2900, clip_length=4, batch_size=8, strides=(1, 6)),
+            "stage_2": _stage(steps=2200, clip_length=12, batch_size=4, strides=(1, 4)),
+        },
+        sort_keys=False,
+    )
     config.optimizer = {
         "learning_rate": 1e-3,
         "final_learning_rate": 0.0,

@@ -14,17 +14,19 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from logvggt_jax.errors import InputError, one_line
+
 if TYPE_CHECKING:
     from logvggt_jax.streaming.chunks import ChunkPlan
 
-BAD_INPUT, FAILURE, INTERRUPTED = 2, 1, 130
+BAD_INPUT, INTERRUPTED = 2, 130
 PROBLEMS_FOUND = 1
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command line and returns the exit code: 0, 2 for bad input, 1 for any other failure.
+    """Runs the command line and returns the exit code: 0, 2 for bad input; `data check` 1 where it found problems.
 
-    `data check` also returns 1 where it found problems.
+    Any exception but InputError is a fault of this package and passes through with its traceback.
 
     Args:
       arguments: without the program's name; default `sys.argv[1:]`.
@@ -38,12 +40,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("logvggt: interrupted; nothing half-written is left", file=sys.stderr)
         return INTERRUPTED
-    except Exception as error:
+    except InputError as error:
         if options.traceback:
             traceback.print_exc()
-        bad_input = isinstance(error, ValueError | OSError | ImportError)
-        print(f"logvggt: error: {_one_line(error, named=not bad_input)}", file=sys.stderr)
-        return BAD_INPUT if bad_input else FAILURE
+        print(f"logvggt: error: {one_line(error)}", file=sys.stderr)
+        return BAD_INPUT
 
 
 def _convert(options: argparse.Namespace) -> None:
@@ -58,9 +59,10 @@ def _convert(options: argparse.Namespace) -> None:
 
 def _reconstruct(options: argparse.Namespace) -> None:
     from logvggt_jax.compile import enable_compilation_cache
+    from logvggt_jax.reconstruction.method import choose_method
     from logvggt_jax.reconstruction.point_cloud import PointFilter
-    from logvggt_jax.reconstruction.reconstruct import check_request, reconstruct
-    from logvggt_jax.weights.checkpoints import from_pretrained
+    from logvggt_jax.reconstruction.reconstruct import LONGER_EDGE, check_request, reconstruct
+    from logvggt_jax.weights.checkpoints import from_pretrained, read_provenance
 
     selection = {
         "stride": options.stride,
@@ -68,8 +70,7 @@ def _reconstruct(options: argparse.Namespace) -> None:
         "overwrite": options.overwrite,
     }
     # Before the model: a misspelt path should not have to wait for gigabytes of weights.
-    chunks = _chunks(options)
-    check_request(options.source, options.output, **selection)
+    check_request(options.source, options.output, longer_edge=options.longer_edge, **selection)
     enable_compilation_cache(options.compilation_cache)
     point_filter = PointFilter(
         confidence_percentile=options.confidence_percentile,
@@ -77,6 +78,8 @@ def _reconstruct(options: argparse.Namespace) -> None:
         pixel_stride=options.pixel_stride,
         max_points=options.max_points or None,
     )
+    provenance = read_provenance(options.checkpoint)
+    chunks = _chunks(options, choose_method(provenance, None if options.mode == "auto" else options.mode))
     model, variables = from_pretrained(options.checkpoint, dtype=options.dtype)
     result = reconstruct(
         options.source,
@@ -84,7 +87,7 @@ def _reconstruct(options: argparse.Namespace) -> None:
         model=model,
         variables=variables,
         chunks=chunks,
-        longer_edge=options.longer_edge,
+        longer_edge=options.longer_edge or provenance.longer_edge or LONGER_EDGE,
         point_filter=point_filter,
         num_previews=options.previews,
         **selection,
@@ -92,17 +95,17 @@ def _reconstruct(options: argparse.Namespace) -> None:
     print(result.summary())
 
 
-def _chunks(options: argparse.Namespace) -> ChunkPlan | None:
-    """The chunks of `--mode chunks`; None for windows."""
+def _chunks(options: argparse.Namespace, method: str) -> ChunkPlan | None:
+    """Sizes of the chunks; None for windows."""
     from logvggt_jax.streaming.chunks import ChunkPlan
 
     given = {"--chunk-size": options.chunk_size, "--chunk-overlap": options.chunk_overlap}
-    if options.mode == "chunks":
+    if method == "chunks":
         size = ChunkPlan.size if options.chunk_size is None else options.chunk_size
         return ChunkPlan(size, size // 2 if options.chunk_overlap is None else options.chunk_overlap)
     for name, value in given.items():
         if value is not None:
-            raise ValueError(f"{name} needs --mode chunks")
+            raise InputError(f"{name} needs --mode chunks")
     return None
 
 
@@ -131,12 +134,13 @@ def _view(options: argparse.Namespace) -> None:
 def _info(options: argparse.Namespace) -> None:
     from rich.console import Console
 
-    from logvggt_jax.weights.checkpoints import load_model
-    from logvggt_jax.weights.summary import model_summary
+    from logvggt_jax.weights.checkpoints import load_model, read_provenance
+    from logvggt_jax.weights.summary import model_summary, provenance_lines
 
     model, variables = load_model(options.checkpoint)
     console = Console()
     console.print(model_summary(model.config, variables["params"]))
+    console.print(provenance_lines(read_provenance(options.checkpoint)), highlight=False, soft_wrap=True)
     console.print("every parameter equals the digest stored with it")
 
 
@@ -210,10 +214,10 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument(
         "--longer-edge",
         type=int,
-        default=518,
+        default=None,
         metavar="PIXELS",
-        help="resize frames so that their longer edge has this size, a multiple of 14; use the size that the model "
-        "was trained with",
+        help="resize frames so that their longer edge has this size, a multiple of 14 (default: the size that the "
+        "model was trained with)",
     )
     sub.add_argument("--stride", type=int, default=1, metavar="N", help="take every N-th frame")
     sub.add_argument("--max-frames", type=int, default=None, metavar="N", help="stop after N frames")
@@ -222,10 +226,10 @@ def _parser() -> argparse.ArgumentParser:
     )
     sub.add_argument(
         "--mode",
-        choices=("windows", "chunks"),
-        default="windows",
+        choices=("auto", "windows", "chunks"),
+        default="auto",
         help="windows: LoG-VGGT's stream. chunks: plain VGGT on overlapping chunks chained by similarities, for public "
-        "VGGT weights, which never learned the relay from window to window",
+        "VGGT weights, which never learned the relay from window to window. auto: what the weights were trained for",
     )
     sub.add_argument(
         "--chunk-size",
@@ -376,11 +380,6 @@ def _with_dashes(arguments: Sequence[str]) -> list[str]:
             argument = name.replace("_", "-") + equals + value
         result.append(argument)
     return result
-
-
-def _one_line(error: Exception, *, named: bool) -> str:
-    text = " ".join(str(error).split()) or type(error).__name__
-    return f"{type(error).__name__}: {text} (--traceback shows where)" if named else text
 
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:

@@ -1,31 +1,207 @@
-"""Sizes and choices of the model as frozen dataclasses: validated on construction, hashable, static under jit.
+"""Settings as frozen dataclasses: read from mappings, validated on construction, hashable; and the model's.
 
-Defaults are VGGT-1B and the LoG-VGGT paper.
+`from_mapping` and the `require_…` helpers serve the settings of the model, of training and of evaluation alike. The
+model's defaults are VGGT-1B and the LoG-VGGT paper.
 """
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import difflib
+import numbers
 import types
 import typing
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeVar
 
-import jax.numpy as jnp
+import ml_dtypes  # noqa: F401  (teaches numpy the name bfloat16)
+import numpy as np
+
+from logvggt_jax.errors import InputError
 
 ATTENTION_IMPLEMENTATIONS = ("auto", "xla", "cudnn", "tpu_flash")
 
+Config = TypeVar("Config")
 
-def _positive(config: Any, *names: str) -> None:
+
+def from_mapping(cls: type[Config], values: Any, path: str) -> Config:
+    """A dataclass from nested mappings, as configuration files and JSON hold them.
+
+    Types are those of the fields: other dataclasses (from mappings), `X | None`, literals, numbers, strings, and
+    tuples (from lists). A whole number is accepted as a float; True is no number. A tuple of dataclasses that have a
+    `name` may be a mapping from names to the other fields, a tuple of pairs a mapping from firsts to seconds; both
+    keep the order of the mapping.
+
+    Args:
+      cls: the dataclass.
+      values: a mapping from its fields to values; fields with a default may be left out.
+      path: what messages call the mapping, such as "config.optimizer"; "" for the outermost.
+
+    Raises:
+      InputError: An unknown or a missing field, a value of another type or out of range; one line that names the
+        field by its path, and the fields there are.
+    """
+    if not isinstance(values, Mapping):
+        raise InputError(f"{path} must be {_described(cls)}, got {values!r}")
+    hints = typing.get_type_hints(cls)
+    fields = {field.name: field for field in dataclasses.fields(cls) if field.init}  # type: ignore[arg-type]
+    known = f"{cls.__name__} knows {', '.join(fields)}"
+    for name in values:
+        if name not in fields:
+            similar = difflib.get_close_matches(str(name), fields, 1)
+            guess = f" did you mean {similar[0]}?" if similar else ""
+            raise InputError(f"unknown field {_joined(path, name)};{guess} {known}")
+    for name, field in fields.items():
+        optional = field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
+        if name not in values and not optional:
+            raise InputError(f"missing field {_joined(path, name)}, {_described(hints[name])}; {known}")
+    arguments = {name: _read(hints[name], value, _joined(path, name)) for name, value in values.items()}
+    try:
+        return cls(**arguments)
+    except ValueError as error:
+        # A validator names class and field; whoever wrote the mapping knows the field by its path.
+        prefix = f"{cls.__name__}."
+        message = str(error)
+        where = _joined(path, message.removeprefix(prefix)) if message.startswith(prefix) else f"{path}: {message}"
+        raise InputError(where) from error
+
+
+def to_mapping(config: Any) -> dict[str, Any]:
+    """The inverse of `from_mapping`: a dataclass as nested dicts and lists, which JSON can hold."""
+    mapping: dict[str, Any] = _plain(dataclasses.asdict(config))
+    return mapping
+
+
+def require_counts(config: Any, *names: str) -> None:
+    """Raises InputError unless these fields are whole numbers of at least 1; None passes, where a type allows it."""
     for name in names:
         value = getattr(config, name)
-        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-            raise ValueError(f"{type(config).__name__}.{name} must be a positive integer, got {value!r}")
+        if value is not None and (not _is_number(value, numbers.Integral) or value < 1):
+            raise InputError(f"{type(config).__name__}.{name} must be a positive integer, got {value!r}")
+
+
+def require_within(config: Any, interval: str, *names: str) -> None:
+    """Raises InputError unless these fields lie in an interval such as "[0, 1)" or "(0, inf)"; None passes."""
+    low, high = (float(bound) for bound in interval[1:-1].split(","))
+    for name in names:
+        value = getattr(config, name)
+        if value is None:
+            continue
+        above = value >= low if interval[0] == "[" else value > low
+        below = value <= high if interval[-1] == "]" else value < high
+        if not (above and below):
+            raise InputError(f"{type(config).__name__}.{name} must lie in {interval}, got {value!r}")
+
+
+def require_one_of(config: Any, choices: Sequence[Any], *names: str) -> None:
+    """Raises InputError unless these fields are one of the choices."""
+    for name in names:
+        value = getattr(config, name)
+        if value not in choices:
+            raise InputError(
+                f"{type(config).__name__}.{name} must be one of {', '.join(map(repr, choices))}, got {value!r}"
+            )
+
+
+def freeze_lists(config: Any) -> None:
+    """Turns lists among the fields of a frozen dataclass into tuples, so that it hashes; for `__post_init__`."""
+    for field in dataclasses.fields(config):
+        object.__setattr__(config, field.name, _frozen(getattr(config, field.name)))
+
+
+def _read(hint: Any, value: Any, path: str) -> Any:
+    """`value` as the type `hint`; InputError where it is another."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if hint is Any:
+        return _frozen(value)
+    if origin in (typing.Union, types.UnionType):
+        if value is None and types.NoneType in arguments:
+            return None
+        others = [other for other in arguments if other is not types.NoneType]
+        if len(others) == 1 and (dataclasses.is_dataclass(others[0]) or typing.get_origin(others[0])):
+            return _read(others[0], value, path)  # whose message says which part is wrong
+        for other in others:
+            with contextlib.suppress(InputError):
+                return _read(other, value, path)
+    elif dataclasses.is_dataclass(hint) and isinstance(hint, type):
+        return value if isinstance(value, hint) else from_mapping(hint, value, path)
+    elif origin is tuple and arguments[-1] is Ellipsis and isinstance(value, Mapping):
+        return _read_named(arguments[0], value, path)
+    elif origin is tuple and isinstance(value, list | tuple):
+        items = [arguments[0]] * len(value) if arguments[-1] is Ellipsis else arguments
+        if len(items) == len(value):
+            return tuple(_read(items[i], part, f"{path}[{i}]") for i, part in enumerate(value))
+    elif origin is not None and isinstance(origin, type) and issubclass(origin, Mapping):
+        if isinstance(value, Mapping):
+            return {key: _read(arguments[1], part, _joined(path, key)) for key, part in value.items()}
+    elif origin is typing.Literal:
+        if value in arguments:
+            return value
+    elif hint is float and _is_number(value, numbers.Real):
+        return float(value)
+    elif hint is int and _is_number(value, numbers.Integral):
+        return int(value)
+    elif origin is None and hint not in (int, float) and isinstance(value, hint):
+        return value
+    raise InputError(f"{path} must be {_described(hint)}, got {value!r}")
+
+
+def _read_named(item: Any, values: Mapping[str, Any], path: str) -> tuple[Any, ...]:
+    """A mapping as a tuple of dataclasses with a name, or of pairs."""
+    if dataclasses.is_dataclass(item):
+        for name, fields in values.items():
+            if not isinstance(fields, Mapping):
+                raise InputError(f"{_joined(path, name)} must be {_described(item)}, got {fields!r}")
+        return tuple(_read(item, {"name": name, **fields}, _joined(path, name)) for name, fields in values.items())
+    pair = typing.get_args(item)
+    if typing.get_origin(item) is not tuple or len(pair) != 2 or Ellipsis in pair:
+        raise InputError(f"{path} must be {_described(tuple[item, ...])}, got {values!r}")
+    return tuple(
+        (_read(pair[0], name, path), _read(pair[1], value, _joined(path, name))) for name, value in values.items()
+    )
+
+
+def _described(hint: Any) -> str:
+    """A type in words."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    names = {int: "a whole number", float: "a number", str: "a string", bool: "True or False", types.NoneType: "None"}
+    if hint in names:
+        return names[hint]
+    if dataclasses.is_dataclass(hint):
+        return f"a mapping with the fields of {hint.__name__}"  # type: ignore[union-attr]
+    if origin in (typing.Union, types.UnionType):
+        return " or ".join(_described(argument) for argument in arguments)
+    if origin is typing.Literal:
+        return f"one of {', '.join(map(repr, arguments))}"
+    if origin is tuple and arguments[-1] is Ellipsis:
+        return f"a list, each item {_described(arguments[0])}"
+    if origin is tuple:
+        return f"a list of {len(arguments)} items ({', '.join(_described(argument) for argument in arguments)})"
+    return "a mapping" if origin is not None else f"of type {getattr(hint, '__name__', hint)}"
+
+
+def _is_number(value: Any, kind: type) -> bool:
+    return isinstance(value, kind) and not isinstance(value, bool)
+
+
+def _joined(path: str, name: str) -> str:
+    return f"{path}.{name}" if path else name
+
+
+def _frozen(value: Any) -> Any:
+    return tuple(_frozen(item) for item in value) if isinstance(value, list | tuple) else value
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
 
 
 def _divides(config: Any, width: int, num_heads: int, multiple: int, why: str) -> None:
     if width % num_heads or (width // num_heads) % multiple:
-        raise ValueError(
+        raise InputError(
             f"{type(config).__name__}.num_heads={num_heads} must split the width {width} into heads whose size "
             f"is a multiple of {multiple} ({why})"
         )
@@ -49,8 +225,8 @@ class EncoderConfig:
     frozen: bool = True
 
     def __post_init__(self) -> None:
-        _positive(self, "embed_dim", "depth", "num_heads", "mlp_ratio", "num_registers", "position_grid")
-        _positive(self, "patch_size")
+        require_counts(self, "embed_dim", "depth", "num_heads", "mlp_ratio", "num_registers", "position_grid")
+        require_one_of(self, (14,), "patch_size")  # images are prepared for no other
         _divides(self, self.embed_dim, self.num_heads, 1, "one slice of channels a head")
 
 
@@ -74,11 +250,11 @@ class AggregatorConfig:
     token_scale: float = 1e-6
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "key_layers", tuple(self.key_layers))
-        _positive(self, "depth", "num_heads", "mlp_ratio", "num_registers")
+        freeze_lists(self)
+        require_counts(self, "depth", "num_heads", "mlp_ratio", "num_registers")
         layers = self.key_layers
         if len(layers) != 4 or list(layers) != sorted(set(layers)) or layers[0] < 0 or layers[-1] >= self.depth:
-            raise ValueError(
+            raise InputError(
                 f"AggregatorConfig.key_layers must be four increasing layer indices below depth={self.depth} "
                 f"(the depth head reads four), got {layers}"
             )
@@ -99,10 +275,10 @@ class CameraHeadConfig:
     initial_pose: tuple[float, ...] = (0.0,) * 9
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "initial_pose", tuple(float(x) for x in self.initial_pose))
-        _positive(self, "depth", "num_heads", "iterations")
+        freeze_lists(self)
+        require_counts(self, "depth", "num_heads", "iterations")
         if len(self.initial_pose) != 9:
-            raise ValueError(f"CameraHeadConfig.initial_pose needs 9 numbers, got {len(self.initial_pose)}")
+            raise InputError(f"CameraHeadConfig.initial_pose needs 9 numbers, got {len(self.initial_pose)}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,12 +289,12 @@ class DPTConfig:
     out_channels: tuple[int, ...] = (256, 512, 1024, 1024)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "out_channels", tuple(self.out_channels))
-        _positive(self, "features")
+        freeze_lists(self)
+        require_counts(self, "features")
         if self.features % 8:
-            raise ValueError(f"DPTConfig.features must be a multiple of 8 (uv embedding), got {self.features}")
+            raise InputError(f"DPTConfig.features must be a multiple of 8 (uv embedding), got {self.features}")
         if len(self.out_channels) != 4 or any(c < 4 or c % 4 for c in self.out_channels):
-            raise ValueError(
+            raise InputError(
                 f"DPTConfig.out_channels must be four positive multiples of 4 (uv embedding), got {self.out_channels}"
             )
 
@@ -137,14 +313,13 @@ class WindowConfig:
     cache: str = "output"
 
     def __post_init__(self) -> None:
-        _positive(self, "size", "stride")
+        require_counts(self, "size", "stride")
         if not self.stride < self.size:
-            raise ValueError(
+            raise InputError(
                 f"WindowConfig.stride={self.stride} must be at least 1 and below size={self.size}: "
                 "neighbouring windows share size - stride frames"
             )
-        if self.cache not in ("output", "input"):
-            raise ValueError(f"WindowConfig.cache must be 'output' or 'input', got {self.cache!r}")
+        require_one_of(self, ("output", "input"), "cache")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -162,10 +337,7 @@ class RefinementConfig:
     num_heads: int = 16
 
     def __post_init__(self) -> None:
-        _positive(self, "num_heads")
-        for name in ("period", "context"):
-            if getattr(self, name) is not None:
-                _positive(self, name)
+        require_counts(self, "period", "context", "num_heads")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -188,52 +360,25 @@ class ModelConfig:
 
     def __post_init__(self) -> None:
         with contextlib.suppress(TypeError):  # what names no type is refused below
-            object.__setattr__(self, "dtype", jnp.dtype(self.dtype).name)
-        if self.dtype not in ("float32", "bfloat16", "float16"):
-            raise ValueError(f"ModelConfig.dtype must be float32, bfloat16 or float16, got {self.dtype!r}")
-        if self.attention not in ATTENTION_IMPLEMENTATIONS:
-            raise ValueError(
-                f"ModelConfig.attention must be one of {ATTENTION_IMPLEMENTATIONS}, got {self.attention!r}"
-            )
+            object.__setattr__(self, "dtype", np.dtype(self.dtype).name)
+        require_one_of(self, ("float32", "bfloat16", "float16"), "dtype")
+        require_one_of(self, ATTENTION_IMPLEMENTATIONS, "attention")
         width = self.encoder.embed_dim
         _divides(self.aggregator, width, self.aggregator.num_heads, 4, "2-D rotary embedding")
         _divides(self.camera_head, 2 * width, self.camera_head.num_heads, 1, "one slice of channels a head")
         _divides(self.refinement, 2 * width, self.refinement.num_heads, 1, "one slice of channels a head")
         context, stride = self.refinement.context, self.windows.stride
         if context is not None and context < stride:
-            raise ValueError(
+            raise InputError(
                 f"RefinementConfig.context={context} must be at least the window stride {stride}: poses are decoded "
                 "in groups of one stride"
             )
 
     def to_dict(self) -> dict[str, Any]:
         """Plain nested dict of JSON types, the form that checkpoints store."""
-        return dataclasses.asdict(self)
+        return to_mapping(self)
 
     @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> ModelConfig:
-        """Inverse of `to_dict`; raises ValueError for an unknown field, naming it and the known ones."""
-        return _from_dict(cls, values, "model")
-
-
-def _from_dict(cls: Any, values: Any, path: str) -> Any:
-    if not isinstance(values, dict):
-        raise ValueError(f"{path} must be a mapping with the fields of {cls.__name__}, got {values!r}")
-    hints = typing.get_type_hints(cls)
-    unknown = sorted(set(values) - set(hints))
-    if unknown:
-        raise ValueError(f"unknown field {path}.{unknown[0]}; {cls.__name__} knows {', '.join(hints)}")
-    arguments = {}
-    for name, value in values.items():
-        alternatives = _alternatives(hints[name])
-        nested = [t for t in alternatives if dataclasses.is_dataclass(t)]
-        if nested and not (value is None and types.NoneType in alternatives):
-            value = _from_dict(nested[0], value, f"{path}.{name}")
-        arguments[name] = value
-    return cls(**arguments)
-
-
-def _alternatives(hint: Any) -> tuple[Any, ...]:
-    if typing.get_origin(hint) in (typing.Union, types.UnionType):
-        return typing.get_args(hint)
-    return (hint,)
+    def from_dict(cls, values: Mapping[str, Any]) -> ModelConfig:
+        """Inverse of `to_dict`; InputError as `from_mapping`."""
+        return from_mapping(cls, values, "model")

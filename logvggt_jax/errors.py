@@ -1,11 +1,53 @@
-"""The one error that entry points shorten to a line."""
+"""Errors of what a user gave, which entry points shorten to one line; any other exception keeps its traceback."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 
 class InputError(ValueError):
     """What a user gave cannot be used: a file, a folder, a setting, an option.
 
-    The message is one line that says what is wrong, where, and how to mend it. Entry points print it and exit;
-    any other exception is a fault of this package and keeps its traceback.
+    The message is one line that says what is wrong, where, and how to mend it. Entry points print it (`one_line`)
+    and exit; any other exception is a fault of this package and keeps its traceback.
     """
+
+
+class MissingInput(InputError, FileNotFoundError):
+    """A file or folder that a user named, or that has to lie in a folder that a user named, is not there."""
+
+
+class OutputExists(InputError, FileExistsError):
+    """A result would have to replace something that a user may want to keep."""
+
+
+class MissingPackage(InputError, ImportError):
+    """What a user asked for needs an optional library that is not installed; the message names the extra."""
+
+
+class DiskError(InputError, OSError):
+    """The operating system refuses to read or write a user's file: no permission, a full disk, a lost network."""
+
+
+@contextmanager
+def disk_errors(path: str | Path) -> Iterator[None]:
+    """Turns the operating system's errors in the block, which reads or writes `path`, into one line that names it.
+
+    Raises:
+      MissingInput: the file is not there.
+      DiskError: any other OSError. An InputError passes through unchanged.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except OSError as error:
+        kind = MissingInput if isinstance(error, FileNotFoundError) else DiskError
+        raise kind(f"{path}: {error.strerror or error}") from error
+
+
+def one_line(error: BaseException) -> str:
+    """An error's message on one line."""
+    return " ".join(str(error).split()) or type(error).__name__

@@ -3,92 +3,122 @@
 from __future__ import annotations
 
 import os
+import secrets
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from logvggt_jax.errors import OutputExists, disk_errors
+
 
 @contextmanager
-def atomic_file(path: Path) -> Iterator[Path]:
-    """A temporary name beside `path` that becomes `path` when the block ends, and vanishes if it fails."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
+def atomic_file(path: str | Path) -> Iterator[Path]:
+    """A temporary name beside `path` that becomes `path` when the block ends, and vanishes if it fails.
+
+    The name is this run's own and keeps the suffix of `path`, from which libraries take the format.
+
+    Raises:
+      DiskError, MissingInput: the file cannot be written, whatever the operating system's reason.
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{path.stem}.{_unique()}{path.suffix}")
     try:
-        yield temporary
-        temporary.replace(path)
+        with disk_errors(path):
+            yield temporary
+            temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
 
 
-def check_output(output: str | Path, *, overwrite: bool, marker: str) -> Path:
-    """The absolute path of `output`, provided that `output_folder` may make or replace it.
+def write_text(path: str | Path, text: str) -> None:
+    """Writes a text file whole or not at all; errors as in `atomic_file`."""
+    with atomic_file(path) as temporary:
+        temporary.write_text(text)
+
+
+@contextmanager
+def atomic_folder(path: str | Path, *, replace: bool = False) -> Iterator[Path]:
+    """A folder to fill that becomes `path` when the block ends, and vanishes if it fails.
+
+    Args:
+      path: the folder to make; its parents are made too.
+      replace: replace what is at `path`, which then goes once the new folder stands in its place. Callers make sure
+        that it is worth no more than the new one (`check_output`).
+
+    Yields:
+      `<path>.<unique>.partial`, which exists and is empty.
 
     Raises:
-      FileExistsError: it exists and may not be replaced.
+      OutputExists: something is at `path` and `replace` is not set; or came to be there in the meantime.
+      DiskError: the folder cannot be made or renamed.
+    """
+    path = Path(path)
+    if not replace and path.exists():
+        raise _exists(path)
+    partial = path.with_name(f"{path.name}.{_unique()}.partial")
+    with disk_errors(partial):
+        partial.mkdir(parents=True)
+    try:
+        yield partial
+        with disk_errors(path):
+            _move(partial, path, replace=replace)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def check_output(output: str | Path, *, overwrite: bool, marker: str) -> Path:
+    """The absolute path of `output`, provided that a result may be written there.
+
+    Args:
+      output: the folder to make.
+      overwrite: an existing `output` may be replaced, provided it is empty or holds `marker`, so that a slip of the
+        keyboard deletes no other folder.
+      marker: a file that every finished folder of this kind has.
+
+    Raises:
+      OutputExists: it exists and may not be replaced.
     """
     output = Path(output).expanduser().resolve()
     if not output.exists():
         return output
     if not overwrite:
-        raise FileExistsError(f"{output} exists: choose another output or pass --overwrite to replace it")
+        raise _exists(output)
     if not output.is_dir() or (any(output.iterdir()) and not (output / marker).is_file()):
-        raise FileExistsError(
+        raise OutputExists(
             f"{output} is not overwritten: it holds no {marker}, so it is no earlier result; choose another "
             "output or delete it yourself"
         )
     return output
 
 
-@contextmanager
-def output_folder(output: str | Path, *, overwrite: bool, marker: str) -> Iterator[Path]:
-    """A folder to fill that becomes `output` when the block ends, and vanishes if it fails.
-
-    Args:
-      output: the folder to make; its parents are made too.
-      overwrite: replace an existing `output`, provided it is empty or holds `marker`, so that a slip of the
-        keyboard deletes no other folder.
-      marker: a file that every finished folder of this kind has.
-
-    Yields:
-      `<output>.partial`, which exists and is empty.
-
-    Raises:
-      FileExistsError: `output` or `<output>.partial` exists and may not be replaced.
-    """
-    output = check_output(output, overwrite=overwrite, marker=marker)
-    partial = output.with_name(output.name + ".partial")
-    if overwrite and partial.is_dir():
-        shutil.rmtree(partial)
-    partial.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        partial.mkdir()
-    except FileExistsError:
-        raise FileExistsError(
-            f"{partial} exists: another run is writing there, or one was killed; wait, or pass --overwrite to delete it"
-        ) from None
-    try:
-        yield partial
-        _replace_folder(partial, output)
-    except BaseException:
-        shutil.rmtree(partial, ignore_errors=True)
-        raise
-
-
-def _replace_folder(source: Path, target: Path) -> None:
-    if not target.exists():
-        source.rename(target)
-        return
-    # A folder cannot replace a full one in one call: the old one steps aside and goes last.
-    aside = target.with_name(f".{target.name}.{os.getpid()}.old")
-    target.rename(aside)
-    try:
-        source.rename(target)
-    except OSError:
-        aside.rename(target)
-        raise
-    shutil.rmtree(aside)
-
-
 def user_cache_folder(kind: str) -> Path:
     """`logvggt/<kind>` in the user's cache folder (`XDG_CACHE_HOME`, else `~/.cache`); not created here."""
     return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "logvggt" / kind
+
+
+def _unique() -> str:
+    return f"{os.getpid()}-{secrets.token_hex(4)}"
+
+
+def _exists(path: Path) -> OutputExists:
+    return OutputExists(f"{path} exists: choose another output or pass --overwrite to replace it")
+
+
+def _move(source: Path, target: Path, *, replace: bool) -> None:
+    if not replace:
+        if target.exists():
+            raise _exists(target)
+        source.rename(target)
+        return
+    # A folder cannot replace a full one in one call: the old one steps aside and goes last.
+    aside = target.with_name(f".{target.name}.{_unique()}.old")
+    if target.exists():
+        target.rename(aside)
+    try:
+        source.rename(target)
+    except BaseException:  # Ctrl-C too
+        if aside.exists():
+            aside.rename(target)
+        raise
+    shutil.rmtree(aside, ignore_errors=True)

@@ -17,6 +17,7 @@ from logvggt_jax.cli import main
 from logvggt_jax.compile import default_cache_folder, enable_compilation_cache
 from logvggt_jax.data import DATASETS
 from logvggt_jax.weights.checkpoints import save_model
+from logvggt_jax.weights.provenance import Provenance
 
 COMMANDS = ("convert", "reconstruct", "render-room", "view", "info", "data check", "data list")
 
@@ -24,7 +25,7 @@ COMMANDS = ("convert", "reconstruct", "render-room", "view", "info", "data check
 @pytest.fixture(scope="module")
 def checkpoint(small_config: ModelConfig, small_variables: dict, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("checkpoint") / "model"
-    save_model(folder, small_config, small_variables["params"])
+    save_model(folder, small_config, small_variables["params"], Provenance("windows", 42, source="a test"))
     return folder
 
 
@@ -113,7 +114,7 @@ def test_from_a_room_to_a_point_cloud(
 ) -> None:
     output = tmp_path / "out"
     arguments = ["reconstruct", str(room), "--checkpoint", str(checkpoint), "--output", str(output)]
-    arguments += ["--longer_edge", "42", "--max_points=500", "--compilation-cache", "none", "--previews", "1"]
+    arguments += ["--max_points=500", "--compilation-cache", "none", "--previews", "1"]
     assert main(arguments) == 0
     printed = capsys.readouterr().out.replace("\n", "")
     for name in ("cameras.json", "trajectory.txt", "points.ply"):
@@ -121,6 +122,20 @@ def test_from_a_room_to_a_point_cloud(
         assert str(output / name) in printed
     assert len(list((output / "depth").glob("*.npz"))) == 5
     assert_fails(capsys, arguments, str(output), "--overwrite")
+
+
+@pytest.mark.filterwarnings("ignore:.*field of view", "always:these weights are public")
+def test_public_weights_run_in_chunks_unless_told_otherwise(
+    small_config: ModelConfig, small_variables: dict, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_model(tmp_path / "vggt", small_config, small_variables["params"], Provenance("vggt", 42))
+    arguments = ["reconstruct", str(room), "--checkpoint", str(tmp_path / "vggt"), "--output", str(tmp_path / "out")]
+    arguments += ["--compilation-cache", "none", "--previews", "0"]
+    # Only chunks take a size.
+    assert main([*arguments, "--chunk-size", "4"]) == 0
+    assert capsys.readouterr().err == ""
+    assert main([*arguments, "--mode", "windows", "--overwrite"]) == 0
+    assert "logvggt: warning: these weights are public VGGT's, which never learned" in capsys.readouterr().err
 
 
 def test_info_counts_parameters(
@@ -133,8 +148,11 @@ def test_info_counts_parameters(
     assert f"{total:,}" in text
     for part in ("encoder", "aggregator", "camera_head", "depth_head", "gccr"):
         assert part in text
+    assert "trained for: windows" in text and "longer edge 42 pixels" in text and "source: a test" in text
+    assert "licence: not recorded" in text
 
 
+@pytest.mark.filterwarnings("ignore:these weights were trained on windows")
 def test_bad_input_is_one_line_and_exit_code_2(
     checkpoint: Path, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -151,7 +169,8 @@ def test_bad_input_is_one_line_and_exit_code_2(
     # The source is looked at before the model, which may take minutes to load.
     assert_fails(capsys, reconstruct(empty, tmp_path / "no-model"), "no image in")
     assert_fails(capsys, reconstruct(room, empty), str(empty))
-    assert_fails(capsys, reconstruct(room, checkpoint, "--longer-edge", "50"), "longer_edge", "14", "50")
+    # So are sizes.
+    assert_fails(capsys, reconstruct(room, tmp_path / "no-model", "--longer-edge", "50"), "longer_edge", "14", "50")
     assert_fails(capsys, reconstruct(room, checkpoint, "--confidence-percentile", "120"), "confidence_percentile")
     assert_fails(capsys, reconstruct(room, checkpoint, "--stride", "0"), "stride")
     assert_fails(capsys, reconstruct(room, checkpoint, "--chunk-size", "8"), "--chunk-size needs --mode chunks")
@@ -215,14 +234,26 @@ def test_traceback_only_when_asked(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "Traceback" in capsys.readouterr().err
 
 
-def test_failures_that_are_no_bad_input_exit_with_1(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(*_: object) -> None:
-        raise RuntimeError("out of\nmemory")
+def test_a_fault_of_our_own_keeps_its_traceback() -> None:
+    """Only InputError becomes a line: a ValueError is a bug, whatever it says."""
+    program = """
+import sys
+from logvggt_jax.cli import main
+from logvggt_jax.weights import checkpoints
+def load_model(path):
+    raise ValueError("operands could not be broadcast")
+checkpoints.load_model = load_model
+sys.exit(main(["info", "x"]))
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 1
+    assert done.stderr.startswith("Traceback") and "operands could not be broadcast" in done.stderr
+    assert "logvggt: error" not in done.stderr
 
-    monkeypatch.setattr("logvggt_jax.weights.checkpoints.load_model", fail)
-    assert_fails(capsys, ["info", "x"], "RuntimeError: out of memory", "--traceback", code=1)
+
+def test_what_the_disk_refuses_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").touch()
+    assert_fails(capsys, ["render-room", "--output", str(tmp_path / "file" / "room")], "file/room", "Not a directory")
 
 
 def test_compilation_cache_follows_flag_environment_and_user_folder(

@@ -1,11 +1,15 @@
-"""The model's configuration: what it accepts, and one line that names the field for what it does not."""
+"""Mappings to settings and back, and the model's: one line names the field of what does not fit."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
-from typing import Any
+import json
+import math
+import types
+from collections.abc import Callable, Mapping
+from typing import Any, Literal
 
+import numpy as np
 import pytest
 
 from logvggt_jax import (
@@ -17,6 +21,117 @@ from logvggt_jax import (
     RefinementConfig,
     WindowConfig,
 )
+from logvggt_jax.config import from_mapping, require_counts, require_one_of, require_within, to_mapping
+from logvggt_jax.errors import InputError
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    name: str
+    weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        require_within(self, "(0, 2]", "weight")
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    count: int
+    parts: tuple[Part, ...]
+    rate: float | None = None
+    shuffle: bool = False
+    kind: Literal["a", "b"] = "a"
+    sizes: tuple[tuple[int, int], ...] = ()
+    options: tuple[tuple[str, Any], ...] = ()
+    extras: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    part: Part | None = None
+    limit: int | str = 1
+
+
+WHOLE = {
+    "count": 3,
+    "parts": {"ten": {}, "two": {"weight": 2}},
+    "rate": 1,
+    "sizes": [[1, 2], (3, 4)],
+    "options": {"b": [1, 2], "a": None},
+    "extras": {"x": 1},
+    "part": {"name": "p"},
+    "limit": "none",
+}
+
+
+def test_a_mapping_becomes_the_dataclass_that_its_types_describe() -> None:
+    found = from_mapping(Settings, WHOLE, "config")
+    assert found.parts == (Part("ten"), Part("two", 2.0)), "in the order written"
+    assert isinstance(found.rate, float) and isinstance(found.parts[1].weight, float)
+    assert found.sizes == ((1, 2), (3, 4))
+    assert found.options == (("b", (1, 2)), ("a", None))
+    assert from_mapping(Settings, {"count": np.int64(3), "parts": [{"name": "one"}]}, "config").parts == (Part("one"),)
+    assert from_mapping(Settings, {"count": 3, "parts": [Part("one")]}, "config").parts == (Part("one"),)
+
+
+def test_settings_survive_json() -> None:
+    found = from_mapping(Settings, WHOLE, "config")
+    assert from_mapping(Settings, json.loads(json.dumps(to_mapping(found))), "config") == found
+    assert to_mapping(found)["sizes"] == [[1, 2], [3, 4]]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"count": "50"}, r"config\.count must be a whole number, got '50'"),
+        ({"count": True}, r"config\.count must be a whole number, got True"),
+        ({"count": 1.0}, r"config\.count must be a whole number, got 1\.0"),
+        ({"rate": "fast"}, r"config\.rate must be a number or None, got 'fast'"),
+        ({"rate": False}, r"config\.rate must be a number or None, got False"),
+        ({"shuffle": 1}, r"config\.shuffle must be True or False, got 1"),
+        ({"kind": "c"}, r"config\.kind must be one of 'a', 'b', got 'c'"),
+        ({"sizes": [[1, "2"]]}, r"config\.sizes\[0\]\[1\] must be a whole number, got '2'"),
+        ({"sizes": [[1, 2, 3]]}, r"config\.sizes\[0\] must be a list of 2 items .*, got \[1, 2, 3\]"),
+        ({"sizes": 5}, r"config\.sizes must be a list, each item a list of 2 items .*, got 5"),
+        ({"sizes": {"a": 1}}, r"config\.sizes must be a whole number, got 'a'"),
+        ({"extras": {"x": "1"}}, r"config\.extras\.x must be a whole number, got '1'"),
+        ({"extras": 1}, r"config\.extras must be a mapping, got 1"),
+        ({"part": 1}, r"config\.part must be a mapping with the fields of Part, got 1"),
+        ({"parts": {"one": 1}}, r"config\.parts\.one must be a mapping with the fields of Part, got 1"),
+        ({"parts": {"one": {"wieght": 1}}}, r"unknown field config\.parts\.one\.wieght; did you mean weight\? Part"),
+        ({"parts": {"one": {"weight": 0}}}, r"^config\.parts\.one\.weight must lie in \(0, 2\], got 0\.0"),
+        ({"limit": 1.5}, r"config\.limit must be a whole number or a string, got 1\.5"),
+        ({"zzz": 1}, r"unknown field config\.zzz; Settings knows count, parts, rate"),
+    ],
+)
+def test_a_value_that_does_not_fit_is_named_by_its_path(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message) as error:
+        from_mapping(Settings, {**WHOLE, **changes}, "config")
+    assert "\n" not in str(error.value)
+
+
+def test_missing_fields_are_named_with_what_they_should_be() -> None:
+    with pytest.raises(InputError, match=r"missing field config\.count, a whole number; Settings knows count, parts"):
+        from_mapping(Settings, {"parts": ()}, "config")
+    with pytest.raises(InputError, match=r"^missing field count, a whole number"):
+        from_mapping(Settings, {"parts": ()}, "")
+
+
+@pytest.mark.parametrize(("interval", "inside", "outside"), [("[0, 1)", (0, 0.5), (-1, 1)), ("(0, inf)", (9,), (0,))])
+def test_intervals_are_those_of_mathematics(
+    interval: str, inside: tuple[float, ...], outside: tuple[float, ...]
+) -> None:
+    for value in (*inside, None):
+        require_within(types.SimpleNamespace(x=value), interval, "x")
+    for value in (*outside, math.nan):
+        with pytest.raises(InputError, match=r"SimpleNamespace\.x must lie in"):
+            require_within(types.SimpleNamespace(x=value), interval, "x")
+
+
+def test_counts_and_choices() -> None:
+    require_counts(types.SimpleNamespace(a=1, b=None), "a", "b")
+    for value in (0, True, 1.0, "1"):
+        with pytest.raises(InputError, match="must be a positive integer"):
+            require_counts(types.SimpleNamespace(a=value), "a")
+    require_one_of(types.SimpleNamespace(a="x"), ("x", "y"), "a")
+    with pytest.raises(InputError, match="must be one of 'x', 'y', got 'z'"):
+        require_one_of(types.SimpleNamespace(a="z"), ("x", "y"), "a")
 
 
 @pytest.mark.parametrize("size", [2, 3, 4, 7])
@@ -34,6 +149,7 @@ def test_any_stride_below_the_window_is_accepted(size: int) -> None:
         (lambda: EncoderConfig(depth=0), r"EncoderConfig\.depth must be a positive integer, got 0"),
         (lambda: EncoderConfig(depth=1.5), r"EncoderConfig\.depth must be a positive integer, got 1\.5"),
         (lambda: EncoderConfig(depth=True), r"EncoderConfig\.depth must be a positive integer, got True"),
+        (lambda: EncoderConfig(patch_size=16), r"EncoderConfig\.patch_size must be one of 14, got 16"),
         (lambda: EncoderConfig(num_heads=15), r"EncoderConfig\.num_heads=15 must split the width 1024"),
         (lambda: AggregatorConfig(key_layers=(4, 11, 17)), r"AggregatorConfig\.key_layers must be four"),
         (lambda: AggregatorConfig(key_layers=(4, 11, 17, 24)), r"AggregatorConfig\.key_layers must be four"),
@@ -41,15 +157,18 @@ def test_any_stride_below_the_window_is_accepted(size: int) -> None:
         (lambda: CameraHeadConfig(initial_pose=(0.0,)), r"CameraHeadConfig\.initial_pose needs 9 numbers, got 1"),
         (lambda: DPTConfig(features=12), r"DPTConfig\.features must be a multiple of 8"),
         (lambda: DPTConfig(out_channels=(256, 512, 1024)), r"DPTConfig\.out_channels must be four"),
-        (lambda: WindowConfig(cache="both"), r"WindowConfig\.cache must be 'output' or 'input', got 'both'"),
+        (lambda: WindowConfig(cache="both"), r"WindowConfig\.cache must be one of 'output', 'input', got 'both'"),
         (lambda: RefinementConfig(period=0), r"RefinementConfig\.period must be a positive integer, got 0"),
-        (lambda: ModelConfig(dtype="int32"), r"ModelConfig\.dtype must be float32, .*got 'int32'"),
-        (lambda: ModelConfig(dtype="bf16"), r"ModelConfig\.dtype must be float32, .*got 'bf16'"),
+        (lambda: ModelConfig(dtype="int32"), r"ModelConfig\.dtype must be one of 'float32', .*got 'int32'"),
+        (lambda: ModelConfig(dtype="bf16"), r"ModelConfig\.dtype must be one of 'float32', .*got 'bf16'"),
         (lambda: ModelConfig(attention="flash"), r"ModelConfig\.attention must be one of .*got 'flash'"),
         (lambda: ModelConfig(aggregator=AggregatorConfig(num_heads=512)), r"AggregatorConfig\.num_heads=512"),
         (lambda: ModelConfig(refinement=RefinementConfig(context=1)), r"context=1 must be at least the window stride"),
         (lambda: ModelConfig.from_dict({"encoder": None}), r"model\.encoder must be a mapping .*got None"),
-        (lambda: ModelConfig.from_dict({"windows": {"sizes": 4}}), r"unknown field model\.windows\.sizes; .* size,"),
+        (
+            lambda: ModelConfig.from_dict({"windows": {"sizes": 4}}),
+            r"unknown field model\.windows\.sizes; did you mean size\? WindowConfig knows size,",
+        ),
     ],
 )
 def test_what_does_not_fit_is_named(build: Callable[[], Any], message: str) -> None:

@@ -20,8 +20,8 @@ from logvggt_jax.data.rooms.rooms import Rooms
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.optimizer import learning_rate_schedule, make_optimizer
 from logvggt_jax.training.sharding import check_batch_size, data_mesh
-from logvggt_jax.training.state import initial_state
-from logvggt_jax.training.step import make_loss, make_train_step
+from logvggt_jax.training.state import TrainState, initial_state
+from logvggt_jax.training.step import make_loss_terms, make_train_step
 
 ROOT = Path(__file__).parents[1]
 
@@ -70,30 +70,112 @@ def test_h20_is_the_papers_training(monkeypatch: pytest.MonkeyPatch) -> None:
         check_batch_size(stage, data_mesh(16))
 
 
-def test_h20_step_holds_together_on_sixteen_devices(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The whole step of VGGT-1B's sizes on abstract values: shapes, types and shardings, no numbers."""
-    config = _config("h20", monkeypatch)
-    model, mesh, frames = LogVGGT(config.model), data_mesh(16), 2
-    height, width = config.stages[0].sizes[-1]
-    shapes = {
-        "images": jax.ShapeDtypeStruct((16, frames, height, width, 3), jnp.uint8),
-        "depth": jax.ShapeDtypeStruct((16, frames, height, width), jnp.float32),
-        "intrinsics": jax.ShapeDtypeStruct((16, frames, 3, 3), jnp.float32),
-        "extrinsics": jax.ShapeDtypeStruct((16, frames, 4, 4), jnp.float32),
+def _abstract_clips(batch: int, frames: int, size: tuple[int, int]) -> dict[str, jax.ShapeDtypeStruct]:
+    return {
+        "images": jax.ShapeDtypeStruct((batch, frames, *size, 3), jnp.uint8),
+        "depth": jax.ShapeDtypeStruct((batch, frames, *size), jnp.float32),
+        "intrinsics": jax.ShapeDtypeStruct((batch, frames, 3, 3), jnp.float32),
+        "extrinsics": jax.ShapeDtypeStruct((batch, frames, 4, 4), jnp.float32),
     }
-    params = jax.eval_shape(model.init, jax.random.key(0), shapes["images"])["params"]
-    assert 1.1e9 < sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(params)) < 1.3e9
+
+
+def _abstract_run(config: TrainConfig, num_devices: int) -> tuple[TrainState, jax.stages.Wrapped]:
+    """A run's first state without values, and its step."""
+    # Parameters do not depend on the form of attention, and tracing cuDNN's asks for a GPU.
+    model = LogVGGT(dataclasses.replace(config.model, attention="xla"))
+    images = jax.ShapeDtypeStruct((1, 1, 14, 14, 3), jnp.uint8)
+    params = jax.eval_shape(model.init, jax.random.key(0), images)["params"]
     optimizer = make_optimizer(config.optimizer, params, frozen=("encoder",))
     state = jax.eval_shape(functools.partial(initial_state, optimizer=optimizer), params)
+    schedule = learning_rate_schedule(config.optimizer, config.stages)
+    terms = make_loss_terms(LogVGGT(config.model), config.loss)
+    return state, make_train_step(terms, config.loss, optimizer, schedule, data_mesh(num_devices))
+
+
+def _shallow(config: TrainConfig) -> TrainConfig:
+    """The run with one layer in each stack (four in the aggregator, for the depth head); all widths are as they are."""
+    model = dataclasses.replace(
+        config.model,
+        encoder=dataclasses.replace(config.model.encoder, depth=1),
+        aggregator=dataclasses.replace(config.model.aggregator, depth=4, key_layers=(0, 1, 2, 3)),
+        camera_head=dataclasses.replace(config.model.camera_head, depth=1),
+    )
+    return dataclasses.replace(config, model=model)
+
+
+def test_h20_trains_all_but_the_encoder(monkeypatch: pytest.MonkeyPatch) -> None:
+    state, _ = _abstract_run(_config("h20", monkeypatch), 16)
+    assert 1.1e9 < sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(state.params)) < 1.3e9
     moments = sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(state.opt_state))
-    modules = [tree for name, tree in params.items() if name != "encoder"]
+    modules = [tree for name, tree in state.params.items() if name != "encoder"]
     trained = sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(modules))
     assert 2 * trained <= moments < 2 * trained + 100, "two moments for what is trained, none for the encoder"
-    schedule = learning_rate_schedule(config.optimizer, config.stages)
-    step = make_train_step(make_loss(model, config.loss), optimizer, schedule, mesh)
-    after, metrics = jax.eval_shape(step, state, shapes)
+
+
+FAST_ATTENTION = {
+    # The platform, and how its programs name the kernel's forward and backward calls.
+    "cudnn": ("cuda", "@__cudnn$fmhaSoftmax(", "@__cudnn$fmhaSoftmaxBackward("),
+    "tpu_flash": ("tpu", '"_flash_attention_kernel"', '"_flash_attention_dq_kernel"'),
+}
+
+
+@pytest.mark.parametrize(
+    ("attention", "stage", "size"),
+    # Sizes with an odd number of tokens, 1,041 and 893.
+    [("cudnn", 0, (392, 518)), ("cudnn", 1, (336, 518)), ("tpu_flash", 0, (392, 518))],
+)
+def test_h20_step_is_lowered_with_fast_attention(
+    attention: str, stage: int, size: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _check_step(_shallow(_config("h20", monkeypatch)), attention, stage, size, monkeypatch)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("attention", ["cudnn", "tpu_flash"])
+@pytest.mark.parametrize("depth", ["shallow", "full"])
+def test_h20_step_is_lowered_with_fast_attention_at_all_sizes(
+    attention: str, depth: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = _config("h20", monkeypatch)
+    for index, stage in enumerate(config.stages):
+        for size in stage.sizes if depth == "shallow" else stage.sizes[:1]:
+            _check_step(_shallow(config) if depth == "shallow" else config, attention, index, size, monkeypatch)
+            jax.clear_caches()
+
+
+def _check_step(
+    config: TrainConfig, attention: str, stage_index: int, size: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The whole step on sixteen devices, abstract values: shapes and types, and every large attention fast."""
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("attention takes its general form")
+
+    monkeypatch.setattr("logvggt_jax.model.attention._blockwise", refuse)
+    # JAX asks the GPU at hand, which may be none.
+    cudnn = "jax._src.cudnn.fused_attention_stablehlo"
+    monkeypatch.setattr(f"{cudnn}.check_cudnn_version", lambda: 91000)
+    monkeypatch.setattr(f"{cudnn}.check_compute_capability", lambda _: True)
+    monkeypatch.setattr(f"{cudnn}.is_cuda_compute_capability_equal", lambda _: False)
+    platform, forward, backward = FAST_ATTENTION[attention]
+    config = dataclasses.replace(config, model=dataclasses.replace(config.model, attention=attention))
+    state, step = _abstract_run(config, 16)
+    stage = config.stages[stage_index]
+    traced = step.trace(state, _abstract_clips(stage.batch_size, stage.clip_length, size))
+    after, metrics = traced.out_info
     assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(lambda x: (x.shape, x.dtype), state)
     assert all(value.shape == () for value in metrics.values())
+    program = traced.lower(lowering_platforms=(platform,)).as_text()
+    if attention == "cudnn":
+        # A frame and a global block in each pair of the aggregator, forward, once more where it is rematerialised,
+        # and backward; the frozen encoder forward alone. What is in the program once runs for every window.
+        blocks = 2 * config.model.aggregator.depth
+        assert program.count(backward) >= blocks
+        assert program.count(forward) >= 2 * blocks + config.model.encoder.depth
+    else:
+        # The kernel is a function of the program, one for each shape: of a frame and of a window with its cache.
+        assert program.count(backward) >= 2
+        assert program.count(forward) >= 2
 
 
 @pytest.mark.parametrize(

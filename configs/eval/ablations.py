@@ -13,6 +13,7 @@ from ml_collections import ConfigDict
 
 
 def get_config() -> ConfigDict:
+    """Clips of procedural rooms, the full model and its variants; fields of `ClipRun`."""
     config = ConfigDict()
     config.title = "Ablations"
     config.dataset = "rooms"
@@ -20,9 +21,11 @@ def get_config() -> ConfigDict:
     # Rooms of the kind that configs/tiny.py trains on, twice round at stride 1.
     config.rooms = ConfigDict({"num_rooms": 8, "style": "compass", "num_frames": 400})
     config.baselines = True
-    # Chunks of the length that the model was trained at.
+    # Rows of the model: LoG-VGGT's windows, VGGT offline up to max_frames, and VGGT on overlapping chunks, as long as
+    # the model was trained at.
+    config.methods = ("windows", "offline", "chunks")
     config.references = ConfigDict({"max_frames": 200, "chunk_size": 12, "chunk_overlap": 6})
-    # Names of logvggt_jax/evaluation/variants.py.
+    # Names of logvggt_jax/evaluation/methods/variants.py.
     config.variants = (
         "full",
         "no_gccr",

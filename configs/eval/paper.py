@@ -12,6 +12,7 @@ from ml_collections import ConfigDict, config_dict
 
 
 def get_config() -> ConfigDict:
+    """All benchmarks at the size of VGGT-1B; fields of `PaperRun`."""
     config = ConfigDict()
     config.title = "LoG-VGGT, the paper's benchmarks"
     # Patterns of benchmark names; any that matches none is an error that lists them.
@@ -22,9 +23,10 @@ def get_config() -> ConfigDict:
     # Clips of each benchmark that are drawn.
     config.figures = 1
 
-    # Rows of VGGT itself on the same weights: offline up to max_frames, and on overlapping chunks chained together.
+    # Rows of the model: LoG-VGGT's windows, VGGT offline up to max_frames, VGGT on overlapping chunks chained together.
+    config.methods = ("windows", "offline", "chunks")
     config.references = ConfigDict({"max_frames": 200, "chunk_size": 60, "chunk_overlap": 30})
-    # Names of logvggt_jax/evaluation/variants.py, evaluated beside the network.
+    # Names of logvggt_jax/evaluation/methods/variants.py, evaluated beside the network.
     config.variants = ()
 
     # Sequences that are timed on this device for the tables of cost: --config.timings.lengths="(100, 200)" for fewer,

@@ -7,6 +7,7 @@ from ml_collections import ConfigDict
 
 
 def get_config() -> ConfigDict:
+    """Clips of 12 and 32 frames of each test room; fields of `ClipRun`."""
     config = ConfigDict()
     config.title = "Procedural rooms, test split"
     config.dataset = "rooms"
@@ -14,7 +15,9 @@ def get_config() -> ConfigDict:
     # Rooms of the kind that configs/tiny.py trains on.
     config.rooms = ConfigDict({"num_rooms": 24, "style": "compass", "num_frames": 96})
     config.baselines = True
-    # Chunks of the length that the model was trained at.
+    # Rows of the model: LoG-VGGT's windows, VGGT offline up to max_frames, and VGGT on overlapping chunks, as long as
+    # the model was trained at.
+    config.methods = ("windows", "offline", "chunks")
     config.references = ConfigDict({"max_frames": 200, "chunk_size": 12, "chunk_overlap": 6})
 
     config.evaluation = evaluation = ConfigDict()

@@ -11,13 +11,16 @@ from ml_collections import ConfigDict
 
 
 def get_config() -> ConfigDict:
+    """Clips of 12 and 32 frames of every sequence; fields of `ClipRun`."""
     config = ConfigDict()
     config.title = "7-Scenes"
     config.dataset = "seven_scenes"
     # "test" needs the official TestSplit.txt in every scene's folder.
     config.split = "all"
     config.baselines = True
-    # Chunks of the length that the model was trained at.
+    # Rows of the model: LoG-VGGT's windows, VGGT offline up to max_frames, and VGGT on overlapping chunks, as long as
+    # the model was trained at.
+    config.methods = ("windows", "offline", "chunks")
     config.references = ConfigDict({"max_frames": 200, "chunk_size": 12, "chunk_overlap": 6})
 
     config.evaluation = evaluation = ConfigDict()

@@ -9,6 +9,7 @@ import numpy as np
 
 from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.data.readers.seven_scenes import SevenScenes
+from logvggt_jax.errors import InputError
 from logvggt_jax.evaluation.progress import track
 from logvggt_jax.evaluation.protocols.images import ImageRule
 from logvggt_jax.evaluation.scratch import scratch_array
@@ -39,7 +40,8 @@ def load_clip(
     """Reads the frames `indices` of `sequence` one by one.
 
     Raises:
-      ValueError, OSError: as the data set's `read`, and where images of one clip differ in size.
+      InputError, OSError: as the data set's `read`, and where images of one clip differ in size.
+      ValueError: no frames are asked for.
     """
     count = len(indices)
     clip: ClipData | None = None
@@ -53,7 +55,7 @@ def load_clip(
                 np.zeros((count, 4, 4), np.float32),
             )
         if frame.images.shape[1:] != clip.images.shape[1:]:
-            raise ValueError(
+            raise InputError(
                 f"{sequence}: frame {index} has size {frame.images.shape[1:3]} after resizing, frame {indices[0]} has "
                 f"{clip.images.shape[1:3]}; frames of a clip must have one size"
             )

@@ -10,25 +10,26 @@ from typing import Any
 from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.data.registry import open_dataset
 from logvggt_jax.data.rooms.rooms import Rooms
+from logvggt_jax.errors import InputError
 from logvggt_jax.evaluation.methods.baselines import all_baselines, static_camera, unit_depth
 from logvggt_jax.evaluation.methods.method import Method
 from logvggt_jax.evaluation.protocols import Protocol, ProtocolSettings, chosen_protocols
 from logvggt_jax.evaluation.protocols.clips import clip_protocols
 from logvggt_jax.evaluation.protocols.images import PrincipalPointCrop
 from logvggt_jax.evaluation.runner import Benchmark
-from logvggt_jax.evaluation.settings import BenchmarkRun, EvaluationRun
+from logvggt_jax.evaluation.settings import ClipRun, PaperRun
 from logvggt_jax.model.logvggt import LogVGGT
 
 
 def open_run(
-    run: EvaluationRun | BenchmarkRun, data_root: str | Path | None
+    run: ClipRun | PaperRun, data_root: str | Path | None
 ) -> tuple[list[Benchmark], Callable[[LogVGGT], list[Method]]]:
     """The benchmarks of a run, and what makes its baselines once the model is known (nothing where it wants none).
 
     Raises:
-      ValueError, FileNotFoundError: as `open_benchmarks` and `open_evaluation_set`.
+      InputError, OSError: as `open_benchmarks` and `open_evaluation_set`.
     """
-    if isinstance(run, BenchmarkRun):
+    if isinstance(run, PaperRun):
         protocols = chosen_protocols(run.protocol, run.benchmarks)
         benchmarks = open_benchmarks(protocols, data_root, run.protocol)
         return benchmarks, lambda _: [unit_depth(), static_camera()] if run.baselines else []
@@ -69,16 +70,15 @@ def open_evaluation_set(
       Rooms are paired with their training split. Any other set has to lend its own mean, and the name says so.
 
     Raises:
-      ValueError: `root` is missing, or given for `rooms`; an unknown option of rooms.
-      FileNotFoundError: `root` does not hold the data set.
+      InputError: `root` is missing, does not hold the data set, or is given for `rooms`; an unknown option of rooms.
     """
     if name != "rooms":
         if root is None:
-            raise ValueError(f"data set {name!r} is read from disk: give its folder with --data_root")
+            raise InputError(f"data set {name!r} is read from disk: give its folder with --data_root")
         dataset = open_dataset(name, root, split)
         return dataset, dataset, "frames of the evaluated set itself (knows the test set's mean)"
     if root is not None:
-        raise ValueError(f"rooms are rendered, not read: leave --data_root={root} out")
+        raise InputError(f"rooms are rendered, not read: leave --data_root={root} out")
     options = dict(rooms or {})
     train = {key: value for key, value in options.items() if key != "num_rooms"}
     return _rooms(split, image_size, options), _rooms("train", image_size, train), "training rooms"
@@ -95,12 +95,12 @@ def open_benchmarks(
       settings: `longer_edge` and `rooms` are used, for rooms, which are rendered.
 
     Raises:
-      FileNotFoundError: `data_root` is not a folder, or has none of the data sets that were asked for.
-      ValueError: an unknown option of rooms.
+      InputError: `data_root` is not a folder, or has none of the data sets that were asked for; an unknown option of
+        rooms.
     """
     root = None if data_root is None else Path(data_root)
     if root is not None and not root.is_dir():
-        raise FileNotFoundError(f"{root}: no such folder; --data_root is the folder that holds one folder a data set")
+        raise InputError(f"{root}: no such folder; --data_root is the folder that holds one folder a data set")
     opened: dict[tuple[str, tuple[str, ...]], tuple[Dataset | None, str, str]] = {}
     for protocol in protocols:
         key = (protocol.dataset, protocol.splits)
@@ -118,7 +118,7 @@ def open_benchmarks(
     found = any(benchmark.dataset is not None for benchmark in benchmarks if benchmark.protocol.dataset != "rooms")
     if root is not None and on_disk and not found:
         reasons = "; ".join(dict.fromkeys(benchmark.missing for benchmark in benchmarks if benchmark.missing))
-        raise FileNotFoundError(f"{root}: holds none of the data sets {', '.join(on_disk)} ({reasons})")
+        raise InputError(f"{root}: holds none of the data sets {', '.join(on_disk)} ({reasons})")
     return benchmarks
 
 
@@ -129,7 +129,7 @@ def _first_split(protocol: Protocol, folder: Path) -> tuple[Dataset | None, str,
     for split in protocol.splits:
         try:
             return open_dataset(protocol.dataset, folder, split), split, ""
-        except (ValueError, OSError, ImportError) as error:
+        except (InputError, OSError, ImportError) as error:
             reasons.append(f"{protocol.dataset}, split {split}: {error}")
     return None, "", "; ".join(reasons)
 
@@ -139,5 +139,5 @@ def _rooms(split: str, image_size: tuple[int, int], options: Mapping[str, Any]) 
     known = inspect.signature(Rooms).parameters
     for option in options:
         if option not in known or option in ("split", "height", "width"):
-            raise ValueError(f"rooms: unknown option {option!r}; known are {', '.join(known)} without split and size")
+            raise InputError(f"rooms: unknown option {option!r}; known are {', '.join(known)} without split and size")
     return Rooms(split=split, height=height, width=width, **options)

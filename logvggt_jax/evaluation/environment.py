@@ -1,7 +1,9 @@
-"""What a result was computed with: versions, commit, device, checkpoint."""
+"""What a result was computed with: versions, commit, code, device."""
 
 from __future__ import annotations
 
+import ast
+import functools
 import hashlib
 import importlib.metadata
 import os
@@ -12,16 +14,59 @@ from typing import Any
 
 import jax
 
+_PACKAGE = Path(__file__).parents[1]
 _VERSIONED = ("logvggt-jax", "jax", "jaxlib", "flax", "numpy", "scipy", "evo", "open3d", "opencv-python-headless")
+# The files that decide a number once frames, images and measures are given. Not among them: the protocols, whose
+# settings are in the key of every record and whose prose is nobody's number; reports; costs.
+_DECIDING = (
+    "types.py",
+    "config.py",
+    "geometry",
+    "metrics",
+    "model",
+    "streaming",
+    "data/dataset.py",
+    "data/formats",
+    "data/readers",
+    "data/rooms",
+    "data/feeding/transforms.py",
+    "evaluation/clips.py",
+    "evaluation/scores.py",
+    "evaluation/methods",
+    "evaluation/protocols/images.py",
+)
 
 
 def environment() -> dict[str, Any]:
-    """`versions` by package, `commit` of this package's checkout (`unknown` where it is not one), `device`."""
+    """`versions` by package, `commit` of this package's checkout (`unknown` where it is not one), `code`, `device`."""
     return {
         "versions": {name: _version(name) for name in _VERSIONED},
         "commit": _commit(Path(__file__).parent),
+        "code": code_version(),
         "device": str(jax.devices()[0].device_kind),
     }
+
+
+@functools.cache
+def code_version(*more: str, package: Path = _PACKAGE) -> str:
+    """Digest of the code that decides numbers; comments, docstrings and layout are not in it.
+
+    Args:
+      *more: files and folders of the package besides those that decide what is measured on a clip.
+      package: folder of the package.
+    """
+    digest = hashlib.blake2b(digest_size=12)
+    for part in (*_DECIDING, *more):
+        for path in [package / part] if part.endswith(".py") else sorted((package / part).rglob("*.py")):
+            tree = ast.parse(path.read_bytes())
+            for node in ast.walk(tree):
+                if (
+                    isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
+                    and ast.get_docstring(node) is not None
+                ):
+                    del node.body[0]
+            digest.update(f"{path.relative_to(package)}\n{ast.dump(tree)}\n".encode())
+    return digest.hexdigest()
 
 
 def describe_device() -> str:
@@ -33,12 +78,6 @@ def describe_device() -> str:
     lines = information.read_text().splitlines() if information.is_file() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return f"{names[0] if names else platform.machine()}, {os.cpu_count()} cores"
-
-
-def checkpoint_identity(path: str | Path) -> str:
-    """Digest of a model folder's description, which holds a digest of every parameter."""
-    description = Path(path).expanduser() / "config.json"
-    return hashlib.blake2b(description.read_bytes(), digest_size=16).hexdigest()
 
 
 def _version(package: str) -> str:

@@ -6,10 +6,12 @@ import contextlib
 import hashlib
 import json
 import math
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+from logvggt_jax.errors import disk_errors
+from logvggt_jax.files import write_text
 
 PREDICTION = "prediction"  # the group under which a method's own failure is recorded
 
@@ -17,28 +19,28 @@ PREDICTION = "prediction"  # the group under which a method's own failure is rec
 class ClipRecords:
     """The file `clips.jsonl` of an evaluation.
 
-    A record belongs to a key: a digest of everything that its numbers depend on. Records of an earlier run with the
-    keys asked for are taken over, so that a killed evaluation goes on where it stopped; all others are dropped, as is a
-    line that was cut off. A method that failed is tried again.
+    A record belongs to a key: a digest of everything that its numbers depend on. Records of earlier runs with the keys
+    asked for are taken over, so that a killed evaluation goes on where it stopped. All others stay in the file until
+    `keep_asked`, so that an evaluation which never ends destroys nothing. A method that failed is tried again, and a
+    line that was cut off is passed over.
 
-    Every run starts with a line {"environment": …}.
+    Before the records of an environment stands a line {"environment": …}; each record names its digest.
     """
 
-    def __init__(self, path: Path, keys: Sequence[str], environment: Mapping[str, Any]) -> None:
-        """Reads what is there; nothing is written before `writing`."""
-        self._path = path
+    def __init__(self, path: Path, keys: Sequence[str], environment: Mapping[str, Any], *, fresh: bool = False) -> None:
+        """Reads what is there, unless a `fresh` run is asked for; nothing is written before `add`."""
+        self._path, self._asked = path, set(keys)
+        self._environment = plain(environment)
         self._records: dict[str, dict[str, Any]] = {}
-        self.environments: list[dict[str, Any]] = []
-        asked = set(keys)
-        for line in _lines(path):
-            if "environment" in line:
-                self.environments.append(line["environment"])
-            elif line.get("key") in asked and PREDICTION not in line["failures"]:
+        self._known: dict[str, dict[str, Any]] = {}
+        text = path.read_text() if path.is_file() else ""
+        # A line that was cut off must not swallow the next one.
+        self._break = "" if text.endswith("\n") or not text else "\n"
+        for line in _lines(text):
+            if "environment" in line and "key" not in line:
+                self._known[record_key(line["environment"])] = line["environment"]
+            elif not fresh and line.get("key") in self._asked and PREDICTION not in line["failures"]:
                 self._records[line["key"]] = line
-        if not self._records:
-            self.environments = []
-        if not self.environments or len(self._records) < len(asked):
-            self.environments.append(dict(environment))
 
     def __contains__(self, key: str) -> bool:
         return key in self._records
@@ -49,40 +51,33 @@ class ClipRecords:
     def __len__(self) -> int:
         return len(self._records)
 
-    @contextlib.contextmanager
-    def writing(self) -> Iterator[None]:
-        """`add` writes while this is open. A file without any record is taken away again."""
-        self._path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            kept = [{"environment": each} for each in self.environments] + list(self._records.values())
-            write_text(self._path, "".join(_line(record) for record in kept))
-            yield
-        finally:
-            if not self._records:
-                self._path.unlink(missing_ok=True)
-                if not any(self._path.parent.iterdir()):
-                    self._path.parent.rmdir()
+    @property
+    def environments(self) -> list[dict[str, Any]]:
+        """Those in which the records asked for were measured."""
+        used = {record["environment"] for record in self._records.values()}
+        return [environment for digest, environment in self._known.items() if digest in used]
 
     def add(self, key: str, record: Mapping[str, Any]) -> None:
         """Appends one record and keeps it under its key."""
-        self._records[key] = plain({"key": key, **record})
-        with self._path.open("a") as file:
-            file.write(_line(self._records[key]))
+        digest = record_key(self._environment)
+        lines = [] if digest in self._known else [{"environment": self._environment}]
+        self._known[digest] = self._environment
+        self._records[key] = plain({"key": key, "environment": digest, **record})
+        with disk_errors(self._path):
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            with self._path.open("a") as file:
+                file.write(self._break + "".join(map(_line, [*lines, self._records[key]])))
+        self._break = ""
+
+    def keep_asked(self) -> None:
+        """Rewrites the file with the records asked for alone."""
+        lines = [*({"environment": each} for each in self.environments), *self._records.values()]
+        write_text(self._path, "".join(map(_line, lines)))
 
 
 def record_key(*parts: Any) -> str:
     """Digest of JSON values."""
     return hashlib.blake2b(json.dumps(plain(parts), sort_keys=True).encode(), digest_size=12).hexdigest()
-
-
-def write_text(path: Path, text: str) -> None:
-    """Writes a file whole or not at all."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        temporary.write_text(text)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def plain(value: Any) -> Any:
@@ -100,11 +95,9 @@ def _line(record: Mapping[str, Any]) -> str:
     return json.dumps(record) + "\n"
 
 
-def _lines(path: Path) -> Iterator[dict[str, Any]]:
-    if not path.is_file():
-        return
-    for text in path.read_text().splitlines():
+def _lines(text: str) -> Iterator[dict[str, Any]]:
+    for line in text.splitlines():
         with contextlib.suppress(ValueError):
-            line = json.loads(text)
-            if isinstance(line, dict):
-                yield line
+            values = json.loads(line)
+            if isinstance(values, dict):
+                yield values

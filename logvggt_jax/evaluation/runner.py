@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +14,13 @@ import numpy as np
 from rich.console import Console
 
 from logvggt_jax.data.dataset import Dataset
-from logvggt_jax.data.rooms.rooms import Rooms
+from logvggt_jax.errors import InputError
 from logvggt_jax.evaluation.clips import load_clip
-from logvggt_jax.evaluation.environment import environment
-from logvggt_jax.evaluation.methods.method import ClipPrediction, Method
+from logvggt_jax.evaluation.environment import code_version, environment
+from logvggt_jax.evaluation.methods.method import ClipPrediction, Method, PredictionError
 from logvggt_jax.evaluation.progress import progress_display
 from logvggt_jax.evaluation.protocols.protocol import Protocol
-from logvggt_jax.evaluation.records import PREDICTION, ClipRecords, plain, record_key, write_text
+from logvggt_jax.evaluation.records import PREDICTION, ClipRecords, plain, record_key
 from logvggt_jax.evaluation.scores import (
     ClipScore,
     ClipTruth,
@@ -30,6 +30,8 @@ from logvggt_jax.evaluation.scores import (
     is_measured,
     prepare_truth,
 )
+from logvggt_jax.files import write_text
+from logvggt_jax.metrics import NotMeasurable
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,56 +68,59 @@ def evaluate(
     title: str,
     command: str,
     configuration: Mapping[str, Any],
-    identity: str = "",
+    checkpoint: str = "",
     max_sequences: int | None = None,
     figures: int = 0,
+    fresh: bool = False,
+    timings: Callable[[], Mapping[str, Any]] | None = None,
     console: Console | None = None,
 ) -> dict[str, Any]:
     """Evaluates all methods on the same clips.
 
     Every clip's metrics are appended to `output`/clips.jsonl as soon as they are known; results.json follows at the
-    end. A run that was interrupted goes on where it stopped when it is started again with the same settings, methods
-    and checkpoint; results of other settings in the folder are replaced. Clips that are too short or cannot be read,
-    methods that fail on a clip (out of memory among other things), and metrics that a clip does not admit, are listed
-    with their reason; means are over the others and carry their number beside the number planned.
+    end. What decides a clip's numbers is their key: the code that measures, the data set's frames, the images' rule,
+    the measures, and the method with its parameters. A later run takes over what it finds under its keys. Results of
+    other runs in the folder stay until this one is complete, and then make place for it.
+
+    Clips that are too short or cannot be read, methods that cannot predict a clip (out of memory among other things),
+    and metrics that a clip does not admit, are listed with their reason; means are over the others and carry their
+    number beside the number planned. Any other exception is a fault of this package and is not caught.
 
     Args:
       benchmarks: what is evaluated; those whose data are missing are listed.
       methods: rows of the tables, names unique; the first is the one drawn in figures.
-      output: folder, created.
+      output: folder, created with the first result.
       title: of the report.
       command: what a reader has to run to get the same numbers.
       configuration: of the run, recorded.
-      identity: of the parameters behind the methods; results of another identity are not taken over.
+      checkpoint: digest of the parameters, recorded.
       max_sequences: only that many first sequences of each benchmark; None takes all.
       figures: clips of each benchmark that are drawn.
+      fresh: measure everything anew, whatever an earlier run has left.
+      timings: measures what becomes `timings` of the results, once all clips are done.
       console: where progress is shown; None for the standard one.
 
     Returns:
       The content of results.json: `title`, `command`, `config`, `methods`, `benchmarks`, `summary` (one entry for each
-      benchmark and method), `skipped`, `failures`, `figures` and `environments` (those of all runs that added
-      records).
+      benchmark and method), `skipped`, `failures`, `figures`, `environments` (those in which the clips were measured)
+      and `timings` where they were asked for.
 
     Raises:
-      ValueError: no clip could be evaluated, or two methods of one name.
+      InputError: no clip could be evaluated, or no method could predict any.
+      ValueError: two methods of one name.
     """
     names = [method.name for method in methods]
     if len(set(names)) < len(names):
         raise ValueError(f"methods must have unique names, got {', '.join(names)}")
     plan, skipped = plan_clips(benchmarks, max_sequences)
     keys = {
-        (clip, method.name): _key(clip, method, identity)
+        (clip, method.name): _key(clip, method)
         for clip in plan
         for method in methods
         if is_measured(method, clip.benchmark.protocol)
     }
-    records = ClipRecords(output / "clips.jsonl", list(keys.values()), environment())
-    stale = [output / name for name in ("results.json", "report.md", "report.html")]
-    if not len(records):
-        stale += (output / "figures").glob("*_frames_*.png")
-    for path in stale:
-        path.unlink(missing_ok=True)
-    with records.writing(), progress_display(console) as progress:
+    records = ClipRecords(output / "clips.jsonl", list(keys.values()), environment(), fresh=fresh)
+    with progress_display(console) as progress:
         task = progress.add_task("evaluating", total=len(plan))
         drawn: dict[str, int] = {}
         for clip in plan:
@@ -130,31 +135,39 @@ def evaluate(
                 if reason:
                     skipped.append({**_where(clip), "reason": reason})
             progress.advance(task)
-        if not len(records):
-            reasons = "; ".join(f"{entry['sequence']}: {entry['reason']}" for entry in skipped[:3])
-            missing = "; ".join(sorted({benchmark.missing for benchmark in benchmarks if benchmark.missing}))
-            raise ValueError(f"no clip could be evaluated ({len(skipped)} skipped; {reasons or missing})")
-        if failed := _all_failed(records, keys.values()):
-            raise ValueError(f"no method could predict any clip; the first says: {failed}")
+    if not len(records):
+        reasons = "; ".join(f"{entry['sequence']}: {entry['reason']}" for entry in skipped[:3])
+        missing = "; ".join(sorted({benchmark.missing for benchmark in benchmarks if benchmark.missing}))
+        raise InputError(f"no clip could be evaluated ({len(skipped)} skipped; {reasons or missing})")
+    if failed := _all_failed(records, keys.values()):
+        raise InputError(f"no method could predict any clip; the first says: {failed}")
     results = plain(
         {
             "title": title,
             "command": command,
             "config": dict(configuration),
-            "checkpoint": identity,
+            "checkpoint": checkpoint,
             "methods": [{"name": m.name, "knows": m.knows, "static": m.static} for m in methods],
             **_collected(benchmarks, methods, plan, skipped, records, keys),
             "skipped": skipped,
             "environments": records.environments,
+            **({} if timings is None else {"timings": timings()}),
         }
     )
-    write_results(results, output)
+    _replace_results(results, records, output)
     return results
 
 
-def write_results(results: Mapping[str, Any], output: Path) -> None:
-    """results.json, whole or not at all."""
+def _replace_results(results: Mapping[str, Any], records: ClipRecords, output: Path) -> None:
+    """Writes results.json, and removes what belongs to other results."""
+    records.keep_asked()
     write_text(output / "results.json", json.dumps(results, indent=1) + "\n")
+    old = [output / "report.md", output / "report.html"]
+    for pattern in ("*_frames_*.png", "ate_against_views_*.png"):
+        old += (output / "figures").glob(pattern)
+    for path in old:
+        if str(path.relative_to(output)) not in results["figures"]:
+            path.unlink(missing_ok=True)
 
 
 def plan_clips(
@@ -169,7 +182,7 @@ def plan_clips(
             try:
                 count = benchmark.dataset.num_frames(sequence)
                 chosen = benchmark.protocol.frames(sequence, count)
-            except (ValueError, OSError) as error:
+            except (InputError, OSError) as error:
                 skipped.append({**_where(Clip(benchmark, sequence, ())), "reason": str(error)})
                 continue
             clips += [Clip(benchmark, sequence, indices) for indices in chosen]
@@ -195,7 +208,7 @@ def _run_clip(
     assert dataset is not None  # the plan has only clips of data sets that are there
     try:
         data = load_clip(dataset, clip.sequence, clip.indices, protocol.images, depth=protocol.needs_depth)
-    except (ValueError, OSError) as error:
+    except (InputError, OSError) as error:
         return str(error)
     truth = prepare_truth(data, protocol.points if any(method.points for method in pending) else None)
     for method in pending:
@@ -219,7 +232,7 @@ def _run_clip(
 def _predicted(method: Method, truth: ClipTruth, protocol: Protocol) -> tuple[ClipPrediction | None, ClipScore]:
     try:
         prediction = method.predict(truth.clip.images)
-    except (ValueError, MemoryError) as error:
+    except (PredictionError, MemoryError) as error:
         return None, ClipScore({}, {PREDICTION: str(error) or "out of memory"})
     except jax.errors.JaxRuntimeError as error:
         if "RESOURCE_EXHAUSTED" not in str(error):
@@ -295,12 +308,13 @@ def _where(clip: Clip) -> dict[str, Any]:
     return {"benchmark": protocol.name, "sequence": clip.sequence, "frames": protocol.frames.wanted}
 
 
-def _key(clip: Clip, method: Method, identity: str) -> str:
-    dataset = clip.benchmark.dataset
-    rendered = dataset.options if isinstance(dataset, Rooms) else None
-    settings = clip.benchmark.protocol.describe()
-    what = [settings, clip.benchmark.split, rendered, clip.sequence, clip.indices]
-    return record_key(*what, method.name, method.knows, identity)
+def _key(clip: Clip, method: Method) -> str:
+    """Digest of what decides the clip's numbers, and of the names under which they stand in the file."""
+    protocol, dataset = clip.benchmark.protocol, clip.benchmark.dataset
+    names = [protocol.name, method.name]
+    data = [protocol.dataset, getattr(dataset, "options", None), clip.sequence, clip.indices]
+    claims = [method.depth, method.pose, method.points, method.static]
+    return record_key(code_version(), names, data, protocol.measures(), claims, method.identity)
 
 
 def _draw(folder: Path, clip: Clip, method: Method, prediction: ClipPrediction, truth: ClipTruth) -> list[str]:
@@ -317,7 +331,7 @@ def _draw(folder: Path, clip: Clip, method: Method, prediction: ClipPrediction, 
         drawn.append(folder / f"{stem}_trajectory.png")
         plots.trajectory_plot(drawn[-1], prediction.extrinsics, data.extrinsics)
     if method.points and truth.points is not None and truth.indices is not None:
-        with contextlib.suppress(ValueError):  # without an alignment there is no picture; the score says why
+        with contextlib.suppress(NotMeasurable):  # without an alignment there is no picture; the score says why
             points = aligned_points(prediction, truth)
             frames, pixels = np.divmod(truth.indices, data.images[0, ..., 0].size)
             colours = data.images.reshape(len(data.images), -1, 3)[frames, pixels]

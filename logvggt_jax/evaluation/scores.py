@@ -12,8 +12,10 @@ from logvggt_jax.evaluation.clips import ClipData
 from logvggt_jax.evaluation.methods.method import ClipPrediction, Method
 from logvggt_jax.evaluation.progress import track
 from logvggt_jax.evaluation.protocols.protocol import DepthMeasure, PointsMeasure, Protocol
+from logvggt_jax.evaluation.scratch import scratch_array
 from logvggt_jax.geometry import camera_centres, invert, umeyama, unproject
-from logvggt_jax.metrics.depth import DEPTH_KEYS, clip_depth_metrics, mean_depth_metrics
+from logvggt_jax.metrics.depth import DEPTH_KEYS, mean_depth_metrics, pixel_errors, resize_depth, valid_depth
+from logvggt_jax.metrics.errors import NotMeasurable
 from logvggt_jax.metrics.points import estimate_normals, point_cloud_metrics, sample_indices
 from logvggt_jax.metrics.pose import pose_accuracy, relative_pose_errors
 from logvggt_jax.metrics.trajectory import rms_radius, trajectory_errors
@@ -106,7 +108,7 @@ def clip_score(method: Method, prediction: ClipPrediction, truth: ClipTruth, pro
         prefix = SFM if name.startswith(SFM) else ""
         try:
             metrics |= {prefix + key: value for key, value in measure().items()}
-        except ValueError as error:
+        except NotMeasurable as error:
             failures[name] = str(error)
     return ClipScore(metrics, failures)
 
@@ -183,21 +185,46 @@ def points_at(depth: np.ndarray, intrinsics: np.ndarray, extrinsics: np.ndarray,
     return np.concatenate(clouds)
 
 
+def valid_pixels(prediction: np.ndarray, target: np.ndarray, max_depth: float | None) -> tuple[np.ndarray, np.ndarray]:
+    """Predicted and true depth [N] of a clip's valid pixels, in order, on disk where they are many.
+
+    Args:
+      prediction: [T, h, w], resized frame by frame as `resize_depth` does where its size is not the target's.
+      target: [T, H, W]. Both may be memory maps: one frame is in memory at a time.
+      max_depth: metres; exclusive bound of valid depth, None for none.
+    """
+    count = sum(int(valid_depth(frame, max_depth).sum()) for frame in target)
+    predicted, true = scratch_array((count,), prediction.dtype), scratch_array((count,), target.dtype)
+    start = 0
+    for shown, frame in zip(prediction, track(target, len(target), "valid depth"), strict=True):
+        valid = valid_depth(frame, max_depth)
+        stop = start + int(valid.sum())
+        if shown.shape != frame.shape:
+            shown = resize_depth(shown[None], frame.shape)[0]
+        predicted[start:stop], true[start:stop] = shown[valid], frame[valid]
+        start = stop
+    return predicted, true
+
+
 def aligned_points(prediction: ClipPrediction, truth: ClipTruth) -> np.ndarray:
     """Predicted points [N, 3] of the compared pixels, moved by the similarity that fits the true ones best.
 
     Raises:
-      ValueError: no true points, no predicted intrinsics, a prediction that is not finite, no similarity.
+      NotMeasurable: no true points, a prediction that is not finite, no similarity.
+      ValueError: the method predicts no depth or intrinsics, or depth of another size.
     """
     if truth.indices is None or truth.points is None or truth.clip.depth is None:
-        raise ValueError("the clip has no true points (no valid depth or no true poses)")
+        raise NotMeasurable("the clip has no true points (no valid depth or no true poses)")
     depth = _finite_depth(prediction)
     if depth.shape != truth.clip.depth.shape:
         raise ValueError(f"predicted depth {depth.shape} must have the shape of the true one {truth.clip.depth.shape}")
     if prediction.intrinsics is None:
         raise ValueError("points need predicted intrinsics")
     cloud = points_at(depth, prediction.intrinsics, prediction.extrinsics, truth.indices)
-    return umeyama(cloud, truth.points).apply(cloud)
+    try:
+        return umeyama(cloud, truth.points).apply(cloud)
+    except ValueError as error:
+        raise NotMeasurable(f"predicted points cannot be aligned: {error}") from error
 
 
 def _middle(size: tuple[int, ...], crop: int | None) -> tuple[slice, slice]:
@@ -209,21 +236,17 @@ def _middle(size: tuple[int, ...], crop: int | None) -> tuple[slice, slice]:
 
 def _depth(prediction: ClipPrediction, clip: ClipData, measure: DepthMeasure) -> dict[str, float]:
     depth = _finite_depth(prediction)
-    if clip.depth is None:
-        raise ValueError("the clip has no true depth")
-    if len(depth) != len(clip.depth):
-        raise ValueError(f"the method predicted {len(depth)} depth maps for {len(clip.depth)} frames")
-    errors = clip_depth_metrics(
-        depth, clip.depth, alignments=measure.alignments, max_depth=measure.max_depth, clip=measure.clip
-    )
+    assert clip.depth is not None  # read where the protocol measures depth
+    pixels = valid_pixels(depth, clip.depth, measure.max_depth)
+    if not pixels[0].size:
+        raise NotMeasurable("no frame of the clip has a valid depth")
     result: dict[str, float] = {}
     for alignment in measure.alignments:
-        result |= {f"{alignment}/{key}": errors[alignment][key] for key in DEPTH_KEYS}
-        result["valid_pixels"] = errors[alignment]["valid_pixels"]
-        if not result["valid_pixels"]:
-            raise ValueError("no frame of the clip has a valid depth")
+        errors = pixel_errors(*pixels, alignment=alignment, clip=measure.clip)
+        result |= {f"{alignment}/{key}": errors[key] for key in DEPTH_KEYS}
+        result["valid_pixels"] = errors["valid_pixels"]
     if not np.isfinite(list(result.values())).all():
-        raise ValueError("predicted depth cannot be aligned: it is 0 at every valid pixel, or its scale overflows")
+        raise NotMeasurable("predicted depth cannot be aligned: it is 0 at every valid pixel, or its scale overflows")
     return result
 
 
@@ -247,7 +270,7 @@ def _trajectory(prediction: ClipPrediction, extrinsics: np.ndarray, static: bool
     radius = rms_radius(camera_centres(true))
     if static:
         if not radius > 0:
-            raise ValueError("the true camera does not move or has no pose")
+            raise NotMeasurable("the true camera does not move or has no pose")
         return {"ate": radius, "ate_ratio": 1.0}
     errors = trajectory_errors(invert(np.asarray(prediction.extrinsics, np.float64)), invert(true))
     return {**errors, "ate_ratio": errors["ate"] / radius}
@@ -265,7 +288,7 @@ def _finite_depth(prediction: ClipPrediction) -> np.ndarray:
         raise ValueError("the method predicts no depth")
     bad = [t for t, frame in enumerate(depth) if not np.isfinite(frame).all()]
     if bad:
-        raise ValueError(f"predicted depth of frame {bad[0]} is not finite ({len(bad)} such frames)")
+        raise NotMeasurable(f"predicted depth of frame {bad[0]} is not finite ({len(bad)} such frames)")
     return depth
 
 

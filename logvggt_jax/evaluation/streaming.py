@@ -67,7 +67,7 @@ def _finish(model: LogVGGT, variables: Any, state: WindowState) -> WindowOutput:
 
 @functools.partial(jax.jit, static_argnums=0)
 def _cameras(model: LogVGGT, variables: Any, camera: jax.Array, register: jax.Array, mask: jax.Array) -> jax.Array:
-    return model.refine_sequence(variables, camera, register, mask)[:, :, -1]
+    return model.refinement.refine_sequence(variables, camera, register, mask)[:, :, -1]
 
 
 def stream_clip(model: LogVGGT, variables: Any, images: np.ndarray) -> StreamedClip:

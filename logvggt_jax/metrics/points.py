@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import ctypes
 import importlib
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
+from logvggt_jax.errors import MissingPackage
 from logvggt_jax.metrics.depth import lower_median
+from logvggt_jax.metrics.errors import NotMeasurable
 
 
 def point_cloud_metrics(
@@ -41,8 +43,9 @@ def point_cloud_metrics(
       and `chamfer_mean`, half of it (the papers do not say which they mean).
 
     Raises:
-      ValueError: an empty cloud, wrong shapes, points that are not finite.
-      ImportError: Open3D (ICP, normals) or SciPy is not installed.
+      NotMeasurable: an empty cloud, points that are not finite.
+      ValueError: wrong shapes.
+      MissingPackage: Open3D (ICP, normals) or SciPy is not installed.
     """
     prediction, target = _cloud(prediction, "prediction"), _cloud(target, "target")
     if prediction_normals is not None:
@@ -96,60 +99,30 @@ def estimate_normals(points: np.ndarray) -> np.ndarray:
     return np.array(cloud.normals)
 
 
-class ScaleShift(NamedTuple):
-    """Protocol A's normalisation of a cloud: z is shifted by -shift_z, then the points are multiplied."""
-
-    shift_z: float
-    scale: float
-
-
-def median_scale_shift(points: np.ndarray) -> ScaleShift:
-    """Median z, and median distance to the per-axis median once z is centred, of points [N, 3].
-
-    Medians are the lower ones. Source: the evaluation's default alignment of pointmaps in the first camera's
-    frame: subtract each cloud's `shift_z`, multiply the prediction by the ratio of scales.
-    """
-    points = _cloud(points, "points")
-    shift_z = lower_median(points[:, 2])
-    centred = points - [0.0, 0.0, shift_z]
-    centre = np.array([lower_median(centred[:, axis]) for axis in range(3)])
-    return ScaleShift(shift_z, lower_median(np.linalg.norm(centred - centre, axis=-1)))
-
-
 def align_median(prediction: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Protocol A: prediction [N, 3] and target [M, 3] of the first camera's frame, both with median z at 0.
+    """The alignment of pointmap evaluations: both clouds are centred in depth, then the prediction takes the size.
 
-    The prediction is scaled to the target's median size; the scale measured on it is held within [1e-3, 1e3].
+    Each cloud, in the first camera's frame, is shifted along z so that its lower median of z is 0. Its size is the
+    lower median of the distances to its per-axis lower median. The prediction is multiplied by the ratio of sizes, its
+    own held within [1e-3, 1e3]. Nothing is rotated, and x and y are not shifted. Our tables align by a similarity over
+    corresponding points instead; numbers made with one cannot be compared with those of the other.
+
+    Args:
+      prediction: [N, 3].
+      target: [M, 3].
+
+    Returns:
+      The aligned prediction [N, 3] and the centred target [M, 3], which are to be compared.
     """
-    predicted, true = median_scale_shift(prediction), median_scale_shift(target)
-    factor = true.scale / float(np.clip(predicted.scale, 1e-3, 1e3))
-    return (prediction - [0.0, 0.0, predicted.shift_z]) * factor, target - [0.0, 0.0, true.shift_z]
+    (predicted, predicted_size), (true, true_size) = _centred(prediction), _centred(target)
+    return predicted * (true_size / float(np.clip(predicted_size, 1e-3, 1e3))), true
 
 
-def align_bounding_boxes(prediction: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Prediction [N, 3] scaled and moved so that its bounding box has the target's diagonal and centre.
-
-    FastVGGT's alignment; a single outlier decides it, so prefer a similarity or `align_median`.
-    """
-    prediction, target = _cloud(prediction, "prediction"), _cloud(target, "target")
-    scale = np.linalg.norm(np.ptp(target, axis=0)) / np.linalg.norm(np.ptp(prediction, axis=0))
-    centre = (prediction.min(0) + prediction.max(0)) / 2
-    return (prediction - centre) * scale + (target.min(0) + target.max(0)) / 2
-
-
-def voxel_chamfer(
-    prediction: np.ndarray, target: np.ndarray, *, voxel: float = 0.05, max_distance: float = 0.5
-) -> float:
-    """FastVGGT's Chamfer distance: sum of both mean nearest distances between voxel centroids, each held to a maximum.
-
-    `voxel` is the side of the voxels and `max_distance` the bound on each distance, in the unit of the points.
-    """
-    reduced = [
-        np.array(_open3d_cloud(_cloud(points, name)).voxel_down_sample(voxel).points)
-        for points, name in ((prediction, "prediction"), (target, "target"))
-    ]
-    forth, back = _nearest(*reduced)[0], _nearest(*reduced[::-1])[0]
-    return float(np.minimum(forth, max_distance).mean() + np.minimum(back, max_distance).mean())
+def _centred(points: np.ndarray) -> tuple[np.ndarray, float]:
+    """Points [N, 3] with median z at 0, and their size."""
+    points = points - [0.0, 0.0, lower_median(points[:, 2])]
+    centre = [lower_median(points[:, axis]) for axis in range(3)]
+    return points, lower_median(np.linalg.norm(points - centre, axis=-1))
 
 
 def sample_indices(count: int, max_points: int | None, seed: int) -> np.ndarray:
@@ -166,17 +139,19 @@ def _nearest(points: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.nda
     try:
         from scipy.spatial import cKDTree
     except ImportError as error:
-        raise ImportError(f'nearest neighbours need SciPy ({error}): pip install "logvggt-jax[eval]"') from error
+        raise MissingPackage(f'nearest neighbours need SciPy ({error}): pip install "logvggt-jax[eval]"') from error
     return cKDTree(others).query(points)
 
 
 def _cloud(points: np.ndarray, name: str) -> np.ndarray:
     points = np.asarray(points, np.float64)
-    if points.ndim != 2 or points.shape[1] != 3 or not len(points):
-        raise ValueError(f"{name} must be a non-empty cloud [N, 3], got shape {points.shape}")
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ValueError(f"{name} must be a cloud [N, 3], got shape {points.shape}")
+    if not len(points):
+        raise NotMeasurable(f"{name} has no points")
     bad = np.flatnonzero(~np.isfinite(points).all(1))
     if bad.size:
-        raise ValueError(f"{name}: point {bad[0]} is not finite ({bad.size} such points); drop them first")
+        raise NotMeasurable(f"{name}: point {bad[0]} is not finite ({bad.size} such points)")
     return points
 
 
@@ -207,4 +182,4 @@ def _open3d() -> Any:
         mend = 'pip install "logvggt-jax[eval]"'
         if ".so" in str(error):
             mend = "install that library (Debian, Ubuntu: apt install libx11-6 libgl1 libegl1 libudev1 libidn2-0)"
-        raise ImportError(f"ICP and normals need Open3D ({error}): {mend}") from error
+        raise MissingPackage(f"ICP and normals need Open3D ({error}): {mend}") from error

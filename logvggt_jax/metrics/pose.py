@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from logvggt_jax.geometry import as_matrix, rotation_angle
+from logvggt_jax.metrics.errors import NotMeasurable
 
 # Keeps directions of zero length and arccosines of one finite, as the reference does.
 _EPSILON = 1e-15
@@ -27,15 +28,15 @@ def relative_pose_errors(
       90], since their sign is ignored; each [N(N-1)/2] float64. A pair without translation has 90 degrees.
 
     Raises:
-      ValueError: fewer than two frames, shapes that differ, or a pose that is not finite (the frame is
-        named).
+      NotMeasurable: fewer than two frames, or a pose that is not finite (the frame is named).
+      ValueError: lengths or shapes differ.
     """
     predicted = checked_poses(predicted_extrinsics, "predicted_extrinsics")
     true = checked_poses(true_extrinsics, "true_extrinsics")
     if len(predicted) != len(true):
         raise ValueError(f"relative_pose_errors: {len(predicted)} predicted poses, {len(true)} true ones")
     if len(true) < 2:
-        raise ValueError(f"relative_pose_errors: relative poses need at least 2 frames, got {len(true)}")
+        raise NotMeasurable(f"relative_pose_errors: relative poses need at least 2 frames, got {len(true)}")
     rotations, translations = [], []
     # One frame against all later ones at a time: memory stays linear in the number of frames.
     for i in range(len(true) - 1):
@@ -81,22 +82,24 @@ def pose_accuracy(rotation: np.ndarray, translation: np.ndarray, threshold: int 
 
 
 def checked_poses(poses: np.ndarray, name: str) -> np.ndarray:
-    """Poses [N, 3|4, 4] as float64 [N, 4, 4]; ValueError for other shapes and non-finite frames."""
+    """Poses [N, 3|4, 4] as float64 [N, 4, 4]; ValueError for other shapes, NotMeasurable for one that is not finite."""
     poses = np.asarray(poses, np.float64)
     if poses.ndim != 3 or poses.shape[1:] not in ((3, 4), (4, 4)):
         raise ValueError(f"{name} must have shape [N, 3, 4] or [N, 4, 4], got {poses.shape}")
     bad = np.flatnonzero(~np.isfinite(poses).all((1, 2)))
     if bad.size:
-        raise ValueError(f"{name}: the pose of frame {bad[0]} is not finite ({bad.size} such frames); drop them first")
+        raise NotMeasurable(f"{name}: the pose of frame {bad[0]} is not finite ({bad.size} such frames)")
     return as_matrix(poses)
 
 
 def _relative(poses: np.ndarray, i: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations [N - i - 1, 3, 3] and translations [N - i - 1, 3] of T_i T_j^-1 for all j > i, from poses [N, 4, 4]."""
     rotation = poses[i, :3, :3] @ poses[i + 1 :, :3, :3].swapaxes(-1, -2)
     return rotation, poses[i, :3, 3] - np.einsum("jab,jb->ja", rotation, poses[i + 1 :, :3, 3])
 
 
 def _direction_error(predicted: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """Degrees [P] in [0, 90] between the lines along translations [P, 3]."""
     predicted = predicted / (np.linalg.norm(predicted, axis=-1, keepdims=True) + _EPSILON)
     true = true / (np.linalg.norm(true, axis=-1, keepdims=True) + _EPSILON)
     sine_squared = np.maximum(1.0 - (predicted * true).sum(-1) ** 2, _EPSILON)

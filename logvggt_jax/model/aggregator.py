@@ -1,6 +1,8 @@
-"""Alternating frame and global attention over one window, with cross-window attention at the key layers."""
+"""Alternating frame and global attention over the frames of one window."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import flax.linen as nn
 import jax
@@ -9,11 +11,26 @@ import jax.numpy as jnp
 from logvggt_jax.config import ModelConfig
 from logvggt_jax.model.initializers import normal
 from logvggt_jax.model.layers import Block
-from logvggt_jax.model.rope import frame_positions, rope_table
+from logvggt_jax.model.memory import Memory
+from logvggt_jax.model.rope import rope_table
+
+
+class WindowTokens(NamedTuple):
+    """What the blocks make of one window's K frames.
+
+    Attributes:
+      key: [B, key layers, K, P, 2C] in the compute type: the key layers' tokens, the frame block's output before the
+        global block's on channels.
+      special: [B, K, 1 + registers, 2C] float32: camera and register tokens of the last layer, in the same form.
+    """
+
+    key: jax.Array
+    special: jax.Array
 
 
 class Aggregator(nn.Module):
-    """Patch tokens of one window to key-layer tokens and special tokens."""
+    """VGGT's trunk: in every layer a frame block (tokens of one frame see one another), then a global block (all
+    tokens of the window see one another, and what a memory adds)."""
 
     config: ModelConfig
 
@@ -21,40 +38,32 @@ class Aggregator(nn.Module):
     def __call__(
         self,
         patch_tokens: jax.Array,
-        frame_mask: jax.Array,
-        cached_tokens: jax.Array,
-        cached_mask: jax.Array,
+        lengths: jax.Array,
         starts_sequence: jax.Array,
+        memory: Memory,
         *,
         grid: tuple[int, int],
-    ) -> tuple[jax.Array, jax.Array]:
-        """Runs all blocks over a window (VGGT; paper, equation of cross-window attention, at the key layers).
+    ) -> tuple[WindowTokens, Memory]:
+        """Runs all layers over a window.
 
         Args:
           patch_tokens: [B, K, h * w, C].
-          frame_mask: bool [B, K], False for padding, which nothing attends to.
-          cached_tokens: [B, key layers, F, P, C], what the previous window left.
-          cached_mask: bool [B, F], False for cached frames that are padding or do not exist.
+          lengths: int32 [B], how many of the K frames are real, always the first ones; nothing attends to the others.
           starts_sequence: bool [B], whether the window's first frame is the sequence's first, which has camera
             and register tokens of its own.
+          memory: what the global blocks attend to besides the window: with cross-window attention the caches of the
+            key layers, see `cross_window.py`.
           grid: (h, w).
 
         Returns:
-          key_tokens [B, key layers, K, P, 2C] in the compute dtype, frame-block output before global-block output
-          on channels; special tokens [B, K, 5, 2C] float32 of the last block (camera, then registers).
+          The tokens, and the memory as the global blocks left it.
         """
         config, sizes = self.config, self.config.aggregator
         batch, frames, _, width = patch_tokens.shape
-        cached_frames = cached_tokens.shape[2]
         special = self._special_tokens(starts_sequence, batch, frames, width)
         x = jnp.concatenate([special, patch_tokens.astype(jnp.float32)], axis=2)
         tokens = x.shape[2]
-
-        positions = frame_positions(grid, 1 + sizes.num_registers)
-        table = rope_table(positions, width // sizes.num_heads, sizes.rope_base)
-        window_table, longer_table = table.tile(frames), table.tile(frames + cached_frames)
-        window_valid = jnp.repeat(frame_mask, tokens, axis=1)
-        longer_valid = jnp.repeat(jnp.concatenate([frame_mask, cached_mask], axis=1), tokens, axis=1)
+        table = rope_table(grid, 1 + sizes.num_registers, width // sizes.num_heads, sizes.rope_base)
 
         def block(name: str) -> Block:
             return Block(
@@ -71,26 +80,21 @@ class Aggregator(nn.Module):
         key_tokens = []
         both = x
         for layer in range(sizes.depth):
-            x = x.reshape(batch * frames, tokens, width)
-            x = frame_out = block(f"frame_block_{layer}")(x, rope=table)
-            x = x.reshape(batch, frames * tokens, width)
-            global_block = block(f"global_block_{layer}")
-            if layer in sizes.key_layers and config.windows.cross_window:
-                cached = cached_tokens[:, sizes.key_layers.index(layer)].astype(jnp.float32)
-                x = global_block(
-                    x,
-                    rope=longer_table,
-                    extra=cached.reshape(batch, cached_frames * tokens, width),
-                    key_valid=longer_valid,
-                )
-            else:
-                x = global_block(x, rope=window_table, key_valid=window_valid)
-            shape = (batch, frames, tokens, width)
+            frame_out, _ = block(f"frame_block_{layer}")(x.reshape(batch * frames, tokens, width), rope=table)
+            x, left = block(f"global_block_{layer}")(
+                frame_out.reshape(batch, frames * tokens, width),
+                rope=table,
+                valid=lengths * tokens,
+                memory=memory.at(layer),
+            )
+            if left is not None:
+                memory = memory.updated(layer, left)
             if layer in sizes.key_layers or layer == sizes.depth - 1:
+                shape = (batch, frames, tokens, width)
                 both = jnp.concatenate([frame_out.reshape(shape), x.reshape(shape)], axis=-1)
             if layer in sizes.key_layers:
                 key_tokens.append(both.astype(config.dtype))
-        return jnp.stack(key_tokens, axis=1), both[:, :, : 1 + sizes.num_registers]
+        return WindowTokens(jnp.stack(key_tokens, axis=1), both[:, :, : 1 + sizes.num_registers]), memory
 
     def _special_tokens(self, starts_sequence: jax.Array, batch: int, frames: int, width: int) -> jax.Array:
         """Camera and register tokens [B, K, 5, C]: copy 0 for the sequence's first frame, copy 1 for others."""

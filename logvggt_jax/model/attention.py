@@ -7,9 +7,11 @@ and blocks of queries (on a CPU that is also the fastest form, see `benchmarks/a
 from __future__ import annotations
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+from absl import logging
 
 from logvggt_jax.model.precision import product_precision
 
@@ -37,24 +39,36 @@ def attention(
       query: [B, queries, heads, head_dim].
       key: [B, keys, heads, head_dim], the query's dtype.
       value: [B, keys, heads, head_dim].
-      key_valid: bool [B, keys], False for keys that nothing may attend to; None for all. A row of B without any
-        valid key gets finite values without meaning.
+      key_valid: bool [B, keys], False for keys that nothing may attend to, or int32 [B], the first so many count;
+        None for all. A row of B without any valid key gets finite values without meaning.
       implementation: `auto` (by the default device), `xla`, `cudnn` or `tpu_flash` (the Pallas kernel). What the
-        last two cannot do takes `xla`: see `_fits_cudnn` and `_fits_tpu_flash`.
+        last two cannot do takes `xla`, with one warning for each reason unless it is small.
 
     Returns:
       [B, queries, heads, head_dim] in the query's dtype; softmax in float32.
     """
     if implementation == "auto":
         implementation = {"gpu": "cudnn", "tpu": "tpu_flash"}.get(jax.default_backend(), "xla")
-    if implementation == "cudnn" and _fits_cudnn(query):
-        return _cudnn(query, key, value, key_valid)
-    if implementation == "tpu_flash" and _fits_tpu_flash(query, key):
-        return _tpu_flash(query, key, value, key_valid)
+    kernel, obstacle = {
+        "cudnn": (_cudnn, _cudnn_obstacle(query)),
+        "tpu_flash": (_tpu_flash, _tpu_flash_obstacle(query, key)),
+    }.get(implementation, (None, None))
+    if kernel is not None and obstacle is None:
+        return kernel(query, key, value, key_valid)
+    key_valid = _as_mask(key_valid, key.shape[1])
     batch, queries, heads, _ = query.shape
     if batch * heads * queries * key.shape[1] <= _SMALL_SCORES:
         return _batched(query, key, value, key_valid)
+    if obstacle is not None:
+        _warn_once(f"attention falls back from {implementation} to the general form, which is slower: {obstacle}")
     return _blockwise(query, key, value, key_valid)
+
+
+def _as_mask(key_valid: jax.Array | None, keys: int) -> jax.Array | None:
+    """bool [B, keys] of either form of validity."""
+    if key_valid is None or key_valid.ndim == 2:
+        return key_valid
+    return jnp.arange(keys) < key_valid[:, None]
 
 
 def _weights(scores: jax.Array, valid: jax.Array | None) -> jax.Array:
@@ -113,28 +127,70 @@ def _blockwise(query: jax.Array, key: jax.Array, value: jax.Array, key_valid: ja
     return out[:, :queries]
 
 
-def _fits_cudnn(query: jax.Array) -> bool:
-    """16-bit inputs, and a head size that the kernel of every GPU since Ampere takes."""
-    return query.dtype in (jnp.bfloat16, jnp.float16) and query.shape[-1] % 8 == 0 and query.shape[-1] <= 128
+@functools.cache
+def _warn_once(message: str) -> None:
+    logging.warning("%s", message)
 
 
-def _fits_tpu_flash(query: jax.Array, key: jax.Array) -> bool:
-    """bfloat16 inputs (float32 products would be rounded to it) and at least a block of keys, outside of a
-    `shard_map` that checks what varies over devices: the kernel does not say so of its result."""
-    varying = jax.typeof(query).mat.varying
-    return query.dtype == jnp.bfloat16 and key.shape[1] >= max(_TPU_BLOCKS) and not varying
+def _cudnn_obstacle(query: jax.Array) -> str | None:
+    """Why cuDNN cannot do it; head sizes up to 128 are what GPUs since Ampere take."""
+    if query.dtype not in (jnp.bfloat16, jnp.float16):
+        return f"cuDNN attention takes bfloat16 and float16, not {query.dtype}"
+    if query.shape[-1] % 8 or query.shape[-1] > 128:
+        return f"cuDNN attention takes heads of a multiple of 8 up to 128, not of {query.shape[-1]}"
+    return None
+
+
+def _tpu_flash_obstacle(query: jax.Array, key: jax.Array) -> str | None:
+    """Why the TPU's kernel should not do it: it rounds float32 products, and pads keys to whole blocks."""
+    if query.dtype != jnp.bfloat16:
+        return f"the TPU's flash kernel takes bfloat16, not {query.dtype}"
+    if key.shape[1] < min(_TPU_BLOCKS):
+        return f"the TPU's flash kernel takes at least {min(_TPU_BLOCKS)} keys, not {key.shape[1]}"
+    return None
 
 
 def _cudnn(query: jax.Array, key: jax.Array, value: jax.Array, key_valid: jax.Array | None) -> jax.Array:
     """cuDNN flash attention. Validity becomes a length: attention does not care about the order of keys, so
     valid ones go first; a dense mask would cost a bias of queries x keys."""
     lengths = None
-    if key_valid is not None:
+    if key_valid is not None and key_valid.ndim == 1:
+        lengths = jnp.maximum(key_valid, 1).astype(jnp.int32)
+    elif key_valid is not None:
         order = jnp.argsort(~key_valid, axis=1, stable=True)[..., None, None]
         key = jnp.take_along_axis(key, order, axis=1)
         value = jnp.take_along_axis(value, order, axis=1)
         lengths = jnp.maximum(key_valid.sum(1), 1).astype(jnp.int32)
+    if query.shape[1] % 2 or key.shape[1] % 2:
+        return _cudnn_of_odd_length(query, key, value, lengths)
+    return _cudnn_call(query, key, value, lengths)
+
+
+def _cudnn_call(query: jax.Array, key: jax.Array, value: jax.Array, lengths: jax.Array | None) -> jax.Array:
     return jax.nn.dot_product_attention(query, key, value, key_value_seq_lengths=lengths, implementation="cudnn")
+
+
+# Odd lengths are refused under differentiation alone: inference does not pay for the padding.
+_cudnn_of_odd_length = jax.custom_vjp(_cudnn_call)
+
+
+def _cudnn_forward(query: jax.Array, key: jax.Array, value: jax.Array, lengths: jax.Array | None) -> Any:
+    """The result and its backward pass, of queries and keys padded to even lengths; padding keys are masked."""
+    if lengths is None:
+        lengths = jnp.full(key.shape[0], key.shape[1], jnp.int32)
+
+    def padded(query: jax.Array, key: jax.Array, value: jax.Array) -> jax.Array:
+        even = [jnp.pad(x, ((0, 0), (0, x.shape[1] % 2), (0, 0), (0, 0))) for x in (query, key, value)]
+        return _cudnn_call(*even, lengths)[:, : query.shape[1]]
+
+    return jax.vjp(padded, query, key, value)
+
+
+def _cudnn_backward(pull_back: Any, cotangent: jax.Array) -> tuple[Any, ...]:
+    return (*pull_back(cotangent), None)
+
+
+_cudnn_of_odd_length.defvjp(_cudnn_forward, _cudnn_backward)
 
 
 def _tpu_flash(query: jax.Array, key: jax.Array, value: jax.Array, key_valid: jax.Array | None) -> jax.Array:
@@ -145,8 +201,7 @@ def _tpu_flash(query: jax.Array, key: jax.Array, value: jax.Array, key_valid: ja
     batch, queries, _, head_dim = query.shape
     keys = key.shape[1]
     q_block, k_block = _least_padding(queries), _least_padding(keys)
-    if key_valid is None:
-        key_valid = jnp.ones((batch, keys), bool)
+    key_valid = jnp.ones((batch, keys), bool) if key_valid is None else _as_mask(key_valid, keys)
 
     def pad(x: jax.Array, block: int) -> jax.Array:
         return jnp.pad(x, ((0, 0), (0, -x.shape[1] % block)) + ((0, 0),) * (x.ndim - 2))

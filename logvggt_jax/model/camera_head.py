@@ -19,9 +19,13 @@ class CameraHead(nn.Module):
 
     @nn.compact
     def __call__(self, camera_tokens: jax.Array, camera_mask: jax.Array) -> jax.Array:
-        """[B, N, 2C] and bool [B, N] -> pose encodings [B, N, R, 9], all rounds, the last one best.
+        """Pose encodings [B, N, R, 9] of all rounds, the last one best.
 
-        Frames see one another in the trunk; those with a False mask are seen by none. Raw encodings accumulate
+        Args:
+          camera_tokens: [B, N, 2C].
+          camera_mask: which of them count, bool [B, N] or the first so many, int32 [B].
+
+        Frames see one another in the trunk; those that do not count are seen by none. Raw encodings accumulate
         over rounds without gradient through the feedback; the field of view is clipped at zero on the way out
         only.
         """
@@ -40,24 +44,22 @@ class CameraHead(nn.Module):
             shift, scale, gate = jnp.split(dense(3 * width, "modulation")(features), 3, axis=-1)
             z = gate * (plain * (1.0 + scale) + shift) + tokens
             for i in range(config.depth):
-                z = Block(
+                z, _ = Block(
                     config.num_heads,
                     4,
                     epsilon=1e-5,
                     layer_scale=config.layer_scale,
                     implementation=self.implementation,
                     name=f"trunk_{i}",
-                )(z, key_valid=camera_mask)
+                )(z, valid=camera_mask)
             z = layer_norm(1e-5, "trunk_norm")(z)
             pose = jax.lax.stop_gradient(pose) + MLP(width // 2, 9, "float32", name="pose_branch")(z)
             emitted = jnp.concatenate([pose[..., :7], jax.nn.relu(pose[..., 7:])], axis=-1)
             return (jax.lax.stop_gradient(pose), pose), emitted
 
         shape = (*tokens.shape[:2], 9)
-        # Derived from the tokens, so that under shard_map the carry varies over devices as the tokens do.
-        zeros = jnp.zeros_like(tokens[..., :1])
-        first = jnp.broadcast_to(empty, shape) + zeros
-        initial = jnp.asarray(config.initial_pose, jnp.float32) + zeros
+        first = jnp.broadcast_to(empty, shape)
+        initial = jnp.broadcast_to(jnp.asarray(config.initial_pose, jnp.float32), shape)
         rounds = nn.scan(one_round, variable_broadcast="params", split_rngs={"params": False}, length=config.iterations)
         _, encodings = rounds(self, (first, initial), None)
         return jnp.moveaxis(encodings, 0, 2)

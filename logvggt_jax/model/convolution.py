@@ -35,8 +35,7 @@ class Convolution(nn.Module):
         if size == 1:
             y = jnp.matmul(x, kernel[0, 0], precision=product_precision(dtype))
         elif self.strides == 1 and jax.default_backend() == "cpu":
-            # The sum makes the kernel vary over devices as x does, for shard_map's sake.
-            y = _looped_convolution(x, kernel + jnp.zeros_like(x, shape=kernel.shape))
+            y = _looped_convolution(x, kernel)
         else:
             y = _convolve(x, kernel, self.strides)
         if self.use_bias:

@@ -64,7 +64,7 @@ class DinoV2(nn.Module):
         first = jnp.concatenate([cls_token + pos_embed[:, :1], registers], axis=1)
         x = jnp.concatenate([jnp.broadcast_to(first, (len(tokens), *first.shape[1:])), tokens], axis=1)
         for i in range(config.depth):
-            x = Block(
+            x, _ = Block(
                 config.num_heads,
                 config.mlp_ratio,
                 epsilon=1e-6,

@@ -33,7 +33,7 @@ class DPTHead(nn.Module):
         for i, (tokens, channels) in enumerate(zip(levels, config.out_channels, strict=True)):
             x = norm(tokens).reshape(-1, *grid, tokens.shape[-1])
             x = Convolution(channels, 1, self.dtype, name=f"project_{i}")(x)
-            x = x + _uv_embedding(x.shape[1:], aspect).astype(x.dtype)
+            x = x + uv_embedding(x.shape[1:], aspect).astype(x.dtype)
             if i < 2:
                 x = UpConv(channels, 4 // 2**i, self.dtype, name=f"resize_{i}")(x)
             elif i == 3:
@@ -46,7 +46,7 @@ class DPTHead(nn.Module):
         x = self._fuse(1, x, maps[0], (2 * maps[0].shape[1], 2 * maps[0].shape[2]))
         x = Convolution(config.features // 2, 3, self.dtype, name="output_1")(x)
         x = _resize_bilinear(x, image_size)
-        x = x + _uv_embedding(x.shape[1:], aspect).astype(x.dtype)
+        x = x + uv_embedding(x.shape[1:], aspect).astype(x.dtype)
         x = jax.nn.relu(Convolution(32, 3, self.dtype, name="output_2_hidden")(x))
         return Convolution(self.out_channels, 1, self.dtype, name="output_2")(x).astype(jnp.float32)
 
@@ -141,20 +141,22 @@ def _resize_bilinear(x: jax.Array, size: tuple[int, int]) -> jax.Array:
     return jnp.einsum("xw,nywc->nyxc", columns, x, precision=precision)
 
 
-def _uv_embedding(shape: tuple[int, ...], aspect: float) -> np.ndarray:
+def uv_embedding(shape: tuple[int, ...], aspect: float) -> jax.Array:
     """0.1 times the sinusoidal code, float32 [h, w, D], of a map's normalised coordinates; x half first.
 
-    `aspect` is the image's W / H; coordinates span a box of unit half-diagonal. Phases are formed in float64.
+    `aspect` is the image's W / H; coordinates span a box of unit half-diagonal. Phases are formed in float64. The
+    program holds one row a line of the map and spreads it over the map by itself.
     """
     height, width, channels = shape
     diagonal = math.sqrt(aspect**2 + 1.0)
     span_x, span_y = aspect / diagonal * (width - 1) / width, 1.0 / diagonal * (height - 1) / height
     frequencies = 100.0 ** (-np.arange(channels // 4) / (channels / 4))
 
-    def code(extent: float, count: int) -> np.ndarray:
+    def code(extent: float, count: int) -> jax.Array:
         phase = np.linspace(-extent, extent, count)[:, None] * frequencies
-        return np.concatenate([np.sin(phase), np.cos(phase)], axis=-1)
+        return jnp.asarray((0.1 * np.concatenate([np.sin(phase), np.cos(phase)], axis=-1)).astype(np.float32))
 
-    x = np.broadcast_to(code(span_x, width)[None], (height, width, channels // 2))
-    y = np.broadcast_to(code(span_y, height)[:, None], (height, width, channels // 2))
-    return (0.1 * np.concatenate([x, y], axis=-1)).astype(np.float32)
+    half = (height, width, channels // 2)
+    x = jnp.broadcast_to(code(span_x, width)[None], half)
+    y = jnp.broadcast_to(code(span_y, height)[:, None], half)
+    return jnp.concatenate([x, y], axis=-1)

@@ -45,17 +45,21 @@ class GCCR(nn.Module):
         self.value = dense(self.width, "value", self.dtype)
         self.output = dense(self.width, "output", self.dtype, kernel_init=nn.initializers.zeros_init())
 
-    def __call__(self, camera_tokens: jax.Array, register_tokens: jax.Array, register_mask: jax.Array) -> jax.Array:
-        """[B, N, 2C], [B, M, 4, 2C], bool [B, M] (False: a frame whose registers do not count) -> [B, N, 2C]."""
-        return self.attend(camera_tokens, self.project(register_tokens), register_mask)
+    def __call__(self, camera_tokens: jax.Array, register_tokens: jax.Array, frames: jax.Array) -> jax.Array:
+        """[B, N, 2C], [B, M, 4, 2C] and the frames whose registers count -> [B, N, 2C]; see `attend`."""
+        return self.attend(camera_tokens, self.project(register_tokens), frames)
 
     def project(self, register_tokens: jax.Array) -> RegisterKeys:
         """Keys and values of register tokens [B, M, 4, 2C]."""
         normed = self.register_norm(register_tokens)
         return RegisterKeys(self.key(normed).astype(self.dtype), self.value(normed).astype(self.dtype))
 
-    def attend(self, camera_tokens: jax.Array, registers: RegisterKeys, register_mask: jax.Array) -> jax.Array:
-        """Refined tokens [B, N, 2C] of camera tokens [B, N, 2C]; `register_mask` bool [B, M]."""
+    def attend(self, camera_tokens: jax.Array, registers: RegisterKeys, frames: jax.Array) -> jax.Array:
+        """Refined tokens [B, N, 2C] of camera tokens [B, N, 2C].
+
+        `frames` says whose registers count: bool [B, M], or the first so many, int32 [B].
+        """
+        a_frame = registers.key.shape[2]
         queries = self.query(self.camera_norm(camera_tokens)).astype(self.dtype)
 
         def heads(tokens: jax.Array) -> jax.Array:
@@ -65,7 +69,7 @@ class GCCR(nn.Module):
             heads(queries),
             heads(registers.key),
             heads(registers.value),
-            jnp.repeat(register_mask, registers.key.shape[2], axis=1),
+            frames * a_frame if frames.ndim == 1 else jnp.repeat(frames, a_frame, axis=1),
             implementation=self.implementation,
         )
         return camera_tokens + self.output(out.reshape(camera_tokens.shape)).astype(jnp.float32)

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 
 from logvggt_jax.model.attention import attention
 from logvggt_jax.model.initializers import constant, fan_in_normal
+from logvggt_jax.model.memory import Keys, LayerMemory
 from logvggt_jax.model.precision import product_precision
 from logvggt_jax.model.rope import RopeTable, apply_rope
 
@@ -68,43 +69,51 @@ class MLP(nn.Module):
 
 
 class Attention(nn.Module):
-    """Multi-head attention of tokens [B, queries, C] to [B, keys, C], the queries' own tokens first.
+    """Multi-head attention of a block's own tokens to themselves and to what a memory adds.
 
-    `qk_norm` normalises queries and keys per head, before the rotary embedding.
+    With `qk_norm` queries and keys are normalised per head, before the rotary embedding.
     """
 
     num_heads: int
+    width: int
     qk_norm: bool
     dtype: str
     implementation: str
 
-    @nn.compact
-    def __call__(
-        self, x: jax.Array, context: jax.Array, rope: RopeTable | None, key_valid: jax.Array | None
-    ) -> jax.Array:
-        width = x.shape[-1]
-        head_dim = width // self.num_heads
-        query = dense(width, "query", self.dtype)(x)
-        key, value = jnp.split(dense(2 * width, "key_value", self.dtype)(context), 2, axis=-1)
-        query, key, value = (t.reshape(*t.shape[:-1], self.num_heads, head_dim) for t in (query, key, value))
+    def setup(self) -> None:
+        self.query = dense(self.width, "query", self.dtype)
+        self.key_value = dense(2 * self.width, "key_value", self.dtype)
+        self.output = dense(self.width, "output", self.dtype)
         if self.qk_norm:
-            query = layer_norm(1e-5, "query_norm")(query)
-            key = layer_norm(1e-5, "key_norm")(key)
-        if rope is not None:
-            query = apply_rope(query, RopeTable(*(part[: query.shape[1]] for part in rope)))
-            key = apply_rope(key, rope)
-        out = attention(
-            query.astype(self.dtype),
-            key.astype(self.dtype),
-            value.astype(self.dtype),
-            key_valid,
-            implementation=self.implementation,
-        )
-        return dense(width, "output", self.dtype)(out.reshape(x.shape))
+            self.query_norm = layer_norm(1e-5, "query_norm")
+            self.key_norm = layer_norm(1e-5, "key_norm")
+
+    def queries(self, normed: jax.Array, rope: RopeTable | None) -> jax.Array:
+        """[B, N, C] after the block's LayerNorm to queries [B, N, heads, head_dim] in the compute type."""
+        query = self._heads(self.query(normed))
+        if self.qk_norm:
+            query = self.query_norm(query)
+        return (query if rope is None else apply_rope(query, rope)).astype(self.dtype)
+
+    def keys(self, normed: jax.Array, rope: RopeTable | None, valid: jax.Array | None = None) -> Keys:
+        """[B, N, C] after the block's LayerNorm to keys and values in the compute type; see `Keys`."""
+        key, value = (self._heads(x) for x in jnp.split(self.key_value(normed), 2, axis=-1))
+        if self.qk_norm:
+            key = self.key_norm(key)
+        key = key if rope is None else apply_rope(key, rope)
+        return Keys(key.astype(self.dtype), value.astype(self.dtype), valid)
+
+    def __call__(self, query: jax.Array, keys: Keys) -> jax.Array:
+        """Queries [B, N, heads, head_dim] to the branch [B, N, C], before its LayerScale."""
+        out = attention(query, keys.key, keys.value, keys.valid, implementation=self.implementation)
+        return self.output(out.reshape(*out.shape[:2], self.width))
+
+    def _heads(self, x: jax.Array) -> jax.Array:
+        return x.reshape(*x.shape[:-1], self.num_heads, self.width // self.num_heads)
 
 
 class Block(nn.Module):
-    """x + γ₁ Attn(LN(x)); x + γ₂ MLP(LN(x)), with an optional longer set of keys and values.
+    """x + γ₁ Attn(LN(x)), then x + γ₂ MLP(LN(x)): the pre-norm transformer block of DINOv2 and VGGT.
 
     The residual stream stays float32 whatever `dtype` the products use.
     """
@@ -123,18 +132,29 @@ class Block(nn.Module):
         x: jax.Array,
         *,
         rope: RopeTable | None = None,
-        extra: jax.Array | None = None,
-        key_valid: jax.Array | None = None,
-    ) -> jax.Array:
-        """Args: x [B, N, C] float32; `extra` [B, E, C], tokens that are keys and values only (cross-window
-        attention), after the block's own; `rope` for the N + E keys; `key_valid` bool [B, N + E]."""
+        valid: jax.Array | None = None,
+        memory: LayerMemory | None = None,
+    ) -> tuple[jax.Array, LayerMemory | None]:
+        """Tokens after the block, and the memory that it leaves.
+
+        Every token of `x` is a query. Keys and values are those of the tokens of `x` that count, and what `memory`
+        adds to them; stored tokens pass through this block's own LayerNorm and projections.
+
+        Args:
+          x: [B, n · P, C] float32, the tokens of n frames, frame after frame.
+          rope: rotary table of one frame's P tokens; None for tokens without a position.
+          valid: which tokens of `x` count, see `Keys.valid`. The others are attended to by none, and what becomes of
+            them means nothing. With a memory a number of tokens or None.
+          memory: what the block has seen before; None for its own tokens alone.
+        """
         width = x.shape[-1]
         norm1 = layer_norm(self.epsilon, "norm1")
+        attention_ = Attention(self.num_heads, width, self.qk_norm, self.dtype, self.implementation, name="attention")
         normed = norm1(x)
-        context = normed if extra is None else jnp.concatenate([normed, norm1(extra)], axis=1)
-        branch = Attention(self.num_heads, self.qk_norm, self.dtype, self.implementation, name="attention")(
-            normed, context, rope, key_valid
-        )
+        keys = attention_.keys(normed, rope, valid)
+        if memory is not None:
+            keys, memory = memory.extend(keys, lambda tokens: attention_.keys(norm1(tokens), rope))
+        branch = attention_(attention_.queries(normed, rope), keys)
         x = x + LayerScale(self.layer_scale, name="scale1")(branch)
         branch = MLP(self.mlp_ratio * width, width, self.dtype, name="mlp")(layer_norm(self.epsilon, "norm2")(x))
-        return x + LayerScale(self.layer_scale, name="scale2")(branch)
+        return x + LayerScale(self.layer_scale, name="scale2")(branch), memory

@@ -1,17 +1,21 @@
 """When GCCR runs and which frames the camera head sees: full sequence, periodic, online, limited context.
 
-Shared by `LogVGGT.apply`, which loops over triggers, and by streams, which fire them one by one.
+A trigger refines a span of frames against the registers of all frames so far and decodes their poses. `fire` is the
+only one: `LogVGGT.apply` loops over it, streams call it when it is due, and operations are counted on its halves.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import dataclasses
 
 import jax
 import jax.numpy as jnp
 
-RefineTokens = Callable[[jax.Array, jax.Array], jax.Array]
-DecodeCameras = Callable[[jax.Array, jax.Array], jax.Array]
+from logvggt_jax.config import ModelConfig
+from logvggt_jax.model.camera_head import CameraHead
+from logvggt_jax.model.checks import check_array
+from logvggt_jax.model.gccr import GCCR, RegisterKeys
+from logvggt_jax.model.parameters import Variables, run
 
 
 def num_triggers(num_frames: int, period: int | None) -> int:
@@ -26,98 +30,216 @@ def trigger_range(trigger: int, num_frames: int, period: int | None) -> tuple[in
     return trigger * period, min((trigger + 1) * period, num_frames)
 
 
-def decode_group(
-    decode_cameras: DecodeCameras,
-    refined_tokens: jax.Array,
-    lengths: jax.Array,
-    start: jax.Array | int,
-    stop: jax.Array | int,
-    *,
-    group: int,
-    context: int,
-) -> jax.Array:
-    """Pose encodings [B, group, R, 9] of frames start … start + group − 1, seen with a limited context.
+@dataclasses.dataclass(frozen=True)
+class Refinement:
+    """GCCR and camera head over the compact tokens of sequences; pure functions of parameters and arrays."""
 
-    The trunk sees frame 0 and the `context` frames up to `stop` (the group's end, or the item's own if that
-    comes first); entries at or beyond `stop` mean nothing.
+    config: ModelConfig
 
-    Args:
-      decode_cameras: camera head, ([B, n, 2C], bool [B, n]) -> [B, n, R, 9].
-      refined_tokens: [B, N, 2C].
-      lengths: int [B], the items' numbers of frames.
-      start: first frame of the group.
-      stop: frame after the group's last, start < stop <= start + group.
-      group: frames of a group, the window stride.
-      context: at least `group`.
-    """
-    ends = jnp.minimum(stop, lengths)[:, None]
-    frames = ends - context + jnp.arange(context)
-    recent = jnp.take_along_axis(refined_tokens, jnp.maximum(frames, 0)[..., None], axis=1)
-    tokens = jnp.concatenate([refined_tokens[:, :1], recent], axis=1)
-    # Frame 0 has a slot of its own only where the recent frames do not include it.
-    valid = jnp.concatenate([ends > context, frames >= 0], axis=1)
-    encodings = decode_cameras(tokens, valid)
-    slots = jnp.clip(start + jnp.arange(group) - ends + context + 1, 0, context)
-    return jnp.take_along_axis(encodings, slots[..., None, None], axis=1)
+    # One trigger.
 
+    def fire(
+        self,
+        variables: Variables,
+        camera_tokens: jax.Array,
+        registers: RegisterKeys | None,
+        refined: jax.Array,
+        lengths: jax.Array,
+        start: jax.Array | int,
+        stop: jax.Array | int,
+        *,
+        size: int,
+    ) -> tuple[jax.Array, jax.Array]:
+        """One trigger: frames [start, stop) are refined and get their poses.
 
-def refine_sequence(
-    refine_tokens: RefineTokens,
-    decode_cameras: DecodeCameras,
-    camera_tokens: jax.Array,
-    frame_mask: jax.Array,
-    *,
-    period: int | None,
-    context: int | None,
-    group: int,
-) -> jax.Array:
-    """Pose encodings [B, T, R, 9] of a whole sequence, whatever the mode.
+        What lies at or beyond `stop`, or an item's own length, means nothing and is seen by none.
 
-    Args:
-      refine_tokens: GCCR over the sequence's registers, ([B, n, 2C], bool [B, T] frames whose registers count) ->
-        [B, n, 2C].
-      decode_cameras: camera head, ([B, n, 2C], bool [B, n]) -> [B, n, R, 9].
-      camera_tokens: [B, T, 2C].
-      frame_mask: bool [B, T], True … True False … False.
-      period: frames between triggers, None for one at the end.
-      context: frames that the trunk sees beside frame 0, None for all so far.
-      group: frames decoded together under a limited context (the window stride).
-    """
-    num_frames = camera_tokens.shape[1]
-    step = num_frames if period is None else min(period, num_frames)
-    if step == num_frames and context is None:
-        refined = refine_tokens(camera_tokens, frame_mask)
-        return decode_cameras(refined, frame_mask)
+        Args:
+          variables: {"params": …}.
+          camera_tokens: [B, N, 2C], N at least start + size.
+          registers: of N frames, see `project_registers`; None where GCCR is off.
+          refined: [B, N, 2C], the refined tokens of frames before `start`.
+          lengths: int32 [B], the items' numbers of frames.
+          start: first frame of the span.
+          stop: frame after its last, at most start + size.
+          size: static.
 
-    triggers = num_triggers(num_frames, step)
-    lengths = frame_mask.sum(1)
-    # Room for the last trigger's and the last group's full size: slices keep one shape.
-    padding = triggers * step + group - num_frames
-    tokens = jnp.pad(camera_tokens, ((0, 0), (0, padding), (0, 0)))
-    mask = jnp.pad(frame_mask, ((0, 0), (0, padding)))
-    order = jnp.arange(tokens.shape[1])
-    shapes = jax.eval_shape(decode_cameras, tokens[:, :1], mask[:, :1])
-    encodings = jnp.zeros_like(tokens, shape=(*tokens.shape[:2], *shapes.shape[2:]))
+        Returns:
+          `refined` with the span's tokens in their place, and pose encodings [B, size, R, 9] of frames from `start`.
+        """
+        refined = self.refine_span(variables, camera_tokens, registers, refined, lengths, start, stop, size=size)
+        return refined, self.decode_span(variables, refined, lengths, start, stop, size=size)
 
-    def one_trigger(carry: tuple[jax.Array, jax.Array], trigger: jax.Array) -> tuple[tuple[jax.Array, jax.Array], None]:
-        refined, encodings = carry
-        start = trigger * step
-        stop = jnp.minimum(start + step, num_frames)
-        fresh = jax.lax.dynamic_slice_in_dim(tokens, start, step, axis=1)
-        fresh = refine_tokens(fresh, frame_mask & (order[:num_frames] < stop))
-        refined = jax.lax.dynamic_update_slice_in_dim(refined, fresh, start, axis=1)
-        if context is None:
-            decoded = decode_cameras(refined, mask & (order < stop))
-            decoded = jax.lax.dynamic_slice_in_dim(decoded, start, step, axis=1)
-            return (refined, jax.lax.dynamic_update_slice_in_dim(encodings, decoded, start, axis=1)), None
+    def refine_span(
+        self,
+        variables: Variables,
+        camera_tokens: jax.Array,
+        registers: RegisterKeys | None,
+        refined: jax.Array,
+        lengths: jax.Array,
+        start: jax.Array | int,
+        stop: jax.Array | int,
+        *,
+        size: int,
+    ) -> jax.Array:
+        """GCCR's half of `fire`."""
+        fresh = jax.lax.dynamic_slice_in_dim(camera_tokens, start, size, axis=1)
+        if registers is not None:
+            fresh = self.attend_registers(variables, fresh, registers, jnp.minimum(lengths, stop))
+        return jax.lax.dynamic_update_slice_in_dim(refined, fresh, start, axis=1)
 
-        def one_group(encodings: jax.Array, first: jax.Array) -> tuple[jax.Array, None]:
-            last = jnp.minimum(first + group, stop)
-            decoded = decode_group(decode_cameras, refined, lengths, first, last, group=group, context=context)
-            return jax.lax.dynamic_update_slice_in_dim(encodings, decoded, first, axis=1), None
+    def decode_span(
+        self,
+        variables: Variables,
+        refined: jax.Array,
+        lengths: jax.Array,
+        start: jax.Array | int,
+        stop: jax.Array | int,
+        *,
+        size: int,
+    ) -> jax.Array:
+        """The camera head's half of `fire`: over all frames so far, or group by group with a limited context."""
+        group = self.config.windows.stride
+        if self.config.refinement.context is None:
+            decoded = self.decode_cameras(variables, refined, jnp.minimum(lengths, stop))
+            return jax.lax.dynamic_slice_in_dim(decoded, start, size, axis=1)
 
-        firsts = start + group * jnp.arange(-(-step // group))
-        return (refined, jax.lax.scan(one_group, encodings, firsts)[0]), None
+        def one_group(first: jax.Array) -> jax.Array:
+            return self._decode_group(variables, refined, lengths, first, jnp.minimum(first + group, stop))
 
-    (_, encodings), _ = jax.lax.scan(one_trigger, (tokens, encodings), jnp.arange(triggers))
-    return encodings[:, :num_frames]
+        decoded = jax.lax.map(one_group, start + group * jnp.arange(-(-size // group)))
+        decoded = jnp.moveaxis(decoded, 0, 1)
+        return decoded.reshape(decoded.shape[0], -1, *decoded.shape[3:])[:, :size]
+
+    def _decode_group(
+        self, variables: Variables, refined: jax.Array, lengths: jax.Array, start: jax.Array, stop: jax.Array
+    ) -> jax.Array:
+        """Pose encodings [B, s, R, 9] of frames start … stop − 1, at most s of them.
+
+        The trunk sees frame 0 and the `context` frames up to `stop`, or to the item's own end if that comes first.
+        """
+        context = self.config.refinement.context
+        assert context is not None  # decode_span has looked
+        ends = jnp.minimum(stop, lengths)[:, None]
+        oldest = jnp.maximum(ends - context, 0)
+        recent = jnp.take_along_axis(refined, (oldest + jnp.arange(context))[..., None], axis=1, mode="clip")
+        # Frame 0 has a place of its own, the last one, only where the recent frames do not include it.
+        tokens = jnp.concatenate([recent, refined[:, :1]], axis=1)
+        encodings = self.decode_cameras(variables, tokens, jnp.minimum(ends[:, 0], context + 1))
+        places = jnp.clip(start + jnp.arange(self.config.windows.stride) - oldest, 0, context)
+        return jnp.take_along_axis(encodings, places[..., None, None], axis=1)
+
+    # All triggers.
+
+    def refine_sequence(
+        self, variables: Variables, camera_tokens: jax.Array, register_tokens: jax.Array, frame_mask: jax.Array
+    ) -> jax.Array:
+        """Pose encodings [B, T, R, 9] of whole sequences in the configured mode: full, periodic or online.
+
+        Args:
+          variables: {"params": …}.
+          camera_tokens: [B, T, 2C].
+          register_tokens: [B, T, 4, 2C].
+          frame_mask: bool [B, T], True … True False … False.
+        """
+        registers = self.project_registers(variables, register_tokens) if self.config.refinement.enabled else None
+        return self.fire_all(variables, camera_tokens, registers, frame_mask.sum(1))
+
+    def fire_all(
+        self, variables: Variables, camera_tokens: jax.Array, registers: RegisterKeys | None, lengths: jax.Array
+    ) -> jax.Array:
+        """Pose encodings [B, T, R, 9] of sequences whose registers are projected already.
+
+        Args:
+          variables: {"params": …}.
+          camera_tokens: [B, T, 2C].
+          registers: of T frames; None where GCCR is off.
+          lengths: int32 [B], the items' numbers of frames, at most T.
+        """
+        num_frames, period = camera_tokens.shape[1], self.config.refinement.period
+        size = num_frames if period is None else min(period, num_frames)
+        triggers = num_triggers(num_frames, size)
+        # Room for the last trigger's full size: spans keep one shape.
+        padding = triggers * size - num_frames
+        camera_tokens, registers = jax.tree.map(
+            lambda x: jnp.pad(x, [(0, padding if axis == 1 else 0) for axis in range(x.ndim)]),
+            (camera_tokens, registers),
+        )
+
+        def one_trigger(refined: jax.Array, start: jax.Array) -> tuple[jax.Array, jax.Array]:
+            stop = jnp.minimum(start + size, num_frames)
+            return self.fire(variables, camera_tokens, registers, refined, lengths, start, stop, size=size)
+
+        _, encodings = jax.lax.scan(one_trigger, camera_tokens, size * jnp.arange(triggers))
+        encodings = jnp.moveaxis(encodings, 0, 1)
+        return encodings.reshape(encodings.shape[0], -1, *encodings.shape[3:])[:, :num_frames]
+
+    def refine(
+        self,
+        variables: Variables,
+        camera_tokens: jax.Array,
+        register_tokens: jax.Array,
+        camera_mask: jax.Array,
+        register_mask: jax.Array,
+    ) -> jax.Array:
+        """GCCR and camera head over the tokens at hand; see `LogVGGT.refine`."""
+        refined = self.refine_tokens(variables, camera_tokens, register_tokens, register_mask)
+        return self.decode_cameras(variables, refined, camera_mask)
+
+    # The parts of a trigger.
+
+    def refine_tokens(
+        self, variables: Variables, camera_tokens: jax.Array, register_tokens: jax.Array, register_mask: jax.Array
+    ) -> jax.Array:
+        """GCCR alone: [B, N, 2C], [B, M, 4, 2C], bool [B, M] -> [B, N, 2C]; the identity when disabled."""
+        if not self.config.refinement.enabled:
+            return camera_tokens
+        registers, width = self.config.aggregator.num_registers, self._width
+        check_array("camera_tokens", camera_tokens, (None, None, width), jnp.floating)
+        check_array("register_tokens", register_tokens, (len(camera_tokens), None, registers, width), jnp.floating)
+        keys = self.project_registers(variables, register_tokens)
+        return self.attend_registers(variables, camera_tokens, keys, register_mask)
+
+    def project_registers(self, variables: Variables, register_tokens: jax.Array) -> RegisterKeys:
+        """GCCR's keys and values of register tokens [B, M, 4, 2C], frame by frame.
+
+        A stream projects each frame once; over again for every trigger, the cost a frame would grow with the
+        sequence.
+        """
+        width, registers = self._width, self.config.aggregator.num_registers
+        check_array("register_tokens", register_tokens, (None, None, registers, width), jnp.floating)
+        return run(self.gccr, variables["params"]["gccr"], register_tokens, method=GCCR.project)
+
+    def attend_registers(
+        self, variables: Variables, camera_tokens: jax.Array, registers: RegisterKeys, frames: jax.Array
+    ) -> jax.Array:
+        """GCCR after `project_registers`: [B, N, 2C] and M frames' keys and values -> [B, N, 2C].
+
+        `frames` says whose registers count: bool [B, M], or the first so many, int32 [B].
+        """
+        check_array("camera_tokens", camera_tokens, (len(registers.key), None, self._width), jnp.floating)
+        if frames.ndim != 1:
+            check_array("register_mask", frames, registers.key.shape[:2], jnp.bool_)
+        return run(self.gccr, variables["params"]["gccr"], camera_tokens, registers, frames, method=GCCR.attend)
+
+    def decode_cameras(self, variables: Variables, camera_tokens: jax.Array, frames: jax.Array) -> jax.Array:
+        """Camera head alone: refined tokens [B, N, 2C] -> pose encodings [B, N, R, 9].
+
+        `frames` says which of them count: bool [B, N], or the first so many, int32 [B].
+        """
+        check_array("camera_tokens", camera_tokens, (None, None, self._width), jnp.floating)
+        if frames.ndim != 1:
+            check_array("camera_mask", frames, camera_tokens.shape[:2], jnp.bool_)
+        return run(self.camera_head, variables["params"]["camera_head"], camera_tokens, frames)
+
+    @property
+    def camera_head(self) -> CameraHead:
+        return CameraHead(self.config.camera_head, self.config.attention)
+
+    @property
+    def gccr(self) -> GCCR:
+        return GCCR(self._width, self.config.refinement.num_heads, self.config.dtype, self.config.attention)
+
+    @property
+    def _width(self) -> int:
+        return 2 * self.config.encoder.embed_dim

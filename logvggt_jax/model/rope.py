@@ -10,36 +10,39 @@ import numpy as np
 
 
 class RopeTable(NamedTuple):
-    """Cosines and sines, float32 [tokens, head_dim / 4] for each of y and x."""
+    """Cosines and sines of one frame's tokens, float32 [P, head_dim / 4] for each of y and x."""
 
-    cos_y: np.ndarray
-    sin_y: np.ndarray
-    cos_x: np.ndarray
-    sin_x: np.ndarray
-
-    def tile(self, frames: int) -> RopeTable:
-        """The table of `frames` frames one after the other: positions know the frame's inside only."""
-        return RopeTable(*(np.tile(part, (frames, 1)) for part in self))
+    cos_y: jax.Array
+    sin_y: jax.Array
+    cos_x: jax.Array
+    sin_x: jax.Array
 
 
-def rope_table(positions: np.ndarray, head_dim: int, base: float) -> RopeTable:
-    """Table for integer positions [tokens, 2] (y, x); position 0 is not rotated."""
+def rope_table(grid: tuple[int, int], num_special: int, head_dim: int, base: float) -> RopeTable:
+    """The table of a frame's tokens: special tokens at position (0, 0), patch (row, column) at (row+1, column+1).
+
+    Position 0 is not rotated. The program holds one row a grid line and spreads it over the grid by itself.
+    """
     frequencies = base ** -(np.arange(head_dim // 4, dtype=np.float32) * np.float32(4.0 / head_dim))
-    angles = positions.astype(np.float32)[:, :, None] * frequencies.astype(np.float32)
-    cos, sin = np.cos(angles), np.sin(angles)
-    return RopeTable(cos[:, 0], sin[:, 0], cos[:, 1], sin[:, 1])
 
+    def spread(axis: int, wave: np.ufunc) -> jax.Array:
+        angles = np.arange(1, grid[axis] + 1, dtype=np.float32)[:, None] * frequencies.astype(np.float32)
+        lines = jnp.asarray(wave(angles))
+        patches = jnp.broadcast_to(jnp.expand_dims(lines, 1 - axis), (*grid, len(frequencies)))
+        special = jnp.full((num_special, len(frequencies)), wave(np.float32(0.0)))
+        return jnp.concatenate([special, patches.reshape(-1, len(frequencies))])
 
-def frame_positions(grid: tuple[int, int], num_special: int) -> np.ndarray:
-    """Positions [P, 2] of one frame's tokens: special tokens at (0, 0), patch (row, column) at (row+1, column+1)."""
-    rows, columns = np.meshgrid(np.arange(grid[0]), np.arange(grid[1]), indexing="ij")
-    patches = np.stack([rows.ravel(), columns.ravel()], axis=-1) + 1
-    return np.concatenate([np.zeros((num_special, 2), patches.dtype), patches])
+    return RopeTable(spread(0, np.cos), spread(0, np.sin), spread(1, np.cos), spread(1, np.sin))
 
 
 def apply_rope(tokens: jax.Array, table: RopeTable) -> jax.Array:
-    """Rotates queries or keys [B, tokens, heads, head_dim] in float32; returns their dtype."""
-    y1, y2, x1, x2 = jnp.split(tokens.astype(jnp.float32), 4, axis=-1)
+    """Rotates queries or keys [B, n · P, heads, head_dim] of n frames in float32; returns their dtype.
+
+    Positions know the inside of a frame only: every frame is rotated alike.
+    """
+    batch, length, heads, head_dim = tokens.shape
+    frames = tokens.astype(jnp.float32).reshape(batch, -1, len(table.cos_y), heads, head_dim)
+    y1, y2, x1, x2 = jnp.split(frames, 4, axis=-1)
     cos_y, sin_y, cos_x, sin_x = (part[:, None, :] for part in table)
     rotated = jnp.concatenate(
         [
@@ -50,4 +53,4 @@ def apply_rope(tokens: jax.Array, table: RopeTable) -> jax.Array:
         ],
         axis=-1,
     )
-    return rotated.astype(tokens.dtype)
+    return rotated.reshape(batch, length, heads, head_dim).astype(tokens.dtype)

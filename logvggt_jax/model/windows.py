@@ -1,9 +1,29 @@
-"""Overlapping windows: index arithmetic and the state that one window hands to the next."""
+"""Overlapping windows: index arithmetic, the state that one window hands to the next, and the loop over them."""
 
 from __future__ import annotations
 
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any
+
 import jax
+import jax.numpy as jnp
 from flax import struct
+from jax.ad_checkpoint import checkpoint_name
+
+from logvggt_jax.config import ModelConfig
+from logvggt_jax.model.aggregator import Aggregator, WindowTokens
+from logvggt_jax.model.checks import check_images, checked_mask
+from logvggt_jax.model.cross_window import CrossWindowMemory
+from logvggt_jax.model.dinov2 import DinoV2
+from logvggt_jax.model.dpt_head import DPTHead, depth_activation, point_activation
+from logvggt_jax.model.parameters import Variables, run
+from logvggt_jax.types import WindowOutput
+
+_PATCH_TOKENS = "patch_tokens"
+# Pixels that a dense head takes at once, about 8 frames of 518 x 518: its maps are the model's largest.
+_DENSE_PIXELS = 8 * 518 * 518
 
 
 @struct.dataclass
@@ -43,3 +63,308 @@ def kept_window(frame: int, num_frames: int, size: int, stride: int) -> int:
 def first_window(frame: int, size: int, stride: int) -> int:
     """The first window that holds `frame`."""
     return max(0, -(-(frame - size + 1) // stride))
+
+
+@dataclasses.dataclass(frozen=True)
+class Windows:
+    """Encoder, aggregator and dense heads over K frames at a time; pure functions of parameters and arrays.
+
+    `start`, `step` and `finish` take a stream group by group, `scan` a whole sequence at once, with the same step.
+    """
+
+    config: ModelConfig
+
+    # A stream.
+
+    def start(self, variables: Variables, frames: jax.Array, frame_mask: jax.Array | None = None) -> WindowState:
+        """The state of a stream before its first window.
+
+        Args:
+          variables: {"params": …}.
+          frames: the first K − s frames [B, K − s, H, W, 3]; fewer are padded and masked.
+          frame_mask: bool [B, K − s], False for padding.
+        """
+        config, overlap = self.config, self.overlap
+        frame_mask = self._checked_group(frames, frame_mask, overlap, "start")
+        batch, image_size = frames.shape[0], _image_size(frames)
+        width, registers = config.encoder.embed_dim, config.aggregator.num_registers
+        patch_tokens = self.encode(variables, frames)
+        tokens = patch_tokens.shape[2] + 1 + registers
+        key_shape = (batch, len(config.aggregator.key_layers), overlap, tokens, 2 * width)
+        return WindowState(
+            patch_tokens=patch_tokens,
+            key_tokens=jnp.zeros(key_shape, config.dtype),
+            special_tokens=jnp.zeros((batch, overlap, 1 + registers, 2 * width), jnp.float32),
+            frame_mask=frame_mask,
+            image_size=image_size,
+            step=jnp.zeros((batch,), jnp.int32),
+        )
+
+    def step(
+        self,
+        variables: Variables,
+        state: WindowState,
+        frames: jax.Array,
+        frame_mask: jax.Array | None = None,
+    ) -> tuple[WindowState, WindowOutput]:
+        """Runs the window that s new frames complete; its s oldest frames become final.
+
+        Args:
+          variables: {"params": …}.
+          state: from `start` or the step before; may be donated.
+          frames: s new frames [B, s, H, W, 3]; a short tail is padded and masked.
+          frame_mask: bool [B, s], False for padding. An item whose new frames are all padding has ended: it only
+            hands out what it still holds.
+        """
+        stride = self.config.windows.stride
+        frame_mask = self._checked_group(frames, frame_mask, stride, "step")
+        image_size = _image_size(frames)
+        if (len(state.step), *state.image_size) != (len(frames), *image_size):
+            raise ValueError(
+                f"step continues a stream of {len(state.step)} x {state.image_size} images (batch, height and width), "
+                f"got {len(frames)} x {image_size}; start a new stream for other shapes"
+            )
+        patch_tokens = jnp.concatenate([state.patch_tokens, self.encode(variables, frames)], axis=1)
+        window_mask = jnp.concatenate([state.frame_mask, frame_mask], axis=1)
+        window = self.attend(variables, state, patch_tokens, window_mask)
+        # An item that has ended shifts its held frames out instead.
+        active = (state.step == 0) | frame_mask.any(1)
+        key_tokens = _select(active, window.key, _shift_in(state.key_tokens, stride, axis=2))
+        special_tokens = _select(active, window.special, _shift_in(state.special_tokens, stride, axis=1))
+        window_mask = _select(active, window_mask, _shift_in(state.frame_mask, stride, axis=1))
+        out = self.decode_dense(
+            variables,
+            WindowTokens(key_tokens[:, :, :stride], special_tokens[:, :stride]),
+            window_mask[:, :stride],
+            image_size,
+        )
+        state = WindowState(
+            patch_tokens=patch_tokens[:, stride:],
+            key_tokens=key_tokens[:, :, stride:],
+            special_tokens=special_tokens[:, stride:],
+            frame_mask=window_mask[:, stride:],
+            image_size=image_size,
+            step=state.step + 1,
+        )
+        return state, out
+
+    def finish(self, variables: Variables, state: WindowState) -> WindowOutput:
+        """The K − s frames that the last window still holds."""
+        held = WindowTokens(state.key_tokens, state.special_tokens)
+        return self.decode_dense(variables, held, state.frame_mask, state.image_size)
+
+    # A whole sequence.
+
+    def scan(
+        self,
+        variables: Variables,
+        images: jax.Array,
+        frame_mask: jax.Array | None = None,
+        *,
+        remat: bool = False,
+    ) -> WindowOutput:
+        """All windows of sequences [B, T, H, W, 3] as one scan over `step`.
+
+        Args:
+          variables: {"params": …}.
+          images: [B, T, H, W, 3].
+          frame_mask: bool [B, T]; None for all frames.
+          remat: see `LogVGGT.apply`.
+        """
+        check_images(images, self.config.encoder.patch_size)
+        frame_mask = None if frame_mask is None else checked_mask(images, frame_mask)
+        num_frames, stride, overlap = images.shape[1], self.config.windows.stride, self.overlap
+
+        def frames_from(first: jax.Array | int, count: int) -> tuple[jax.Array, jax.Array]:
+            # A short tail repeats the last frame, masked, instead of padding a copy of all images.
+            index = first + jnp.arange(count)
+            clipped = jnp.minimum(index, num_frames - 1)
+            frames = jnp.take(images, clipped, axis=1)
+            mask = jnp.broadcast_to(index < num_frames, frames.shape[:2])
+            return frames, mask if frame_mask is None else mask & jnp.take(frame_mask, clipped, axis=1)
+
+        def advance(state: WindowState, window: jax.Array) -> tuple[WindowState, WindowOutput]:
+            frames, mask = frames_from(window * stride + overlap, stride)
+            return self.step(variables, state, frames, mask)
+
+        if remat:
+            # All but the encoder's result, without which a frozen encoder would run twice.
+            keep = jax.checkpoint_policies.save_only_these_names(_PATCH_TOKENS)
+            advance = jax.checkpoint(advance, prevent_cse=False, policy=keep)
+
+        windows = num_windows(num_frames, self.config.windows.size, stride)
+        state = self.start(variables, *frames_from(0, overlap))
+        # Outputs live in buffers that the scan updates in place: stacked ones would be copied to put B first.
+        padded = windows * stride + overlap
+        one_step = jax.eval_shape(advance, state, jnp.int32(0))[1]
+        buffers = jax.tree.map(lambda x: jnp.zeros((x.shape[0], padded, *x.shape[2:]), x.dtype), one_step)
+
+        def write(buffers: WindowOutput, out: WindowOutput, first: jax.Array | int) -> WindowOutput:
+            return jax.tree.map(
+                lambda buffer, x: jax.lax.dynamic_update_slice_in_dim(buffer, x, first, axis=1), buffers, out
+            )
+
+        def body(
+            carry: tuple[WindowState, WindowOutput, jax.Array], _: None
+        ) -> tuple[tuple[WindowState, WindowOutput, jax.Array], None]:
+            state, buffers, window = carry
+            state, out = advance(state, window)
+            return (state, write(buffers, out, window * stride), window + 1), None
+
+        (state, buffers, _), _ = jax.lax.scan(body, (state, buffers, jnp.int32(0)), length=windows)
+        buffers = write(buffers, self.finish(variables, state), windows * stride)
+        return jax.tree.map(lambda x: x[:, :num_frames], buffers)
+
+    # The parts of a step.
+
+    def encode(self, variables: Variables, images: jax.Array) -> jax.Array:
+        """Patch tokens [B, n, h * w, C] float32 of images [B, n, H, W, 3]; frames are independent."""
+        params = variables["params"]["encoder"]
+        if self.config.encoder.frozen:
+            # At the source: nothing of the encoder's pass is then kept for a backward pass.
+            params = jax.lax.stop_gradient(params)
+        pixels = jnp.asarray(images, jnp.float32) / (255.0 if images.dtype == jnp.uint8 else 1.0)
+        tokens = run(self.encoder, params, pixels.reshape(-1, *images.shape[2:]))
+        return checkpoint_name(tokens.reshape(*images.shape[:2], *tokens.shape[1:]), _PATCH_TOKENS)
+
+    def attend(
+        self, variables: Variables, state: WindowState, patch_tokens: jax.Array, window_mask: jax.Array
+    ) -> WindowTokens:
+        """All attention blocks over one window.
+
+        Args:
+          variables: {"params": …}.
+          state: of the stream before the window, whose cache the key layers see.
+          patch_tokens: [B, K, h * w, C] of the window's frames.
+          window_mask: bool [B, K], True … True False … False.
+        """
+        is_first = state.step == 0
+        params = variables["params"]["aggregator"]
+        tokens, _ = run(
+            self.aggregator,
+            params,
+            patch_tokens,
+            window_mask.sum(1),
+            is_first,
+            self._memory(state),
+            grid=self.grid(state.image_size),
+        )
+        return tokens
+
+    def decode_dense(
+        self, variables: Variables, tokens: WindowTokens, frame_mask: jax.Array, image_size: tuple[int, int]
+    ) -> WindowOutput:
+        """Dense heads over the tokens of n frames, which are independent.
+
+        Args:
+          variables: {"params": …}.
+          tokens: key [B, key layers, n, P, 2C], special [B, n, 5, 2C].
+          frame_mask: bool [B, n], handed on.
+          image_size: (H, W).
+        """
+        params, grid = variables["params"], self.grid(image_size)
+        batch, num_levels, count = tokens.key.shape[:3]
+        patches = tokens.key[..., 1 + self.config.aggregator.num_registers :, :]
+        levels = [patches[:, i].reshape(batch * count, *patches.shape[3:]) for i in range(num_levels)]
+
+        def dense(head: DPTHead, name: str) -> jax.Array:
+            def frames(levels: list[jax.Array]) -> jax.Array:
+                return run(head, params[name], levels, grid=grid, image_size=image_size)
+
+            raw = _in_groups(frames, levels, max(1, _DENSE_PIXELS // math.prod(image_size)))
+            return raw.reshape(batch, count, *raw.shape[1:])
+
+        depth, depth_confidence = depth_activation(dense(self.depth_head, "depth_head"))
+        points = points_confidence = None
+        if self.config.point_head is not None:
+            points, points_confidence = point_activation(dense(self.point_head, "point_head"))
+        return WindowOutput(
+            depth=depth,
+            depth_confidence=depth_confidence,
+            camera_tokens=tokens.special[:, :, 0],
+            register_tokens=tokens.special[:, :, 1:],
+            frame_mask=frame_mask,
+            points=points,
+            points_confidence=points_confidence,
+        )
+
+    # Modules and sizes.
+
+    @property
+    def encoder(self) -> DinoV2:
+        return DinoV2(self.config.encoder, self.config.dtype, self.config.attention)
+
+    @property
+    def aggregator(self) -> Aggregator:
+        return Aggregator(self.config)
+
+    @property
+    def depth_head(self) -> DPTHead:
+        return DPTHead(self.config.depth_head, 2, self.config.dtype)
+
+    @property
+    def point_head(self) -> DPTHead:
+        if self.config.point_head is None:
+            raise ValueError("this model has no point head: set ModelConfig.point_head")
+        return DPTHead(self.config.point_head, 4, self.config.dtype)
+
+    @property
+    def overlap(self) -> int:
+        """F = K − s, the frames that neighbouring windows share."""
+        return self.config.windows.size - self.config.windows.stride
+
+    def grid(self, image_size: tuple[int, int]) -> tuple[int, int]:
+        """(h, w) patches of images of (H, W) pixels."""
+        patch = self.config.encoder.patch_size
+        return image_size[0] // patch, image_size[1] // patch
+
+    def _memory(self, state: WindowState) -> CrossWindowMemory:
+        """What the key layers see of the window before; before the first window nothing."""
+        windows, width = self.config.windows, self.config.encoder.embed_dim
+        # Key tokens hold the frame block's output, which is the global block's input, before that block's output.
+        half = slice(width, None) if windows.cache == "output" else slice(None, width)
+        return CrossWindowMemory(
+            state.key_tokens[..., half],
+            jnp.where(state.step == 0, 0, state.frame_mask.sum(1)),
+            self.config.aggregator.key_layers if windows.cross_window else (),
+        )
+
+    def _checked_group(self, frames: jax.Array, mask: jax.Array | None, count: int, name: str) -> jax.Array:
+        """The mask bool [B, count] of a call of `start` or `step`, after a check of both."""
+        check_images(frames, self.config.encoder.patch_size, f"frames of {name}")
+        if frames.shape[1] != count:
+            raise ValueError(
+                f"{name} takes {count} frames [B, {count}, H, W, 3], got {frames.shape[1]}; pad them and pass "
+                "frame_mask"
+            )
+        return checked_mask(frames, mask)
+
+
+def _in_groups(function: Callable[[Any], jax.Array], inputs: Any, at_most: int) -> jax.Array:
+    """`function` of arrays [N, ...] that it treats item by item, at most so many items at a time."""
+    count = len(jax.tree.leaves(inputs)[0])
+    groups = -(-count // at_most)
+    if groups == 1:
+        return function(inputs)
+    size = -(-count // groups)
+
+    def split(x: jax.Array) -> jax.Array:
+        x = jnp.pad(x, [(0, groups * size - count), *[(0, 0)] * (x.ndim - 1)])
+        return x.reshape(groups, size, *x.shape[1:])
+
+    out = jax.lax.map(function, jax.tree.map(split, inputs))
+    return out.reshape(groups * size, *out.shape[2:])[:count]
+
+
+def _image_size(images: jax.Array) -> tuple[int, int]:
+    return images.shape[2], images.shape[3]
+
+
+def _shift_in(held: jax.Array, padding: int, *, axis: int) -> jax.Array:
+    """`held` followed by `padding` empty frames."""
+    return jnp.pad(held, [(0, padding if i == axis else 0) for i in range(held.ndim)])
+
+
+def _select(active: jax.Array, when_active: jax.Array, otherwise: jax.Array) -> jax.Array:
+    """Chooses per batch item; `active` bool [B]."""
+    return jnp.where(active.reshape(-1, *(1,) * (when_active.ndim - 1)), when_active, otherwise)

@@ -1,17 +1,16 @@
 """From frames on disk to results on disk: sources, reconstructions, the viewer."""
 
+from logvggt_jax.reconstruction.cameras_file import read_cameras, write_cameras
 from logvggt_jax.reconstruction.depth_files import read_depth, write_depth
-from logvggt_jax.reconstruction.point_cloud import PointFilter, write_point_cloud
-from logvggt_jax.reconstruction.reconstruct import Reconstruction, reconstruct
+from logvggt_jax.reconstruction.exporters import EXPORTERS
+from logvggt_jax.reconstruction.exporters.tum import read_trajectory, write_trajectory
+from logvggt_jax.reconstruction.point_cloud import PointFilter
+from logvggt_jax.reconstruction.reconstruct import reconstruct
+from logvggt_jax.reconstruction.result import Reconstruction
 from logvggt_jax.reconstruction.sources import FolderSource, SourceFrame, VideoSource, open_source
-from logvggt_jax.reconstruction.trajectory_files import (
-    read_cameras,
-    read_trajectory,
-    write_cameras,
-    write_trajectory,
-)
 
 __all__ = [
+    "EXPORTERS",
     "FolderSource",
     "PointFilter",
     "Reconstruction",
@@ -24,6 +23,5 @@ __all__ = [
     "reconstruct",
     "write_cameras",
     "write_depth",
-    "write_point_cloud",
     "write_trajectory",
 ]

@@ -1,12 +1,15 @@
-"""Depth maps on disk, one file a frame, and pictures of them."""
+"""Depth maps and images on disk, one file a frame, and pictures of depth."""
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 
 import cv2
 import numpy as np
+from PIL import Image
 
+from logvggt_jax.errors import InputError, MissingInput, disk_errors, one_line
 from logvggt_jax.files import atomic_file
 
 
@@ -24,14 +27,18 @@ def write_depth(path: str | Path, depth: np.ndarray, confidence: np.ndarray) -> 
 
     Depth is z-depth in the unit of the trajectory, confidence is at least 1.
     """
-    with atomic_file(Path(path)) as temporary, temporary.open("wb") as stream:
-        np.savez(stream, depth=_half(depth), confidence=_half(confidence))
+    with atomic_file(path) as temporary:
+        np.savez(temporary, depth=_half(depth), confidence=_half(confidence))
 
 
 def read_depth(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     """Depth and confidence, [H, W] float32, of a file that `write_depth` has written."""
-    with np.load(path, allow_pickle=False) as arrays:
-        return arrays["depth"].astype(np.float32), arrays["confidence"].astype(np.float32)
+    with disk_errors(path), Path(path).open("rb") as stream:
+        try:
+            with np.load(stream, allow_pickle=False) as arrays:
+                return arrays["depth"].astype(np.float32), arrays["confidence"].astype(np.float32)
+        except (zipfile.BadZipFile, EOFError, KeyError, ValueError, TypeError) as error:
+            raise InputError(f"{path}: no depth file of this program, or damaged: {one_line(error)}") from error
 
 
 def depth_picture(depth: np.ndarray, *, near: float, far: float) -> np.ndarray:
@@ -49,8 +56,30 @@ def write_picture(path: str | Path, image: np.ndarray) -> None:
     encoded, buffer = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
     if not encoded:
         raise ValueError(f"{path}: an image of shape {image.shape} cannot be encoded as PNG")
-    with atomic_file(Path(path)) as temporary:
+    with atomic_file(path) as temporary:
         temporary.write_bytes(buffer.tobytes())
+
+
+def write_jpeg(path: str | Path, image: np.ndarray) -> None:
+    """Writes an RGB image [H, W, 3] uint8 as JPEG, at a quality that keeps every pixel to a few grey levels."""
+    with atomic_file(path) as temporary:
+        Image.fromarray(image).save(temporary, quality=95, subsampling=0)
+
+
+def read_picture(path: str | Path) -> np.ndarray:
+    """An image file as [H, W, 3] uint8 RGB.
+
+    Raises:
+      MissingInput: no such file.
+      InputError: it is no picture, or damaged.
+    """
+    try:
+        with Path(path).open("rb") as stream, Image.open(stream) as picture:
+            return np.asarray(picture.convert("RGB"))
+    except FileNotFoundError as error:
+        raise MissingInput(f"{path} does not exist: expected the output of `logvggt reconstruct`") from error
+    except (OSError, SyntaxError) as error:  # what Pillow raises for damaged pictures
+        raise InputError(f"{path}: cannot be read as a picture ({one_line(error)}); reconstruct again") from error
 
 
 def _half(values: np.ndarray) -> np.ndarray:

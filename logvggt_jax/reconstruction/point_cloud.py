@@ -1,22 +1,30 @@
 """Coloured point clouds from depth maps, chosen and written frame by frame at constant memory.
 
-Two passes. The first sees depth and confidence of every frame as it becomes final and counts, in a histogram of
-confidences, the points that qualify; then the threshold and the exact number of points are known. The second,
-when poses are final, unprojects and writes frame by frame.
+Two passes. The first sees depth and confidence of every frame and counts, in a histogram of confidences, the points
+that qualify; then the threshold and the exact number of points are known. The second unprojects and writes frame by
+frame.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 
+from logvggt_jax.errors import InputError, MissingInput, disk_errors
 from logvggt_jax.files import atomic_file
 from logvggt_jax.geometry import unproject
 
 VERTEX = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")])
+
+_HEADER = (
+    "ply\nformat binary_little_endian 1.0\nelement vertex {count}\n"
+    + "".join(f"property {'float' if VERTEX[name] == np.float32 else 'uchar'} {name}\n" for name in VERTEX.names or ())
+    + "end_header\n"
+)
 
 # Bins of log(confidence - 1): 0.5 % wide, from a pixel that the model is certain about to one it knows nothing of.
 _BIN_EDGES = np.linspace(-20.0, 20.0, 8001)
@@ -41,13 +49,13 @@ class PointFilter:
 
     def __post_init__(self) -> None:
         if not 0 <= self.confidence_percentile < 100:
-            raise ValueError(f"confidence_percentile must be in [0, 100), got {self.confidence_percentile}")
+            raise InputError(f"confidence_percentile must be in [0, 100), got {self.confidence_percentile}")
         if self.edge_threshold is not None and not self.edge_threshold > 0:
-            raise ValueError(f"edge_threshold must be above 0, got {self.edge_threshold}")
+            raise InputError(f"edge_threshold must be above 0, got {self.edge_threshold}")
         if self.pixel_stride < 1:
-            raise ValueError(f"pixel_stride must be at least 1 pixel, got {self.pixel_stride}")
+            raise InputError(f"pixel_stride must be at least 1 pixel, got {self.pixel_stride}")
         if self.max_points is not None and self.max_points < 1:
-            raise ValueError(f"max_points must be at least 1, got {self.max_points}")
+            raise InputError(f"max_points must be at least 1, got {self.max_points}")
 
     def candidates(self, depth: np.ndarray, confidence: np.ndarray) -> np.ndarray:
         """Pixels of a depth map [H, W] that may become points, whatever the threshold; bool [H, W]."""
@@ -134,32 +142,57 @@ def frame_vertices(
     return vertices
 
 
-def write_point_cloud(path: str | Path, frames: Iterable[np.ndarray]) -> int:
-    """Writes vertices, chunk by chunk, as a binary PLY file; returns their number.
+def write_points(path: str | Path, count: int, frames: Iterable[np.ndarray]) -> None:
+    """Writes `count` vertices, frame by frame, as a binary PLY file.
 
     Args:
       path: the PLY file.
+      count: of all vertices.
       frames: arrays [n] of dtype `VERTEX`; each is written before the next is asked for.
-    """
-    from plyfile import PlyData, PlyElement
 
-    path = Path(path)
-    raw = path.with_name(f".{path.name}.vertices")
-    try:
-        count = 0
-        with raw.open("wb") as stream:
-            for vertices in frames:
-                stream.write(vertices.astype(VERTEX, copy=False).tobytes())
-                count += len(vertices)
-        # The header names the number of points, so that it can be written only now; a memory map hands the
-        # points from one file to the other without holding them.
-        stored = np.memmap(raw, VERTEX, mode="r", shape=(count,)) if count else np.empty(0, VERTEX)
-        element = PlyElement.describe(stored, "vertex")
-        with atomic_file(path) as temporary:
-            PlyData([element], byte_order="<").write(str(temporary))
-        return count
-    finally:
-        raw.unlink(missing_ok=True)
+    Raises:
+      ValueError: `frames` hold another number of vertices.
+    """
+    written = 0
+    with atomic_file(path) as temporary, temporary.open("wb") as stream:
+        stream.write(_HEADER.format(count=count).encode())
+        for vertices in frames:
+            stream.write(vertices.astype(VERTEX, copy=False).tobytes())
+            written += len(vertices)
+        if written != count:
+            raise ValueError(f"{path}: {count} vertices announced, {written} given")
+
+
+def count_points(path: str | Path) -> int:
+    """The number of vertices of a file that `write_points` has written, read from its header.
+
+    Raises:
+      MissingInput: no such file.
+      InputError: it is another file, or cut off.
+    """
+    return len(_stored_points(Path(path)))
+
+
+def read_points(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
+    """Points [M, 3] float32 and colours [M, 3] uint8 of such a file; errors as `count_points`."""
+    vertices = _stored_points(Path(path))
+    points = np.stack([vertices[name] for name in "xyz"], axis=-1)
+    return points, np.stack([vertices[name] for name in ("red", "green", "blue")], axis=-1)
+
+
+def _stored_points(path: Path) -> np.ndarray:
+    """The vertices [M] of a file, mapped and not read."""
+    if not path.is_file():
+        raise MissingInput(f"{path} does not exist: expected the output of `logvggt reconstruct`")
+    with disk_errors(path), path.open("rb") as stream:
+        start = stream.read(2 * len(_HEADER))
+    match = re.search(rb"element vertex (\d+)\n", start)
+    count = int(match[1]) if match else 0
+    header = _HEADER.format(count=count).encode()
+    size = len(header) + count * VERTEX.itemsize
+    if not start.startswith(header) or path.stat().st_size != size:
+        raise InputError(f"{path} is not a point cloud of this program, or is cut off; reconstruct again")
+    return np.memmap(path, VERTEX, "r", len(header), (count,)) if count else np.empty(0, VERTEX)
 
 
 def _confidence_bin(confidence: np.ndarray) -> np.ndarray:

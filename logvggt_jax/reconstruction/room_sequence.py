@@ -9,7 +9,8 @@ import numpy as np
 from rich.progress import track
 
 from logvggt_jax.data.rooms.rooms import Rooms
-from logvggt_jax.files import output_folder
+from logvggt_jax.errors import disk_errors
+from logvggt_jax.files import atomic_folder, check_output
 from logvggt_jax.geometry import invert
 from logvggt_jax.reconstruction.depth_files import write_picture
 
@@ -51,7 +52,8 @@ def write_room_sequence(
     height, width = image_size
     rooms = Rooms(split, height=height, width=width, num_frames=num_frames, num_rooms=1, seed=seed)
     sequence = rooms.sequences[0]
-    with output_folder(output, overwrite=overwrite, marker=INTRINSICS_FILE) as folder:
+    target = check_output(output, overwrite=overwrite, marker=INTRINSICS_FILE)
+    with atomic_folder(target, replace=overwrite) as folder, disk_errors(target):
         steps = track(range(num_frames), description=f"Rendering {sequence}", disable=not progress)
         for index in steps:
             frames = rooms.read(sequence, [index])

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from logvggt_jax.data.formats.image import read_rgb
+from logvggt_jax.errors import InputError, MissingInput, disk_errors
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 SEVEN_SCENES_COLOUR = (".color.png", ".color.jpg")
@@ -54,10 +55,11 @@ class FolderSource:
     def __init__(self, path: Path, *, stride: int = 1, max_frames: int | None = None) -> None:
         _check_sampling(stride, max_frames)
         self.path = path
-        files = [file for file in path.iterdir() if file.is_file() and not file.name.startswith(".")]
+        with disk_errors(path):
+            files = [file for file in path.iterdir() if file.is_file() and not file.name.startswith(".")]
         images = [file for file in files if file.suffix.lower() in IMAGE_SUFFIXES]
         if not images:
-            raise FileNotFoundError(
+            raise MissingInput(
                 f"no image in {path}: expected {', '.join('*' + s for s in IMAGE_SUFFIXES)} files, found "
                 f"{len(files)} other files; give the folder that holds the images themselves"
             )
@@ -83,10 +85,11 @@ class FolderSource:
     def __iter__(self) -> Iterator[SourceFrame]:
         first: tuple[Path, tuple[int, ...]] | None = None
         for timestamp, name, file in self._frames:
-            image = read_rgb(file)
+            with disk_errors(file):
+                image = read_rgb(file)
             first = first or (file, image.shape)
             if image.shape != first[1]:
-                raise ValueError(
+                raise InputError(
                     f"{file} is {_size(image.shape)} pixels but {first[0].name} is {_size(first[1])}: all frames "
                     "of a sequence need one size; resize them or put them into folders of their own"
                 )
@@ -136,7 +139,7 @@ class VideoSource:
                 if position % self._stride == 0:
                     decoded, image = capture.retrieve()
                     if not decoded:
-                        raise ValueError(f"{self.path}: frame {position} cannot be decoded; re-encode the video")
+                        raise InputError(f"{self.path}: frame {position} cannot be decoded; re-encode the video")
                     rgb = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
                     yield SourceFrame(f"frame-{position:06d}", position / self._rate, rgb)
                     taken += 1
@@ -147,7 +150,7 @@ class VideoSource:
     def _open(self) -> cv2.VideoCapture:
         capture = cv2.VideoCapture(str(self.path))
         if not capture.isOpened():
-            raise ValueError(
+            raise InputError(
                 f"{self.path} cannot be opened as a video: expected a file that OpenCV decodes (mp4, avi, mkv, "
                 "webm, …) or a folder of images; re-encode it, for example to H.264 mp4"
             )
@@ -155,7 +158,7 @@ class VideoSource:
 
     def _check_end(self, decoded: int) -> None:
         if decoded == 0:
-            raise ValueError(f"{self.path} holds no frame that can be decoded; re-encode the video")
+            raise InputError(f"{self.path} holds no frame that can be decoded; re-encode the video")
         # Headers are often off by a frame or two; more is missing when a file is damaged or cut short.
         if decoded < 0.99 * self._announced - 2:
             warnings.warn(
@@ -181,11 +184,11 @@ def open_source(path: str | Path, *, stride: int = 1, max_frames: int | None = N
     """
     path = Path(path).expanduser()
     if not path.exists():
-        raise FileNotFoundError(f"{path} does not exist: expected a folder of images or a video file")
+        raise MissingInput(f"{path} does not exist: expected a folder of images or a video file")
     if path.is_dir():
         return FolderSource(path, stride=stride, max_frames=max_frames)
     if path.suffix.lower() in IMAGE_SUFFIXES:
-        raise ValueError(f"{path} is a single image: give the folder that holds the sequence, or a video")
+        raise InputError(f"{path} is a single image: give the folder that holds the sequence, or a video")
     return VideoSource(path, stride=stride, max_frames=max_frames)
 
 
@@ -200,9 +203,9 @@ def read_ahead(items: Iterator[Item]) -> Iterator[Item]:
 
 def _check_sampling(stride: int, max_frames: int | None) -> None:
     if stride < 1:
-        raise ValueError(f"stride must be at least 1, got {stride}")
+        raise InputError(f"stride must be at least 1, got {stride}")
     if max_frames is not None and max_frames < 1:
-        raise ValueError(f"max_frames must be at least 1, got {max_frames}")
+        raise InputError(f"max_frames must be at least 1, got {max_frames}")
 
 
 def _natural_order(file: Path) -> tuple[list[tuple[int, int, str]], str]:

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from logvggt_jax.errors import MissingPackage
 from logvggt_jax.geometry import camera_centres, matrix_to_quaternion
-from logvggt_jax.reconstruction.reconstruct import CAMERAS_FILE, POINTS_FILE
-from logvggt_jax.reconstruction.trajectory_files import read_cameras
+from logvggt_jax.reconstruction.result import Reconstruction
 
 HOST = "127.0.0.1"
 
@@ -23,30 +23,27 @@ def open_viewer(folder: str | Path, *, port: int = 8080) -> Any:
       port: of the web page; the next free one is taken if it is in use.
 
     Raises:
-      FileNotFoundError: `folder` holds no reconstruction.
-      ImportError: viser is not installed.
+      InputError: `folder` holds no reconstruction.
+      MissingPackage: viser is not installed.
     """
-    folder = Path(folder)
-    cameras = read_cameras(folder / CAMERAS_FILE)
-    points, colours = read_points(folder / POINTS_FILE)
+    result = Reconstruction.open(folder)
+    points, colours = result.points()
     try:
         import viser
     except ImportError as error:
-        raise ImportError('the viewer needs viser: pip install "logvggt-jax[viewer]"') from error
+        raise MissingPackage('the viewer needs viser: pip install "logvggt-jax[viewer]"') from error
 
-    extrinsics = np.stack([frame["extrinsics"] for frame in cameras["frames"]])
-    centres = camera_centres(extrinsics)
+    centres = camera_centres(result.extrinsics)
     span = float(np.ptp(np.concatenate([centres, points[:: max(1, len(points) // 10_000)]]), axis=0).max())
     server = viser.ViserServer(host=HOST, port=port, verbose=False)
     server.scene.set_up_direction("-y")
     server.scene.add_point_cloud("/points", points, colours, point_size=span / 1000)
-    height, width = cameras["image_size"]
-    quaternions = matrix_to_quaternion(np.swapaxes(extrinsics[:, :3, :3], -1, -2))
-    for index, frame in enumerate(cameras["frames"]):
-        x, y, z, w = quaternions[index]
+    height, width = result.image_size
+    quaternions = matrix_to_quaternion(np.swapaxes(result.extrinsics[:, :3, :3], -1, -2))
+    for index, (x, y, z, w) in enumerate(quaternions):
         server.scene.add_camera_frustum(
             f"/cameras/{index:06d}",
-            fov=2 * float(np.arctan(height / 2 / frame["intrinsics"][1, 1])),
+            fov=2 * float(np.arctan(height / 2 / result.intrinsics[index, 1, 1])),
             aspect=width / height,
             scale=span / 40,
             wxyz=(w, x, y, z),
@@ -65,18 +62,3 @@ def serve_forever(server: Any) -> None:
             time.sleep(1.0)
     except KeyboardInterrupt:
         server.stop()
-
-
-def read_points(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
-    """Points [N, 3] float32 and colours [N, 3] uint8 of a PLY file of `write_point_cloud`.
-
-    Raises:
-      FileNotFoundError: no such file.
-    """
-    from plyfile import PlyData
-
-    if not Path(path).is_file():
-        raise FileNotFoundError(f"{path} does not exist: expected the output of `logvggt reconstruct`")
-    vertices = PlyData.read(str(path))["vertex"].data
-    points = np.stack([vertices[name] for name in "xyz"], axis=-1)
-    return points, np.stack([vertices[name] for name in ("red", "green", "blue")], axis=-1)

@@ -9,15 +9,20 @@ closure).
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 
 import jax
 import numpy as np
 
+from logvggt_jax.errors import InputError
 from logvggt_jax.geometry import Similarity, robust_similarity, unproject
-from logvggt_jax.streaming.offline import ChunkPrediction
+from logvggt_jax.model.logvggt import LogVGGT, Variables
+from logvggt_jax.streaming.offline import FinalFrames, PlainPrediction, predict_plain
+from logvggt_jax.streaming.results import Cameras, FrameResult, PredictionError, checked_frames, device_memory
 
-PredictChunk = Callable[[np.ndarray], ChunkPrediction]
+PredictChunk = Callable[[np.ndarray], PlainPrediction]
 
 # Shared pixels that fit a similarity: seven numbers need no more, and every chunk solves for them six times.
 _MOST_POINTS = 200_000
@@ -38,9 +43,9 @@ class ChunkPlan:
         for name in ("size", "overlap"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise ValueError(f"chunk {name} must be a whole number of at least 1 frame, got {value!r}")
+                raise InputError(f"chunk {name} must be a whole number of at least 1 frame, got {value!r}")
         if not self.overlap < self.size:
-            raise ValueError(
+            raise InputError(
                 f"chunk overlap must be at least 1 frame and below the chunk size {self.size}, got {self.overlap}: "
                 "neighbours are aligned by the frames they share, and each has to add some"
             )
@@ -66,14 +71,14 @@ class ChunkChain:
     def __init__(self, predict: PredictChunk, plan: ChunkPlan) -> None:
         self._predict, self._plan = predict, plan
         self._images: list[np.ndarray] = []
-        self._shared: ChunkPrediction | None = None
+        self._shared: PlainPrediction | None = None
         self._first = 0
 
-    def push(self, image: np.ndarray) -> ChunkPrediction | None:
+    def push(self, image: np.ndarray) -> PlainPrediction | None:
         """Takes the next image [H, W, 3]; the frames that became final with it, oldest first, if any.
 
         Raises:
-          ValueError: a chunk cannot be aligned with the one before.
+          PredictionError: a chunk cannot be aligned with the one before.
         """
         self._images.append(image)
         if len(self._images) < self._plan.size:
@@ -86,7 +91,7 @@ class ChunkChain:
         self._first += step
         return jax.tree.map(lambda x: x[:step], chunk)
 
-    def close(self) -> ChunkPrediction | None:
+    def close(self) -> PlainPrediction | None:
         """Ends the sequence: the frames still held; None if there was no frame. Errors as in `push`."""
         if not self._images:
             return None
@@ -95,7 +100,7 @@ class ChunkChain:
         self._images, self._shared = [], None
         return last
 
-    def _next_chunk(self) -> ChunkPrediction:
+    def _next_chunk(self) -> PlainPrediction:
         chunk = self._predict(np.stack(self._images))
         if self._shared is None:
             return chunk
@@ -103,14 +108,65 @@ class ChunkChain:
         try:
             similarity = align(jax.tree.map(lambda x: x[:shared], chunk), self._shared)
         except ValueError as error:
-            raise ValueError(
+            raise PredictionError(
                 f"the chunk from frame {self._first} to {self._first + len(self._images) - 1} cannot be aligned with "
                 f"the one before on the {shared} frames they share ({error}); take larger chunks with more overlap"
             ) from error
         return move(chunk, similarity)
 
 
-def align(source: ChunkPrediction, target: ChunkPrediction) -> Similarity:
+class ChunkSession:
+    """Takes frames like a `StreamSession` and hands them out chunk by chunk, depth and pose final.
+
+    The world is the first chunk's first camera, the unit the first chunk's. Memory is that of one chunk, and the
+    cameras.
+
+    Args:
+      model: whose parts are used; its windows are not.
+      variables: {"params": …}.
+      plan: sizes of the chunks.
+    """
+
+    def __init__(self, model: LogVGGT, variables: Variables, plan: ChunkPlan) -> None:
+        # Once, not for every chunk, where they are numpy arrays.
+        predict = functools.partial(predict_plain, model, jax.device_put(variables))
+        self._patch_size, self._plan = model.config.encoder.patch_size, plan
+        self._chain = ChunkChain(predict, plan)
+        self._newest: np.ndarray | None = None
+        self._final = FinalFrames()
+        self._closed = False
+
+    @property
+    def num_frames(self) -> int:
+        """Frames handed out so far; their depth and pose are final."""
+        return len(self._final)
+
+    def push(self, frames: np.ndarray | jax.Array | Sequence[np.ndarray]) -> list[FrameResult]:
+        """Takes frames and returns those that became final; see `Predictor.push`."""
+        if self._closed:
+            raise ValueError("this stream is closed: make another ChunkSession for another sequence")
+        results: list[FrameResult] = []
+        for frame in checked_frames(frames, patch_size=self._patch_size, before=self._newest):
+            self._newest = frame
+            with self._memory():
+                results += self._final.add(self._chain.push(frame))
+        return results
+
+    def close(self) -> list[FrameResult]:
+        """Ends the stream: the frames still held; PredictionError where the last chunk does not fit the others."""
+        self._closed, self._newest = True, None
+        with self._memory():
+            return self._final.add(self._chain.close())
+
+    def cameras(self) -> Cameras:
+        """Cameras of the frames handed out so far; all are final."""
+        return self._final.cameras()
+
+    def _memory(self) -> AbstractContextManager[None]:
+        return device_memory(f"a chunk of {self._plan.size} frames", "take a smaller chunk size")
+
+
+def align(source: PlainPrediction, target: PlainPrediction) -> Similarity:
     """The similarity that carries one prediction of some frames onto another of the same frames.
 
     It fits the points of the same pixels where both are confident, weighted by the geometric mean of both
@@ -131,7 +187,7 @@ def align(source: ChunkPrediction, target: ChunkPrediction) -> Similarity:
     return robust_similarity(_points(source, chosen), _points(target, chosen), weights, threshold=threshold)
 
 
-def move(prediction: ChunkPrediction, similarity: Similarity) -> ChunkPrediction:
+def move(prediction: PlainPrediction, similarity: Similarity) -> PlainPrediction:
     """The same prediction in the world and unit that `similarity` maps to; float32."""
     points = prediction.points
     return prediction._replace(
@@ -141,7 +197,7 @@ def move(prediction: ChunkPrediction, similarity: Similarity) -> ChunkPrediction
     )
 
 
-def _confident(source: ChunkPrediction, target: ChunkPrediction) -> np.ndarray:
+def _confident(source: PlainPrediction, target: PlainPrediction) -> np.ndarray:
     """Pixels [n, H, W] that both predictions know something of."""
     valid = np.ones(source.depth.shape, bool)
     for prediction in (source, target):
@@ -152,7 +208,7 @@ def _confident(source: ChunkPrediction, target: ChunkPrediction) -> np.ndarray:
     return valid
 
 
-def _points(prediction: ChunkPrediction, indices: np.ndarray) -> np.ndarray:
+def _points(prediction: PlainPrediction, indices: np.ndarray) -> np.ndarray:
     """World points [N, 3] float64 of pixels `indices` [N], sorted and flat in [n, H, W]; frame by frame."""
     pixels = prediction.depth[0].size
     borders = np.searchsorted(indices, np.arange(len(prediction.depth) + 1) * pixels)

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
 import numpy as np
 
 from logvggt_jax.config import WindowConfig
+from logvggt_jax.errors import InputError
+from logvggt_jax.geometry import encode_poses
 from logvggt_jax.model.logvggt import LogVGGT, Variables
+from logvggt_jax.streaming.results import Cameras, FrameResult, PredictionError, checked_frames, device_memory
 
 
-class ChunkPrediction(NamedTuple):
-    """What is predicted of n frames, numpy arrays in one world and one unit of length.
+class PlainPrediction(NamedTuple):
+    """What plain VGGT predicts of n frames, numpy arrays in one world and one unit of length.
 
     Attributes:
       depth: [n, H, W] z-depth.
@@ -46,7 +50,7 @@ def plain_vggt(model: LogVGGT, num_frames: int) -> LogVGGT:
     return LogVGGT(dataclasses.replace(model.config, windows=windows, refinement=refinement))
 
 
-def predict_plain(model: LogVGGT, variables: Variables, images: np.ndarray) -> ChunkPrediction:
+def predict_plain(model: LogVGGT, variables: Variables, images: np.ndarray) -> PlainPrediction:
     """Plain VGGT's prediction of images [n, H, W, 3], in the frame of the first; compiled once for each n.
 
     Args:
@@ -58,7 +62,114 @@ def predict_plain(model: LogVGGT, variables: Variables, images: np.ndarray) -> C
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _predict(model: LogVGGT, variables: Variables, images: jax.Array) -> ChunkPrediction:
+def _predict(model: LogVGGT, variables: Variables, images: jax.Array) -> PlainPrediction:
     predictions = model.apply(variables, images[None])
-    wanted = {name: getattr(predictions, name) for name in ChunkPrediction._fields}
-    return jax.tree.map(lambda x: x[0], ChunkPrediction(**wanted))
+    wanted = {name: getattr(predictions, name) for name in PlainPrediction._fields}
+    return jax.tree.map(lambda x: x[0], PlainPrediction(**wanted))
+
+
+class FinalFrames:
+    """Frames of plain VGGT that are handed out, and their cameras; all are final."""
+
+    def __init__(self) -> None:
+        self._encodings: list[np.ndarray] = []
+        self._extrinsics: list[np.ndarray] = []
+        self._intrinsics: list[np.ndarray] = []
+
+    def __len__(self) -> int:
+        return len(self._encodings)
+
+    def add(self, prediction: PlainPrediction | None) -> list[FrameResult]:
+        """The results of the frames that follow those added so far; None adds none."""
+        if prediction is None:
+            return []
+        first, size = len(self), prediction.depth.shape[1:]
+        encodings = encode_poses(prediction.extrinsics, prediction.intrinsics, size).astype(np.float32)
+        self._encodings += list(encodings)
+        self._extrinsics += list(prediction.extrinsics)
+        self._intrinsics += list(prediction.intrinsics)
+        return [
+            FrameResult(
+                index=first + i,
+                depth=prediction.depth[i],
+                confidence=prediction.depth_confidence[i],
+                pose_encoding=encodings[i],
+                pose_is_final=True,
+                points=None if prediction.points is None else prediction.points[i],
+                points_confidence=None if prediction.points_confidence is None else prediction.points_confidence[i],
+            )
+            for i in range(len(encodings))
+        ]
+
+    def cameras(self) -> Cameras:
+        """Cameras of all frames added so far."""
+        if not self._encodings:
+            nothing = np.zeros((0, 3, 4), np.float32)
+            return Cameras(np.zeros((0, 9), np.float32), nothing, nothing[..., :3], np.zeros(0, bool))
+        arrays = [np.stack(x) for x in (self._encodings, self._extrinsics, self._intrinsics)]
+        return Cameras(arrays[0], arrays[1], arrays[2], np.ones(len(self), bool))
+
+
+@dataclasses.dataclass(frozen=True)
+class OfflineSettings:
+    """Limits of the method: `max_frames` is the longest sequence it takes, None for no limit.
+
+    Memory grows with the frames, time with their square.
+    """
+
+    max_frames: int | None = 200
+
+    def __post_init__(self) -> None:
+        limit = self.max_frames
+        if limit is not None and (isinstance(limit, bool) or not isinstance(limit, int) or limit < 1):
+            raise InputError(f"offline max_frames must be at least 1 frame or None, got {limit!r}")
+
+
+class OfflineSession:
+    """Takes frames like a `StreamSession` and hands them all out when the sequence ends.
+
+    Args:
+      model: whose parts are used; its windows are not.
+      variables: {"params": …}.
+      settings: limits.
+    """
+
+    def __init__(self, model: LogVGGT, variables: Variables, settings: OfflineSettings) -> None:
+        self._model, self._variables, self._settings = model, jax.device_put(variables), settings
+        self._images: list[np.ndarray] = []
+        self._final = FinalFrames()
+        self._closed = False
+
+    @property
+    def num_frames(self) -> int:
+        """Frames handed out so far."""
+        return len(self._final)
+
+    def push(self, frames: np.ndarray | jax.Array | Sequence[np.ndarray]) -> list[FrameResult]:
+        """Takes frames; see `Predictor.push`. Raises PredictionError for more than `max_frames`."""
+        if self._closed:
+            raise ValueError("this sequence is closed: make another OfflineSession for another one")
+        before = self._images[-1] if self._images else None
+        self._images += list(checked_frames(frames, patch_size=self._model.config.encoder.patch_size, before=before))
+        limit = self._settings.max_frames
+        if limit is not None and len(self._images) > limit:
+            raise PredictionError(
+                f"full attention over {len(self._images)} frames exceeds max_frames={limit}; raise it if memory and "
+                "time allow"
+            )
+        return []
+
+    def close(self) -> list[FrameResult]:
+        """Predicts all frames at once."""
+        images, self._images, self._closed = self._images, [], True
+        if not images:
+            return []
+        height, width = images[0].shape[:2]
+        with device_memory(
+            f"full attention over {len(images)} frames of {height} x {width} pixels", "take fewer or smaller frames"
+        ):
+            return self._final.add(predict_plain(self._model, self._variables, np.stack(images)))
+
+    def cameras(self) -> Cameras:
+        """Cameras of the frames handed out so far."""
+        return self._final.cameras()

@@ -1,4 +1,4 @@
-"""Compact tokens of a stream on the device, in buffers that grow by whole chunks."""
+"""Compact tokens of a stream on the device, in buffers that double."""
 
 from __future__ import annotations
 
@@ -28,24 +28,23 @@ def _grown(buffers: Tokens, *, room: int) -> Tokens:
 
 
 class TokenStore:
-    """Camera tokens, register tokens and refined camera tokens of the frames that are final.
+    """Camera tokens, refined camera tokens and GCCR's view of the registers, of the frames that are final.
 
-    Capacities are multiples of `chunk`, so that programs which read the buffers compile once a chunk of frames
-    and not once a frame. What lies at or beyond `count` means nothing and has to be masked.
+    Capacities double: a program that reads the buffers compiles anew ever more rarely, and never once a frame. What
+    lies at or beyond `count` means nothing and has to be masked.
 
     Attributes:
       count: frames stored.
       camera: [1, capacity, 2C] float32.
-      registers: register tokens [1, capacity, 4, 2C] float32, or GCCR's keys and values of them, whichever is
-        appended; None where refinement is off, which reads no registers.
+      registers: GCCR's keys and values [1, capacity, 4, 2C]; None where refinement is off, which reads no registers.
       refined: [1, capacity, 2C] float32, frames that a trigger has refined.
     """
 
-    def __init__(self, *, chunk: int) -> None:
-        self._chunk = chunk
+    def __init__(self, *, first_capacity: int) -> None:
+        self._first_capacity = first_capacity
         self.count = 0
         self.camera: jax.Array | None = None
-        self.registers: jax.Array | RegisterKeys | None = None
+        self.registers: RegisterKeys | None = None
         self.refined: jax.Array | None = None
 
     @property
@@ -53,8 +52,8 @@ class TokenStore:
         """Frames that fit without growing."""
         return 0 if self.camera is None else self.camera.shape[1]
 
-    def append(self, camera: jax.Array, registers: jax.Array | RegisterKeys | None, valid: int) -> None:
-        """Adds the first `valid` of n frames: `camera` [1, n, 2C], `registers` [1, n, 4, 2C], of one kind always."""
+    def append(self, camera: jax.Array, registers: RegisterKeys | None, valid: int) -> None:
+        """Adds the first `valid` of n frames: `camera` [1, n, 2C] and their registers' keys and values."""
         if self.camera is None:
             self.camera, self.refined = camera[:, :0], camera[:, :0]
             self.registers = jax.tree.map(lambda x: x[:, :0], registers)
@@ -68,9 +67,16 @@ class TokenStore:
 
     def reserve(self, frames: int) -> None:
         """Grows the buffers until `frames` frames fit; call after the first `append`."""
-        room = -(-frames // self._chunk) * self._chunk - self.capacity
-        if room <= 0 or self.camera is None or self.refined is None:
+        if frames <= self.capacity:
             return
-        self.camera, self.refined = _grown(self.camera, room=room), _grown(self.refined, room=room)
-        if self.registers is not None:
-            self.registers = _grown(self.registers, room=room)
+        wanted = self._first_capacity
+        while wanted < frames:
+            wanted *= 2
+        buffers = (self.camera, self.refined, self.registers)
+        self.camera, self.refined, self.registers = _grown(buffers, room=wanted - self.capacity)
+
+    def trim(self) -> None:
+        """Gives back the room beyond the last frame, in steps of the first capacity: what reads all runs once."""
+        room = -(-self.count // self._first_capacity) * self._first_capacity
+        buffers = (self.camera, self.refined, self.registers)
+        self.camera, self.refined, self.registers = jax.tree.map(lambda x: x[:, :room], buffers)

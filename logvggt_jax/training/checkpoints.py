@@ -14,6 +14,7 @@ from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.processes import any_process
 from logvggt_jax.training.state import TrainState
 from logvggt_jax.weights.checkpoints import check_destination, digests, save_model, verify_digests
+from logvggt_jax.weights.provenance import Provenance
 
 # How fast, from where and with how many broken clips the data come; the data stream checks that they are the same.
 FREE_DATA_SETTINGS = ("worker_count", "num_threads", "cache_dir", "max_broken")
@@ -65,7 +66,7 @@ class RunCheckpoints:
         failure: Exception | None = None
         if jax.process_index() == 0:
             try:
-                save_model(self.model_folder, self.config.model, params)
+                save_model(self.model_folder, self.config.model, params, self._provenance())
             except Exception as error:
                 failure = error
         # The others would wait for the first one in the checkpoint below.
@@ -88,6 +89,11 @@ class RunCheckpoints:
             ),
             force=True,
         )
+
+    def _provenance(self) -> Provenance:
+        longer_edge = max(max(size) for stage in self.config.stages for size in stage.sizes)
+        start = self.config.initial_weights or "random parameters"
+        return Provenance("windows", longer_edge, source=f"trained from {start} in {self.folder.parent}")
 
     def restore(self, like: TrainState, *, step: int | None = None) -> tuple[TrainState, Position]:
         """The state at `step` (None: the latest), with the shapes and placement of `like`.
@@ -137,7 +143,7 @@ class RunCheckpoints:
             raise ValueError(f"{where} cannot be read ({type(error).__name__}: {reason:.200}); {mend}") from error
 
     def _check_configuration(self, stored: Mapping[str, Any], where: str) -> None:
-        ours = _json(self.config.to_dict())
+        ours = self.config.to_dict()
         for part in ("model", "stages", "data", "loss", "optimizer", "seed"):
             theirs = stored.get(part)
             if part == "data" and theirs is not None:
@@ -165,12 +171,6 @@ def _parts(state: TrainState) -> tuple[Any, dict[str, Any]]:
 
 def _abstract(tree: Any) -> Any:
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding), tree)
-
-
-def _json(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _json(item) for key, item in value.items()}
-    return [_json(item) for item in value] if isinstance(value, list | tuple) else value
 
 
 def _first_difference(theirs: Any, ours: Any, name: str) -> tuple[str, Any, Any] | None:

@@ -6,20 +6,25 @@ There are no hyperparameters in code: files under `configs/` state them all.
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Mapping
 from typing import Any
 
-from logvggt_jax.config import ModelConfig
+from logvggt_jax.config import (
+    ModelConfig,
+    freeze_lists,
+    from_mapping,
+    require_counts,
+    require_one_of,
+    require_within,
+    to_mapping,
+)
 from logvggt_jax.data.feeding.augmentation import ColourAugmentation
 from logvggt_jax.data.feeding.holdouts import HoldOut
+from logvggt_jax.errors import InputError
 
 LOSSES = ("log_vggt", "vggt")
 SCHEDULES = ("cosine", "linear_tail")
-
-
-def _require(condition: bool, message: str) -> None:
-    if not condition:
-        raise ValueError(message)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,12 +47,10 @@ class LossConfig:
     quantile: float | None = None
 
     def __post_init__(self) -> None:
-        _require(self.name in LOSSES, f"loss.name must be one of {LOSSES}, got {self.name!r}")
-        _require(0 < self.gamma <= 1, f"loss.gamma must lie in (0, 1], got {self.gamma}")
-        _require(
-            self.quantile is None or 0 < self.quantile <= 1,
-            f"loss.quantile must lie in (0, 1] or be None, got {self.quantile}",
-        )
+        require_one_of(self, LOSSES, "name")
+        weights = ("translation_weight", "rotation_weight", "field_of_view_weight")
+        require_within(self, "[0, inf)", "camera_weight", "depth_weight", *weights, "alpha")
+        require_within(self, "(0, 1]", "gamma", "quantile")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,13 +75,11 @@ class OptimizerConfig:
     clip_norm: float
 
     def __post_init__(self) -> None:
-        _require(self.schedule in SCHEDULES, f"optimizer.schedule must be one of {SCHEDULES}, got {self.schedule!r}")
-        _require(self.learning_rate > 0, f"optimizer.learning_rate must be positive, got {self.learning_rate}")
-        _require(
-            0 <= self.warmup_fraction < 0.75,
-            f"optimizer.warmup_fraction must lie in [0, 0.75), got {self.warmup_fraction}",
-        )
-        _require(self.clip_norm > 0, f"optimizer.clip_norm must be positive, got {self.clip_norm}")
+        require_one_of(self, SCHEDULES, "schedule")
+        require_within(self, "(0, inf)", "learning_rate", "clip_norm")
+        require_within(self, "[0, inf)", "final_learning_rate", "weight_decay")
+        require_within(self, "[0, 1)", "b1", "b2")
+        require_within(self, "[0, 0.75)", "warmup_fraction")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,15 +99,12 @@ class StageConfig:
     sizes: tuple[tuple[int, int], ...]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "sizes", tuple((int(h), int(w)) for h, w in self.sizes))
-        for field in ("steps", "clip_length", "batch_size", "min_stride", "max_stride"):
-            value = getattr(self, field)
-            _require(isinstance(value, int) and value >= 1, f"stage {self.name!r}: {field} must be >= 1, got {value!r}")
-        _require(
-            self.min_stride <= self.max_stride,
-            f"stage {self.name!r}: min_stride={self.min_stride} exceeds max_stride={self.max_stride}",
-        )
-        _require(bool(self.sizes), f"stage {self.name!r}: sizes is empty, give at least one (height, width)")
+        freeze_lists(self)
+        require_counts(self, "steps", "clip_length", "batch_size", "min_stride", "max_stride")
+        if self.min_stride > self.max_stride:
+            raise InputError(f"StageConfig.min_stride={self.min_stride} exceeds max_stride={self.max_stride}")
+        if not self.sizes:
+            raise InputError("StageConfig.sizes is empty, give at least one (height, width)")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,16 +123,11 @@ class SourceConfig:
     options: tuple[tuple[str, Any], ...] = ()
 
     def __post_init__(self) -> None:
-        object.__setattr__(
-            self, "options", tuple(sorted((key, _frozen(value)) for key, value in dict(self.options).items()))
-        )
-        _require(self.weight > 0, f"data set {self.name!r}: weight must be positive, got {self.weight}")
-        if self.stride is not None:
-            object.__setattr__(self, "stride", tuple(self.stride))
-            _require(
-                len(self.stride) == 2 and 1 <= self.stride[0] <= self.stride[1],
-                f"data set {self.name!r}: stride must be a pair 1 <= low <= high, got {self.stride}",
-            )
+        freeze_lists(self)
+        object.__setattr__(self, "options", tuple(sorted(self.options)))
+        require_within(self, "(0, inf)", "weight")
+        if self.stride is not None and not (len(self.stride) == 2 and 1 <= self.stride[0] <= self.stride[1]):
+            raise InputError(f"SourceConfig.stride must be a pair 1 <= low <= high, got {self.stride}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -161,9 +154,12 @@ class DataConfig:
     max_broken: float = 0.0
 
     def __post_init__(self) -> None:
-        _require(bool(self.sources), "data.sources is empty: name at least one data set")
-        for field in ("min_valid_depth", "max_broken"):
-            _require(0 <= getattr(self, field) < 1, f"data.{field} must lie in [0, 1), got {getattr(self, field)}")
+        object.__setattr__(self, "hold_out", tuple(sorted(self.hold_out, key=lambda pair: pair[0])))
+        if not self.sources:
+            raise InputError("DataConfig.sources is empty: name at least one data set")
+        require_within(self, "[0, 1]", "reverse")
+        require_within(self, "[0, inf)", "worker_count", "num_threads")
+        require_within(self, "[0, 1)", "min_valid_depth", "max_broken")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -178,10 +174,10 @@ class ValidationConfig:
     size: tuple[int, int]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "size", tuple(self.size))
-        for field in ("every", "num_clips", "stride"):
-            _require(getattr(self, field) >= 1, f"validation.{field} must be >= 1, got {getattr(self, field)}")
-        _require(self.clip_length >= 2, "validation.clip_length must be >= 2: pose errors are of pairs of frames")
+        freeze_lists(self)
+        require_counts(self, "every", "num_clips", "clip_length", "stride")
+        if self.clip_length < 2:
+            raise InputError("ValidationConfig.clip_length must be at least 2: pose errors are of pairs of frames")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -209,9 +205,10 @@ class TrainConfig:
     max_minutes: float | None
 
     def __post_init__(self) -> None:
-        _require(bool(self.stages), "stages is empty: a run needs at least one")
-        for field in ("log_every", "save_every", "keep_checkpoints", "max_skipped_in_a_row"):
-            _require(getattr(self, field) >= 1, f"{field} must be >= 1, got {getattr(self, field)}")
+        if not self.stages:
+            raise InputError("TrainConfig.stages is empty: a run needs at least one")
+        require_counts(self, "log_every", "save_every", "keep_checkpoints", "max_skipped_in_a_row")
+        require_within(self, "(0, inf)", "max_minutes")
 
     @property
     def total_steps(self) -> int:
@@ -220,61 +217,25 @@ class TrainConfig:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain nested dict of JSON types, the form that checkpoints store."""
-        return dataclasses.asdict(self)
+        return to_mapping(self)
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> TrainConfig:
-        """A run from nested mappings, as files under `configs/` build them.
+        """A run from nested mappings, as files under `configs/` build them; inverse of `to_dict`.
 
-        `stages` maps names to fields and runs in the order of the names; `data.sources` and `data.hold_out` map
-        data-set names to fields.
+        `stages` and `data.sources` may map names to the other fields, `data.hold_out` maps names of data sets to
+        rules. Stages run in the order written. A mapping that was sorted by name (ml_collections' ConfigDict does
+        so, unless made with `sort_keys=False`) has lost it: its stages run in the order of the numbers in their
+        names, stage_2 before stage_10.
 
         Raises:
-          ValueError: An unknown or missing field, or a value out of range; names it and the known ones.
+          InputError: as `from_mapping`.
         """
-        values = dict(values)
-        _check_fields(cls, values, "config")
-        stages, data, validation = values["stages"], dict(values["data"]), values["validation"]
-        values["model"] = ModelConfig.from_dict(dict(values["model"]))
-        values["loss"] = _build(LossConfig, values["loss"], "config.loss")
-        values["optimizer"] = _build(OptimizerConfig, values["optimizer"], "config.optimizer")
-        values["stages"] = tuple(
-            _build(StageConfig, {"name": name, **stages[name]}, f"config.stages.{name}") for name in sorted(stages)
-        )
-        _check_fields(DataConfig, data, "config.data")
-        data["sources"] = tuple(
-            _build(SourceConfig, {"name": name, **data["sources"][name]}, f"config.data.sources.{name}")
-            for name in sorted(data["sources"])
-        )
-        data["hold_out"] = tuple(
-            (name, _build(HoldOut, rule, f"config.data.hold_out.{name}"))
-            for name, rule in sorted(dict(data.get("hold_out", {})).items())
-        )
-        if data.get("augmentation") is not None:
-            data["augmentation"] = _build(ColourAugmentation, data["augmentation"], "config.data.augmentation")
-        values["data"] = _build(DataConfig, data, "config.data")
-        if validation is not None:
-            validation = dict(validation)
-            _check_fields(ValidationConfig, validation, "config.validation")
-            validation["source"] = _build(SourceConfig, validation["source"], "config.validation.source")
-            values["validation"] = _build(ValidationConfig, validation, "config.validation")
-        return cls(**values)
+        stages = values.get("stages")
+        if isinstance(stages, Mapping) and list(stages) == sorted(stages):
+            values = {**values, "stages": {name: stages[name] for name in sorted(stages, key=_numbers_by_value)}}
+        return from_mapping(cls, values, "config")
 
 
-def _frozen(value: Any) -> Any:
-    return tuple(value) if isinstance(value, list) else value
-
-
-def _check_fields(cls: Any, values: Mapping[str, Any], path: str) -> None:
-    fields = dataclasses.fields(cls)
-    known = [field.name for field in fields]
-    for name in values:
-        _require(name in known, f"unknown field {path}.{name}; {cls.__name__} knows {', '.join(known)}")
-    for field in fields:
-        required = field.default is dataclasses.MISSING
-        _require(not required or field.name in values, f"missing field {path}.{field.name} of {cls.__name__}; set it")
-
-
-def _build(cls: Any, values: Mapping[str, Any], path: str) -> Any:
-    _check_fields(cls, values, path)
-    return cls(**values)
+def _numbers_by_value(name: str) -> list[tuple[int, str]]:
+    return [(int(part) if part.isdecimal() else 0, part) for part in re.split(r"(\d+)", name)]

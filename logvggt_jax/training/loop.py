@@ -26,7 +26,7 @@ from logvggt_jax.training.processes import ASK_EVERY, any_process, check_agreeme
 from logvggt_jax.training.progress import Speedometer, duration, progress_line
 from logvggt_jax.training.sharding import check_batch_size, replicated
 from logvggt_jax.training.state import TrainState, initial_state
-from logvggt_jax.training.step import Batch, CompiledSteps, Metrics, make_loss, make_train_step
+from logvggt_jax.training.step import Batch, Metrics, make_loss_terms, make_train_step
 from logvggt_jax.training.validation import Validation
 
 # Steps handed to the device before the oldest has to be finished: enough to hide the host's work.
@@ -82,7 +82,9 @@ class _Run:
         optimizer = make_optimizer(config.optimizer, params, frozen=_frozen_modules(config))
         schedule = learning_rate_schedule(config.optimizer, config.stages)
         self.state = jax.device_put(initial_state(params, optimizer), replicated(mesh))
-        self.steps = CompiledSteps(make_train_step(make_loss(model, config.loss), optimizer, schedule, mesh))
+        terms = make_loss_terms(model, config.loss)
+        self.step = make_train_step(terms, config.loss, optimizer, schedule, mesh)
+        self.programs: dict[tuple[int, ...], jax.stages.Compiled] = {}
         self.validation = None if config.validation is None else Validation(model, config.validation, mesh)
         self.checkpoints = RunCheckpoints(workdir, config)
         self.speed = Speedometer(config.stages)
@@ -135,8 +137,7 @@ class _Run:
         self.speed.restart()
         while step < end:
             batch = next(batches)
-            self._compile(stage, batch, log)
-            self.state, metrics = self.steps(self.state, batch)
+            self.state, metrics = self._program(stage, batch, log)(self.state, batch)
             step += 1
             self.speed.count()
             in_flight.append(metrics["loss/total"])
@@ -157,13 +158,15 @@ class _Run:
                 return step, True
         return step, False
 
-    def _compile(self, stage: StageConfig, batch: Batch, log: MetricsLog) -> None:
-        if self.steps.has(batch):
-            return
-        started = time.perf_counter()
-        self.steps.compile(self.state, batch)
-        log.say(f"{stage.name}: step compiled in {time.perf_counter() - started:.0f} s")
-        self.speed.restart()
+    def _program(self, stage: StageConfig, batch: Batch, log: MetricsLog) -> jax.stages.Compiled:
+        """The step compiled ahead of time for clips of this shape: a call cannot cost another compilation unseen."""
+        shape = batch["images"].shape
+        if shape not in self.programs:
+            started = time.perf_counter()
+            self.programs[shape] = self.step.lower(self.state, batch).compile()
+            log.say(f"{stage.name}: step compiled in {time.perf_counter() - started:.0f} s")
+            self.speed.restart()
+        return self.programs[shape]
 
     def _log(self, step: int, stage: StageConfig, metrics: Metrics, broken_clips: int, log: MetricsLog) -> None:
         values = {name: float(value) for name, value in jax.device_get(metrics).items()}

@@ -11,6 +11,8 @@ from typing import Any
 from rich.console import Console
 from tensorboardX import SummaryWriter
 
+from logvggt_jax.files import write_text
+
 FILE_NAME = "metrics.jsonl"
 
 
@@ -73,6 +75,4 @@ def _drop_later_lines(path: Path, last_step: int) -> None:
     if not path.exists():
         return
     kept = [entry for entry in read_metrics(path) if entry["step"] <= last_step]
-    scratch = path.with_name(f".{path.name}.new")
-    scratch.write_text("".join(json.dumps(entry) + "\n" for entry in kept))
-    scratch.replace(path)
+    write_text(path, "".join(json.dumps(entry) + "\n" for entry in kept))

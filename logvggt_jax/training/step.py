@@ -22,38 +22,64 @@ from logvggt_jax.training.state import TrainState
 
 Batch = dict[str, jax.Array]
 Metrics = dict[str, jax.Array]
-LossFunction = Callable[[Any, Batch], tuple[jax.Array, Metrics]]
-TrainStep = Callable[[TrainState, Batch], tuple[TrainState, Metrics]]
+LossTerms = Callable[[Any, Batch], tuple[dict[str, Mean], dict[str, Mean]]]
 
 
-def make_loss(model: LogVGGT, config: LossConfig) -> LossFunction:
-    """The loss of parameters on one device's share of a batch; to be called within `shard_map`.
+def make_loss_terms(model: LogVGGT, config: LossConfig) -> LossTerms:
+    """A function (parameters, one device's share of a batch) -> (terms of the objective, figures to be logged).
 
-    Numerators and denominators are added over the devices *inside* the differentiated function. The result is
-    the mean over the whole batch however its valid pixels are spread, and its gradient with respect to
-    replicated parameters is complete: averaging it again would be wrong.
+    Both are sums and counts over that share alone, so the function holds no communication and can be differentiated
+    on each device by itself.
     """
 
-    def loss(params: Any, batch: Batch) -> tuple[jax.Array, Metrics]:
+    def terms(params: Any, batch: Batch) -> tuple[dict[str, Mean], dict[str, Mean]]:
         frame_mask = batch.get("frame_mask")
         predictions = model.apply({"params": params}, batch["images"], frame_mask, remat=True)
         targets = normalize_clips(batch["depth"], batch["intrinsics"], batch["extrinsics"], frame_mask=frame_mask)
-        values = _global_means(loss_terms(predictions, targets, config))
-        total = total_loss(values, config)
-        figures = _global_means(progress_figures(jax.lax.stop_gradient(predictions), targets))
-        figures["rotation_over_identity"] = figures["rotation"] / jnp.maximum(figures["identity_rotation"], 1e-6)
-        logged = {f"loss/{name}": value for name, value in {"total": total, **values}.items()}
-        return total, {**logged, **{f"train/{name}": value for name, value in figures.items()}}
+        figures = progress_figures(jax.lax.stop_gradient(predictions), targets)
+        return loss_terms(predictions, targets, config), figures
 
-    return loss
+    return terms
+
+
+def loss_and_gradients(
+    terms: LossTerms, config: LossConfig, params: Any, batch: Batch
+) -> tuple[jax.Array, Metrics, Any]:
+    """The objective over the whole batch, what is logged of it, and its gradient; to be called within `shard_map`.
+
+    Every term is a quotient of sums over all devices, and its denominator does not depend on the parameters. So each
+    device differentiates its own numerators alone; sums over devices are taken outside of what is differentiated,
+    where no rule of differentiation can count them twice. The result is that of one device with the whole batch,
+    however unevenly the valid pixels are spread.
+    """
+
+    def numerators(params: Any) -> tuple[dict[str, jax.Array], Any]:
+        means, figures = terms(params, batch)
+        denominators = {name: mean.denominator for name, mean in means.items()}
+        return {name: mean.numerator for name, mean in means.items()}, (denominators, figures)
+
+    local, pull_back, sums = jax.vjp(numerators, params, has_aux=True)
+    summed, (denominators, figures) = jax.lax.psum((local, sums), DATA_AXIS)
+
+    def objective(numerators: dict[str, jax.Array]) -> tuple[jax.Array, Metrics]:
+        values = {name: Mean(value, denominators[name]).value() for name, value in numerators.items()}
+        return total_loss(values, config), values
+
+    (total, values), weights = jax.value_and_grad(objective, has_aux=True)(summed)
+    gradients = jax.lax.psum(pull_back(weights)[0], DATA_AXIS)
+    progress = {name: mean.value() for name, mean in figures.items()}
+    progress["rotation_over_identity"] = progress["rotation"] / jnp.maximum(progress["identity_rotation"], 1e-6)
+    metrics = {f"loss/{name}": value for name, value in {"total": total, **values}.items()}
+    return total, metrics | {f"train/{name}": value for name, value in progress.items()}, gradients
 
 
 def make_train_step(
-    loss: LossFunction,
+    terms: LossTerms,
+    config: LossConfig,
     optimizer: optax.GradientTransformation,
     schedule: optax.Schedule,
     mesh: Mesh,
-) -> TrainStep:
+) -> jax.stages.Wrapped:
     """A jitted step (state, batch) -> (state, metrics); the state is donated, the batch split over `mesh`.
 
     A batch holds `images` uint8 [B, T, H, W, 3], `depth` [B, T, H, W], `intrinsics` [B, T, 3, 3], `extrinsics`
@@ -62,9 +88,9 @@ def make_train_step(
     """
 
     def step(state: TrainState, batch: Batch) -> tuple[TrainState, Metrics]:
-        (value, metrics), gradients = jax.value_and_grad(loss, has_aux=True)(state.params, batch)
+        total, metrics, gradients = loss_and_gradients(terms, config, state.params, batch)
         norms = module_norms(gradients)
-        usable = jnp.isfinite(value)
+        usable = jnp.isfinite(total)
         for norm in norms.values():
             usable &= jnp.isfinite(norm)
         learning_rate = jnp.asarray(schedule(state.step), jnp.float32)
@@ -88,38 +114,5 @@ def make_train_step(
         metrics["longest_skip"] = new_state.longest_skip.astype(jnp.float32)
         return new_state, metrics
 
-    sharded = jax.shard_map(step, mesh=mesh, in_specs=(P(), P(DATA_AXIS)), out_specs=(P(), P()))
+    sharded = jax.shard_map(step, mesh=mesh, in_specs=(P(), P(DATA_AXIS)), out_specs=(P(), P()), check_vma=False)
     return jax.jit(sharded, donate_argnums=0)
-
-
-class CompiledSteps:
-    """The training step compiled ahead of time, once for each shape of batch.
-
-    A compiled program cannot be traced again: a state or batch of another shape, type or placement raises
-    instead of silently costing a second compilation.
-    """
-
-    def __init__(self, step: Any) -> None:
-        self._step = step
-        self._programs: dict[tuple[Any, ...], Any] = {}
-
-    def has(self, batch: Batch) -> bool:
-        """Whether batches of this shape have their program."""
-        return _signature(batch) in self._programs
-
-    def compile(self, state: TrainState, batch: Batch) -> None:
-        """Compiles the step for batches of this shape."""
-        self._programs[_signature(batch)] = self._step.lower(state, batch).compile()
-
-    def __call__(self, state: TrainState, batch: Batch) -> tuple[TrainState, Metrics]:
-        """Runs the program of the batch's shape; `state` is donated."""
-        return self._programs[_signature(batch)](state, batch)
-
-
-def _global_means(means: dict[str, Mean]) -> dict[str, jax.Array]:
-    """Averages over the whole batch: sums over devices first, divided once."""
-    return {name: mean.value() for name, mean in jax.lax.psum(means, DATA_AXIS).items()}
-
-
-def _signature(batch: Batch) -> tuple[Any, ...]:
-    return tuple((name, value.shape, value.dtype) for name, value in sorted(batch.items()))

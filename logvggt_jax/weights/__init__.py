@@ -5,14 +5,17 @@ from logvggt_jax.weights.checkpoints import (
     digests,
     from_pretrained,
     load_model,
+    read_provenance,
     save_model,
     verify_digests,
 )
 from logvggt_jax.weights.files import open_state_dict
+from logvggt_jax.weights.provenance import Provenance
 from logvggt_jax.weights.vggt import ConversionReport, config_from_vggt, parameter_shapes, params_from_vggt
 
 __all__ = [
     "ConversionReport",
+    "Provenance",
     "config_from_vggt",
     "convert",
     "digests",
@@ -21,6 +24,7 @@ __all__ = [
     "open_state_dict",
     "parameter_shapes",
     "params_from_vggt",
+    "read_provenance",
     "save_model",
     "verify_digests",
 ]

@@ -1,6 +1,6 @@
 """Model folders: parameters in Orbax's format, and beside them the configuration and a digest of every leaf.
 
-    <folder>/config.json   format version, ModelConfig, digests, versions of the libraries that wrote it
+    <folder>/config.json   format version, ModelConfig, provenance, digests, versions of the libraries that wrote it
     <folder>/params/       Orbax
 
 Orbax restores flipped bytes without complaint; the digests find them.
@@ -13,7 +13,6 @@ import dataclasses
 import hashlib
 import importlib.metadata
 import json
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -25,11 +24,14 @@ import orbax.checkpoint as ocp
 from rich.console import Console
 from rich.progress import Progress
 
-from logvggt_jax.config import ModelConfig
+from logvggt_jax.config import ModelConfig, from_mapping
+from logvggt_jax.errors import InputError, MissingInput, OutputExists, disk_errors
+from logvggt_jax.files import atomic_folder
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.weights.files import open_state_dict
-from logvggt_jax.weights.hub import resolve
+from logvggt_jax.weights.hub import licence, resolve
 from logvggt_jax.weights.lazy import LazyTensors
+from logvggt_jax.weights.provenance import Provenance
 from logvggt_jax.weights.vggt import (
     ConversionReport,
     config_from_vggt,
@@ -40,6 +42,8 @@ from logvggt_jax.weights.vggt import (
 
 FORMAT = "logvggt-jax model"
 VERSION = 1
+_UNKNOWN = Provenance()
+_VGGT_LONGER_EDGE = 518
 _MEND = "the checkpoint is damaged: copy or convert it again"
 
 
@@ -68,51 +72,42 @@ def verify_digests(tree: Any, expected: dict[str, str], where: str) -> None:
     for name in sorted(found.keys() | expected.keys()):
         if name not in found or name not in expected:
             which = "is not in the checkpoint" if name not in found else "has no digest"
-            raise ValueError(f"{where}: leaf {name} {which}; {_MEND}")
+            raise InputError(f"{where}: leaf {name} {which}; {_MEND}")
         if found[name] != expected[name]:
-            raise ValueError(
+            raise InputError(
                 f"{where}: leaf {name} differs from its digest ({found[name]}, expected {expected[name]}); {_MEND}"
             )
 
 
-def save_model(path: str | Path, config: ModelConfig, params: Any) -> None:
+def save_model(path: str | Path, config: ModelConfig, params: Any, provenance: Provenance = _UNKNOWN) -> None:
     """Writes a model folder; an older model folder at `path` is replaced once the new one is complete.
 
     Args:
       path: The folder to make.
       config: Configuration of the model.
       params: Its parameter tree, `variables["params"]`.
+      provenance: What the weights were trained for and where they come from.
 
     Raises:
-      FileExistsError: `path` exists and is not a model folder.
+      OutputExists: `path` exists and is not a model folder.
     """
     path = Path(path).expanduser().absolute()
     check_destination(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     description = {
         "format": FORMAT,
         "version": VERSION,
         "config": config.to_dict(),
+        "provenance": dataclasses.asdict(provenance),
         "digests": digests(params),
         "libraries": {
             name: importlib.metadata.version(name) for name in ("logvggt-jax", "jax", "flax", "orbax-checkpoint")
         },
     }
-    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch:
-        fresh, old = Path(scratch) / "new", Path(scratch) / "old"
-        fresh.mkdir()
+    with atomic_folder(path, replace=True) as fresh, disk_errors(path):
         with _checkpointer() as checkpointer:
             checkpointer.save(fresh / "params", jax.device_get(params))
             checkpointer.wait_until_finished()
         (fresh / "config.json").write_text(json.dumps(description, indent=2) + "\n")
-        if path.exists():
-            path.replace(old)
-        try:
-            fresh.replace(path)
-        except BaseException:  # Ctrl-C too: leaving the block removes what is in `old`
-            if old.exists():
-                old.replace(path)
-            raise
 
 
 def check_destination(path: Path) -> None:
@@ -121,8 +116,8 @@ def check_destination(path: Path) -> None:
         return
     try:
         _read_description(path)
-    except (FileNotFoundError, ValueError) as error:
-        raise FileExistsError(f"{path}: exists and is not a model folder; give another path or remove it") from error
+    except InputError as error:
+        raise OutputExists(f"{path}: exists and is not a model folder; give another path or remove it") from error
 
 
 def load_model(path: str | Path) -> tuple[LogVGGT, dict[str, Any]]:
@@ -143,12 +138,28 @@ def load_model(path: str | Path) -> tuple[LogVGGT, dict[str, Any]]:
     description = _read_description(path)
     try:
         config = ModelConfig.from_dict(description["config"])
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{path / 'config.json'}: {error}; written by another version of this package?") from error
+    except InputError as error:
+        raise InputError(f"{path / 'config.json'}: {error}; written by another version of this package?") from error
     model = LogVGGT(config)
     params = _restore(path / "params", parameter_shapes(config))
     verify_digests(params, description["digests"], str(path))
     return model, {"params": params}
+
+
+def read_provenance(path_or_repo: str | Path) -> Provenance:
+    """What the weights that `from_pretrained` would read were trained for; reads no parameter.
+
+    A folder written before this was recorded gives a `Provenance` of unknowns, a VGGT checkpoint that of VGGT.
+
+    Raises:
+      InputError: As `from_pretrained`, for what can be seen without reading parameters.
+    """
+    path = resolve(path_or_repo)
+    if not (path.is_dir() and _is_model_folder(path)):
+        return _vggt_provenance(path_or_repo)
+    description = _read_description(path)
+    with _naming(path / "config.json"):
+        return from_mapping(Provenance, description.get("provenance", {}), "provenance")
 
 
 def from_pretrained(
@@ -159,8 +170,8 @@ def from_pretrained(
     VGGT-1B is converted in memory; its sizes are read off the tensors' shapes (`config_from_vggt`).
 
     Args:
-      path_or_repo: A model folder of this package; a VGGT `.safetensors` or `.pt` file or the folder that holds
-        `model.safetensors` or `model.pt`; or a hub repository such as `facebook/VGGT-1B`.
+      path_or_repo: A model folder of this package; a VGGT `.safetensors` or `.pt` file or a folder that holds one;
+        or a hub repository such as `facebook/VGGT-1B`.
       dtype: Compute type of the model, `float32` or `bfloat16`; None keeps the checkpoint's (VGGT: float32).
       point_head: Keep VGGT's point head. A model folder has it or not.
 
@@ -172,7 +183,7 @@ def from_pretrained(
     if path.is_dir() and _is_model_folder(path):
         model, variables = load_model(path)
         if point_head and model.config.point_head is None:
-            raise ValueError(f"{path}: the model has no point head; convert VGGT with point_head, or leave it out")
+            raise InputError(f"{path}: the model has no point head; convert VGGT with point_head, or leave it out")
     else:
         with open_state_dict(path) as state_dict, _naming(path):
             config = config_from_vggt(state_dict, point_head=point_head)
@@ -213,13 +224,17 @@ def convert(source: str | Path, destination: str | Path, *, point_head: bool = F
 
             params, report = params_from_vggt(LazyTensors(list(state_dict), read), config)
     with console.status("Writing the model folder"):
-        save_model(destination, config, params)
+        save_model(destination, config, params, _vggt_provenance(source))
     console.print(
         f"{path}: {len(report.used)} tensors used, {len(report.skipped)} skipped, "
         f"{len(report.initialised)} parameters initialised",
         soft_wrap=True,
     )
     return report
+
+
+def _vggt_provenance(source: str | Path) -> Provenance:
+    return Provenance("vggt", _VGGT_LONGER_EDGE, licence(source), f"VGGT checkpoint {source}")
 
 
 def _checkpointer() -> ocp.StandardCheckpointer:
@@ -255,29 +270,30 @@ def _is_model_folder(path: Path) -> bool:
 def _read_description(path: Path) -> dict[str, Any]:
     file = path / "config.json"
     if not file.is_file():
-        raise FileNotFoundError(
+        raise MissingInput(
             f"{file}: no such file, so the folder is not a model's; give one made by `logvggt convert` or training"
         )
     try:
-        description = json.loads(file.read_text())
-    except ValueError as error:
-        raise ValueError(f"{file}: not valid JSON ({error}); {_MEND}") from error
+        with disk_errors(file):
+            description = json.loads(file.read_text())
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{file}: not valid JSON ({error}); {_MEND}") from error
     if not isinstance(description, dict) or description.get("format") != FORMAT:
-        raise ValueError(f"{file}: not the description of a model of this package (format {FORMAT!r})")
+        raise InputError(f"{file}: not the description of a model of this package (format {FORMAT!r})")
     if description.get("version") != VERSION:
-        raise ValueError(
+        raise InputError(
             f"{file}: format version {description.get('version')!r}, this package reads {VERSION}; "
             "use the version of logvggt-jax that wrote it"
         )
     if not all(isinstance(description.get(part), dict) for part in ("config", "digests")):
-        raise ValueError(f"{file}: config or digests are missing; {_MEND}")
+        raise InputError(f"{file}: config or digests are missing; {_MEND}")
     return description
 
 
 def _restore(path: Path, target: Any) -> Any:
     """Parameters in the shapes and placement of `target`, after a check that these are the stored shapes."""
     if not path.is_dir():
-        raise FileNotFoundError(f"{path}: the parameters are missing; {_MEND}")
+        raise MissingInput(f"{path}: the parameters are missing; {_MEND}")
     try:
         with _checkpointer() as checkpointer:
             stored = checkpointer.metadata(path).item_metadata
@@ -291,10 +307,10 @@ def _restore(path: Path, target: Any) -> Any:
     except Exception as error:
         # Orbax raises bare Exception, among others, for truncated and missing files.
         reason = " ".join(str(error).split())
-        raise ValueError(f"{path}: cannot be read ({type(error).__name__}: {reason:.200}); {_MEND}") from error
+        raise InputError(f"{path}: cannot be read ({type(error).__name__}: {reason:.200}); {_MEND}") from error
 
 
-class _OtherModelError(ValueError):
+class _OtherModelError(InputError):
     """The stored parameters are not those of the configuration."""
 
 
@@ -312,7 +328,7 @@ def _naming(path: Path) -> Iterator[None]:
     """Puts the file's path before errors that know only the tensor."""
     try:
         yield
-    except ValueError as error:
+    except InputError as error:
         if str(error).startswith(str(path)):
             raise
-        raise ValueError(f"{path}: {error}") from error
+        raise InputError(f"{path}: {error}") from error

@@ -2,50 +2,72 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import numpy as np
 import safetensors
 
+from logvggt_jax.errors import InputError, MissingInput, disk_errors
 from logvggt_jax.weights.lazy import LazyTensors
 from logvggt_jax.weights.torch_zip import open_torch_zip
 
-# Preferred first: safetensors cannot hold code.
-WEIGHT_FILES = ("model.safetensors", "model.pt")
+SUFFIXES = (".safetensors", ".pt")
+# Where there are several files; the first of them first, since safetensors cannot hold code.
+_USUAL_NAMES = ("model.safetensors", "model.pt")
 
 
 def find_weights(path: Path) -> Path:
-    """The checkpoint file that `path` (a file, or a folder with one of `WEIGHT_FILES`) means.
+    """The checkpoint file that `path` (a file, or a folder that holds one) means.
 
     Raises:
-      FileNotFoundError: Nothing is there, or the folder holds none of the known files.
-      ValueError: The file's suffix is neither `.safetensors` nor `.pt`.
+      MissingInput: Nothing is there, or the folder holds no checkpoint.
+      InputError: The file's suffix is not one of `SUFFIXES`, or the folder holds several checkpoints.
     """
     if path.is_dir():
-        for name in WEIGHT_FILES:
-            if (path / name).is_file():
-                return path / name
-        raise FileNotFoundError(f"{path}: the folder holds no {' or '.join(WEIGHT_FILES)}; give the file itself")
+        with disk_errors(path):
+            names = [file.name for file in path.iterdir() if file.is_file()]
+        return path / choose_weights(names, str(path), f"{path}/")
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file or folder; give a checkpoint file or the folder that holds it")
-    if path.suffix not in (".safetensors", ".pt"):
-        raise ValueError(f"{path}: unknown suffix {path.suffix!r}; expected a .safetensors or .pt checkpoint")
+        raise MissingInput(f"{path}: no such file or folder; give a checkpoint file or the folder that holds it")
+    if path.suffix not in SUFFIXES:
+        raise InputError(f"{path}: unknown suffix {path.suffix!r}; expected a .safetensors or .pt checkpoint")
     return path
+
+
+def choose_weights(names: Sequence[str], where: str, prefix: str) -> str:
+    """The one of these file names that holds a model's weights: the usual name, or the only checkpoint there is.
+
+    Args:
+      names: All files of the folder or repository.
+      where: What to call it in an error.
+      prefix: What a user puts before a name to choose the file.
+
+    Raises:
+      MissingInput: None is a checkpoint.
+      InputError: Several are, and none has a usual name; names them.
+    """
+    weights = sorted(name for name in names if name.endswith(SUFFIXES))
+    usual = [name for name in _USUAL_NAMES if name in weights]
+    if usual or len(weights) == 1:
+        return (usual or weights)[0]
+    if not weights:
+        raise MissingInput(f"{where}: holds no .safetensors or .pt file; give the file itself")
+    raise InputError(f"{where}: holds several checkpoints, {', '.join(weights)}; give one as {prefix}{weights[0]}")
 
 
 def open_state_dict(path: str | Path) -> AbstractContextManager[Mapping[str, np.ndarray]]:
     """Opens a checkpoint as a lazy mapping of PyTorch names to arrays, in the file's own dtype.
 
     Args:
-      path: A `.safetensors` or `.pt` file, or a folder with `model.safetensors` or `model.pt`.
+      path: A `.safetensors` or `.pt` file, or a folder that holds one.
 
     Returns:
       A context manager; the mapping reads tensors only while it is open.
 
     Raises:
-      FileNotFoundError, ValueError: As `find_weights`; ValueError also for a damaged or truncated file, and for
+      MissingInput, InputError: As `find_weights`; InputError also for a damaged or truncated file, and for
         a pickle that holds anything but tensors.
     """
     file = find_weights(Path(path))
@@ -55,10 +77,11 @@ def open_state_dict(path: str | Path) -> AbstractContextManager[Mapping[str, np.
 @contextmanager
 def _open_safetensors(path: Path) -> Iterator[Mapping[str, np.ndarray]]:
     try:
-        opened = safetensors.safe_open(path, framework="numpy")
+        with disk_errors(path):
+            opened = safetensors.safe_open(path, framework="numpy")
     except safetensors.SafetensorError as error:
         reason = " ".join(str(error).split())
-        raise ValueError(
+        raise InputError(
             f"{path}: not a readable safetensors file ({reason}); it is damaged or truncated, copy or download it again"
         ) from error
     with opened as file:

@@ -8,6 +8,7 @@ import jax
 from rich.table import Table
 
 from logvggt_jax.config import ModelConfig
+from logvggt_jax.weights.provenance import Provenance
 
 
 def model_summary(config: ModelConfig, params: dict[str, Any]) -> Table:
@@ -41,3 +42,16 @@ def model_summary(config: ModelConfig, params: dict[str, Any]) -> Table:
         table.add_row(part, f"{count:,}", f"{mebibytes:,.1f}", descriptions[part])
     table.add_row("all", f"{total:,}", f"{size:,.1f}", "", style="bold")
     return table
+
+
+def provenance_lines(provenance: Provenance) -> str:
+    """What the weights were trained for and where they come from, one line each."""
+    purpose = {"windows": "windows (LoG-VGGT)", "vggt": "all frames at once (VGGT)"}
+    edge = provenance.longer_edge
+    lines = {
+        "trained for": purpose.get(provenance.trained_for or ""),
+        "image size": f"longer edge {edge} pixels" if edge else None,
+        "licence": provenance.licence,
+        "source": provenance.source,
+    }
+    return "\n".join(f"{title}: {value or 'not recorded'}" for title, value in lines.items())

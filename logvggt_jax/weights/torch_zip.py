@@ -21,6 +21,7 @@ from typing import Any
 import ml_dtypes
 import numpy as np
 
+from logvggt_jax.errors import InputError, disk_errors
 from logvggt_jax.weights.lazy import LazyTensors
 
 _STORAGE_DTYPES = {
@@ -139,14 +140,15 @@ def open_torch_zip(path: Path) -> Iterator[Mapping[str, np.ndarray]]:
         tensors. Damage inside a storage is raised when its tensor is read.
     """
     try:
-        opened = zipfile.ZipFile(path)
+        with disk_errors(path):
+            opened = zipfile.ZipFile(path)
     except zipfile.BadZipFile as error:
-        raise ValueError(f"{path}: {_why_not_a_zip(path)}") from error
+        raise InputError(f"{path}: {_why_not_a_zip(path)}") from error
     with opened as archive:
         root = _root(archive, path)
         order = _read(archive, f"{root}byteorder", path) if f"{root}byteorder" in archive.namelist() else b"little"
         if order != b"little":
-            raise ValueError(f"{path}: byte order {order!r:.20} is not supported, expected little-endian; {_MEND}")
+            raise InputError(f"{path}: byte order {order!r:.20} is not supported, expected little-endian; {_MEND}")
         layouts = _layouts(_read(archive, f"{root}data.pkl", path), path)
 
         def read(name: str) -> np.ndarray:
@@ -155,7 +157,7 @@ def open_torch_zip(path: Path) -> Iterator[Mapping[str, np.ndarray]]:
             try:
                 return layout.view(data)
             except ValueError as error:
-                raise ValueError(f"{path}: tensor {name}: {error}; the file is damaged, copy it again") from error
+                raise InputError(f"{path}: tensor {name}: {error}; the file is damaged, copy it again") from error
 
         yield LazyTensors(list(layouts), read)
 
@@ -176,7 +178,7 @@ def _why_not_a_zip(path: Path) -> str:
 def _root(archive: zipfile.ZipFile, path: Path) -> str:
     roots = [n.removesuffix("data.pkl") for n in archive.namelist() if n == "data.pkl" or n.endswith("/data.pkl")]
     if len(roots) != 1:
-        raise ValueError(f"{path}: expected one data.pkl in the archive, found {len(roots)}; not a file of torch.save")
+        raise InputError(f"{path}: expected one data.pkl in the archive, found {len(roots)}; not a file of torch.save")
     return roots[0]
 
 
@@ -184,29 +186,29 @@ def _read(archive: zipfile.ZipFile, member: str, path: Path) -> bytes:
     try:
         info = archive.getinfo(member)
         if info.compress_type != zipfile.ZIP_STORED:
-            raise ValueError(f"{path}: {member} is compressed, torch.save never does that; {_MEND}")
+            raise InputError(f"{path}: {member} is compressed, torch.save never does that; {_MEND}")
         # Reading to the end checks the member's CRC.
         return archive.read(info)
     except (KeyError, zipfile.BadZipFile, EOFError, OSError) as error:
         reason = f"{member} is missing" if isinstance(error, KeyError) else str(error)
-        raise ValueError(f"{path}: {reason}; the file is damaged, copy or download it again") from error
+        raise InputError(f"{path}: {reason}; the file is damaged, copy or download it again") from error
 
 
 def _layouts(pickled: bytes, path: Path) -> dict[str, _TensorLayout]:
     try:
         state_dict = _TensorUnpickler(io.BytesIO(pickled)).load()
     except _RefusedError as error:
-        raise ValueError(f"{path}: {error}; {_MEND}") from error
+        raise InputError(f"{path}: {error}; {_MEND}") from error
     except Exception as error:
         # A malformed pickle raises whatever its broken instructions run into.
-        raise ValueError(
+        raise InputError(
             f"{path}: data.pkl is damaged ({type(error).__name__}: {error}); copy or download it again"
         ) from error
     if not isinstance(state_dict, dict):
-        raise ValueError(f"{path}: holds a {type(state_dict).__name__}, expected a flat state dict of tensors")
+        raise InputError(f"{path}: holds a {type(state_dict).__name__}, expected a flat state dict of tensors")
     for name, value in state_dict.items():
         if not isinstance(name, str) or not isinstance(value, _TensorLayout):
-            raise ValueError(
+            raise InputError(
                 f"{path}: entry {name!r:.80} is a {type(value).__name__}, expected a flat state dict of tensors; "
                 "save model.state_dict() alone"
             )

@@ -23,6 +23,7 @@ from logvggt_jax.config import (
     ModelConfig,
     RefinementConfig,
 )
+from logvggt_jax.errors import InputError
 from logvggt_jax.model.logvggt import LogVGGT
 
 ParamPath = tuple[str, ...]
@@ -233,11 +234,11 @@ def params_from_vggt(
     heads = ("track_head.",) if config.point_head is not None else ("track_head.", "point_head.")
     for name in state_dict:
         if name not in known and not name.startswith(heads):
-            raise ValueError(f"unknown key {name!r} in the state dict{_differences(state_dict, config)}")
+            raise InputError(f"unknown key {name!r} in the state dict{_differences(state_dict, config)}")
     report.skipped = [name for name in state_dict if name not in known]
     missing = [rule.name for rule in rules if rule.name not in state_dict]
     if missing:
-        raise ValueError(
+        raise InputError(
             f"{len(missing)} of {len(rules)} keys are missing from the state dict, first {', '.join(missing[:3])}"
             f"{_differences(state_dict, config)}"
         )
@@ -245,11 +246,11 @@ def params_from_vggt(
     for rule in rules:
         tensor = np.asarray(state_dict[rule.name])
         if tensor.shape != rule.shape:
-            raise ValueError(
+            raise InputError(
                 f"{rule.name} has shape {tensor.shape}, expected {rule.shape}{_differences(state_dict, config)}"
             )
         if tensor.dtype.name not in _DTYPES:
-            raise ValueError(f"{rule.name} is {tensor.dtype.name}, expected one of {', '.join(_DTYPES)}")
+            raise InputError(f"{rule.name} is {tensor.dtype.name}, expected one of {', '.join(_DTYPES)}")
         for path, layout in rule.targets:
             # A copy, because a view would keep the caller's array alive and follow its changes.
             _insert(params, path, jnp.array(layout(tensor).astype(np.float32)))
@@ -277,10 +278,10 @@ def config_from_vggt(state_dict: Mapping[str, np.ndarray], *, point_head: bool =
 
     def shape(name: str, rank: int) -> tuple[int, ...]:
         if name not in state_dict:
-            raise ValueError(f"the state dict lacks {name}, which VGGT has")
+            raise InputError(f"the state dict lacks {name}, which VGGT has")
         found = np.shape(state_dict[name])
         if len(found) != rank:
-            raise ValueError(f"{name} has shape {found}, VGGT's has {rank} axes")
+            raise InputError(f"{name} has shape {found}, VGGT's has {rank} axes")
         return found
 
     def count(prefix: str) -> int:
@@ -296,10 +297,10 @@ def config_from_vggt(state_dict: Mapping[str, np.ndarray], *, point_head: bool =
     positions = shape(f"{encoder}.pos_embed", 3)[1] - 1
     grid = round(positions**0.5)
     if grid * grid != positions:
-        raise ValueError(f"{encoder}.pos_embed holds {positions} grid positions, expected a square number")
+        raise InputError(f"{encoder}.pos_embed holds {positions} grid positions, expected a square number")
     depth = count(f"{frame}.")
     if depth != 24:
-        raise ValueError(
+        raise InputError(
             f"the state dict has {depth} aggregator blocks of each kind, VGGT has 24: the key layers are unknown; "
             "build a ModelConfig with aggregator.key_layers and call params_from_vggt"
         )
@@ -344,7 +345,7 @@ def _differences(state_dict: Mapping[str, np.ndarray], config: ModelConfig) -> s
     """How the configuration's sizes differ from those the state dict shows, as the end of an error's line."""
     try:
         found = config_from_vggt(state_dict, point_head=config.point_head is not None)
-    except ValueError as error:
+    except InputError as error:
         return f"; {error}"
     texts = []
     for part, fields in _SIZES.items():

@@ -13,6 +13,7 @@ from rich.console import Console
 
 from logvggt_jax.data.readers.seven_scenes import SevenScenes
 from logvggt_jax.data.rooms.rooms import Rooms
+from logvggt_jax.errors import InputError
 from logvggt_jax.evaluation.clips import load_clip
 from logvggt_jax.evaluation.datasets import open_benchmarks
 from logvggt_jax.evaluation.methods.baselines import static_camera, unit_depth
@@ -61,9 +62,9 @@ def test_without_a_list_of_test_sequences_all_are_taken_and_said_so(tmp_path: Pa
 
 def test_no_data_set_at_all_is_an_error_and_rooms_need_none(tmp_path: Path) -> None:
     both = chosen_protocols(SETTINGS, ["sintel-depth", "rooms-12"])
-    with pytest.raises(FileNotFoundError, match="holds none of the data sets sintel"):
+    with pytest.raises(InputError, match="holds none of the data sets sintel"):
         open_benchmarks(both, tmp_path, SETTINGS)
-    with pytest.raises(FileNotFoundError, match="no such folder; --data_root"):
+    with pytest.raises(InputError, match="no such folder; --data_root"):
         open_benchmarks(both, tmp_path / "none", SETTINGS)
     sintel, rooms = open_benchmarks(both, None, SETTINGS)
     assert "no --data_root" in sintel.missing

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -13,17 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays as number_arrays
 
-from logvggt_jax.evaluation import depth_metrics, scratch
-from logvggt_jax.evaluation.scratch import scratch_array
 from logvggt_jax.metrics import depth as depth_module
-from logvggt_jax.metrics.depth import (
-    DEPTH_KEYS,
-    align_depth,
-    clip_depth_metrics,
-    lower_median,
-    mean_depth_metrics,
-    resize_depth,
-)
+from logvggt_jax.metrics import depth_metrics
+from logvggt_jax.metrics.depth import DEPTH_KEYS, align_depth, lower_median, mean_depth_metrics, resize_depth
 
 REFERENCE_NAMES = {"scale_shift_lad_adam": "scale_shift"}
 CASES = (
@@ -175,30 +166,6 @@ def test_blocks_give_the_errors_of_the_whole(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(depth_module, "_BLOCK", 17)
     for name, errors in whole.items():
         assert depth_metrics(prediction, target, alignment=name, mask=mask) == pytest.approx(errors, rel=1e-6)
-
-
-def test_clips_are_resized_to_the_truth_frame_by_frame() -> None:
-    rng = np.random.default_rng(0)
-    target, prediction = rng.uniform(1, 2, (3, 20, 30)), rng.uniform(1, 2, (3, 10, 15))
-    made = clip_depth_metrics(prediction, target, alignments=("scale", "median"), max_depth=1.8, clip=1.9)
-    for name, errors in made.items():
-        resized = resize_depth(prediction, (20, 30))
-        assert errors == depth_metrics(resized, target, alignment=name, max_depth=1.8, clip=1.9)
-
-
-def test_memory_does_not_grow_with_the_clip(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is not in memory is in a file: `tracemalloc` sees numpy's own arrays and no memory map."""
-    monkeypatch.setattr(scratch, "_IN_MEMORY", 0)
-    monkeypatch.setattr(depth_module, "_BLOCK", 4096)
-    peaks = []
-    for count in (4, 64):
-        target, prediction = scratch_array((count, 60, 80), np.float32), scratch_array((count, 30, 40), np.float32)
-        target[:], prediction[:] = 2.0, 1.0
-        tracemalloc.start()
-        clip_depth_metrics(prediction, target, alignments=("scale", "median"))
-        peaks.append(tracemalloc.get_traced_memory()[1])
-        tracemalloc.stop()
-    assert peaks[1] < 1.1 * peaks[0]
 
 
 @pytest.mark.parametrize(

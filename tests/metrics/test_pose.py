@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays as number_arrays
 
-from logvggt_jax.evaluation import pose_accuracy, relative_pose_errors
 from logvggt_jax.geometry import compose, quaternion_to_matrix
+from logvggt_jax.metrics import pose_accuracy, relative_pose_errors
 
 POSE_CASES = (
     "noisy_small",

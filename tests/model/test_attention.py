@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from absl import logging
 from jax.experimental.pallas import tpu as pallas_tpu
 
 from logvggt_jax.model import attention as module
@@ -137,14 +140,77 @@ def test_the_tpu_kernel_computes_the_textbook(masked):
     np.testing.assert_allclose(np.asarray(out, np.float32), textbook(query, key, value, valid), atol=2e-2)
 
 
-def test_a_checked_shard_map_takes_a_form_that_it_can_check():
-    """The TPU's kernel does not say over which devices its result varies."""
+CUDNN = "jax._src.cudnn.fused_attention_stablehlo"
+
+
+@pytest.fixture
+def cudnn_for_lowering(monkeypatch):
+    """JAX asks the GPU at hand about cuDNN; programs can be lowered without one."""
+    monkeypatch.setattr(f"{CUDNN}.check_cudnn_version", lambda: 91000)
+    monkeypatch.setattr(f"{CUDNN}.check_compute_capability", lambda _: True)
+    monkeypatch.setattr(f"{CUDNN}.is_cuda_compute_capability_equal", lambda _: False)
+
+
+def gradients_of(*arguments, **options):
+    return jax.grad(lambda qkv: (attention(*qkv, *arguments[3:], **options).astype(jnp.float32) ** 2).sum())(
+        arguments[:3]
+    )
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize(("queries", "keys"), [(1041, 1041), (1041, 1042), (1042, 1041), (1042, 1042)])
+@pytest.mark.usefixtures("cudnn_for_lowering")
+def test_cudnn_is_lowered_forward_and_backward_at_any_length(queries, keys, masked):
+    query, key = (jax.ShapeDtypeStruct((2, n, 16, 64), jnp.bfloat16) for n in (queries, keys))
+    valid = (jax.ShapeDtypeStruct((2, keys), bool),) if masked else ()
+    differentiated = functools.partial(gradients_of, implementation="cudnn")
+    text = jax.jit(differentiated).trace(query, key, key, *valid).lower(lowering_platforms=("cuda",)).as_text()
+    assert (text.count("@__cudnn$fmhaSoftmax("), text.count("@__cudnn$fmhaSoftmaxBackward(")) == (1, 1)
+    inference = jax.jit(functools.partial(attention, implementation="cudnn"))
+    text = inference.trace(query, key, key, *valid).lower(lowering_platforms=("cuda",)).as_text()
+    assert text.count("@__cudnn$fmhaSoftmax(") == 1
+    assert "stablehlo.pad" not in text, "inference needs no padding"
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_padding_to_even_lengths_changes_no_gradient(monkeypatch, masked):
+    """The call of cuDNN, answered by the general implementation, which sees even lengths alone."""
+    general, lengths = jax.nn.dot_product_attention, set()
+
+    def answer(query, key, value, *, implementation, **options):
+        lengths.update((query.shape[1], key.shape[1]))
+        return general(query, key, value, implementation="xla", **options)
+
+    monkeypatch.setattr(jax.nn, "dot_product_attention", answer)
+    arguments = inputs(queries=37, keys=53, dtype=jnp.bfloat16)
+    valid = jnp.asarray(np.random.default_rng(1).random((2, 53)) < 0.6) if masked else None
+    found = gradients_of(*arguments, valid, implementation="cudnn")
+    assert lengths == {38, 54}
+    for a, b in zip(found, gradients_of(*arguments, valid, implementation="xla"), strict=True):
+        np.testing.assert_allclose(np.asarray(a, np.float32), np.asarray(b, np.float32), atol=2e-2)
+
+
+def test_each_fall_back_is_said_once(caplog, monkeypatch):
+    attention(*inputs(), implementation="cudnn")
+    assert not caplog.records, "what is small is not slower"
+    monkeypatch.setattr(module, "_SMALL_SCORES", 0)
+    logging.use_python_logging(quiet=True)
+    module._warn_once.cache_clear()
+    for _ in range(2):
+        attention(*inputs(), implementation="cudnn")
+        attention(*inputs(dtype=jnp.bfloat16), implementation="tpu_flash")
+    messages = [record.message for record in caplog.records]
+    assert len(messages) == 2
+    assert "from cudnn" in messages[0] and "not float32" in messages[0]
+    assert "from tpu_flash" in messages[1] and "at least 256 keys, not 53" in messages[1]
+
+
+def test_the_tpu_kernel_stands_inside_shard_map():
+    """It does not say over which devices its result varies, so that check has to be off, as in training."""
     shape = jax.ShapeDtypeStruct((2, 520, 2, 64), jnp.bfloat16)
     mesh = jax.make_mesh((2,), ("data",), axis_types=(jax.sharding.AxisType.Auto,))
     data = jax.P("data")
-
-    def gradient(*arguments):
-        return jax.grad(lambda args: attention(*args, implementation="tpu_flash").astype(jnp.float32).sum())(arguments)
-
-    sharded = jax.shard_map(gradient, mesh=mesh, in_specs=(data, data, data), out_specs=data)
-    assert jax.eval_shape(sharded, shape, shape, shape)[0].shape == shape.shape
+    differentiated = functools.partial(gradients_of, implementation="tpu_flash")
+    sharded = jax.shard_map(differentiated, mesh=mesh, in_specs=(data,) * 3, out_specs=data, check_vma=False)
+    program = jax.jit(sharded).trace(shape, shape, shape)
+    assert str(program.jaxpr).count("pallas_call") >= 3, "forward, and backward for queries and for keys"

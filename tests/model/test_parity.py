@@ -24,10 +24,11 @@ from logvggt_jax.geometry import (
 )
 from logvggt_jax.model.aggregator import Aggregator
 from logvggt_jax.model.camera_head import CameraHead
+from logvggt_jax.model.cross_window import CrossWindowMemory
 from logvggt_jax.model.dinov2 import DinoV2
 from logvggt_jax.model.dpt_head import DPTHead
 from logvggt_jax.model.logvggt import LogVGGT
-from logvggt_jax.model.rope import apply_rope, frame_positions, rope_table
+from logvggt_jax.model.rope import apply_rope, rope_table
 from logvggt_jax.weights import config_from_vggt, params_from_vggt
 
 TOKENS, DENSE, SIZE, GRID = 2e-6, 5e-6, (56, 70), (4, 5)
@@ -68,13 +69,13 @@ def modules(converted):
     """Encoder, aggregator, depth head and camera head with example arguments."""
     config, _ = converted
     width, patches = config.encoder.embed_dim, GRID[0] * GRID[1]
-    mask, nothing = jnp.ones((1, 6), bool), jnp.zeros((1, 0), bool)
-    cached = jnp.zeros((1, 4, 0, patches + 5, width))
+    mask, lengths, first = jnp.ones((1, 6), bool), jnp.full(1, 6), jnp.ones(1, bool)
+    nothing = CrossWindowMemory(jnp.zeros((1, 0)), jnp.zeros(1, jnp.int32), ())
     return {
         "encoder": (DinoV2(config.encoder, "float32", "auto"), (jnp.zeros((6, *SIZE, 3)),), {}),
         "aggregator": (
             Aggregator(config),
-            (jnp.zeros((1, 6, patches, width)), mask, cached, nothing, mask[:, 0]),
+            (jnp.zeros((1, 6, patches, width)), lengths, first, nothing),
             {"grid": GRID},
         ),
         "depth_head": (
@@ -286,17 +287,16 @@ def test_blocks(layers, golden, converted, name, source, path):
     module, params = layers[path]
     options = {}
     if "frame" in path:
-        options["rope"] = rope_table(golden["rope_pos"], 16, converted[0].aggregator.rope_base)
-    found = module.apply({"params": params}, golden[source], **options)
+        options["rope"] = rope_table(GRID, 5, 16, converted[0].aggregator.rope_base)
+    found, _ = module.apply({"params": params}, golden[source], **options)
     np.testing.assert_allclose(found, golden[name], rtol=0, atol=2e-6)
     assert relative_error(found, golden[name]) <= TOKENS
 
 
 def test_rotary_embedding(golden, converted):
-    table = rope_table(golden["rope_pos"], 16, converted[0].aggregator.rope_base)
+    table = rope_table(GRID, 5, 16, converted[0].aggregator.rope_base)
     found = apply_rope(jnp.swapaxes(golden["rope_in"], 1, 2), table)
     np.testing.assert_allclose(np.swapaxes(found, 1, 2), golden["rope_out"], rtol=0, atol=2e-6)
-    np.testing.assert_array_equal(frame_positions(GRID, 5), golden["rope_pos"])
 
 
 # -- geometry ---------------------------------------------------------------------------------------------------

@@ -31,7 +31,7 @@ def tokens(num_frames: int = FRAMES, batch: int = 1, seed: int = 0):
 
 @functools.lru_cache
 def sequence(model: LogVGGT):
-    return jax.jit(model.refine_sequence)
+    return jax.jit(model.refinement.refine_sequence)
 
 
 @functools.lru_cache
@@ -51,7 +51,7 @@ def test_zero_output_projection_is_the_identity(small_config, small_variables):
     params = dict(small_variables["params"])
     params["gccr"] = dict(params["gccr"], output=jax.tree.map(np.zeros_like, params["gccr"]["output"]))
     camera, register = tokens()
-    refined = LogVGGT(small_config).refine_tokens({"params": params}, camera, register, full())
+    refined = LogVGGT(small_config).refinement.refine_tokens({"params": params}, camera, register, full())
     np.testing.assert_array_equal(refined, camera)
 
 
@@ -59,14 +59,14 @@ def test_fresh_parameters_leave_camera_tokens_alone(small_config):
     model = LogVGGT(small_config)
     variables = model.init(jax.random.key(3), np.zeros((1, 1, 28, 42, 3), np.float32))
     camera, register = tokens()
-    np.testing.assert_array_equal(model.refine_tokens(variables, camera, register, full()), camera)
+    np.testing.assert_array_equal(model.refinement.refine_tokens(variables, camera, register, full()), camera)
 
 
 def test_disabled_is_the_camera_head_alone(small_config, small_variables):
     model = with_refinement(small_config, enabled=False)
     camera, register = tokens()
     poses = sequence(model)(small_variables, camera, register, full())
-    close(poses, model.decode_cameras(small_variables, camera, full()))
+    close(poses, model.refinement.decode_cameras(small_variables, camera, full()))
     with pytest.raises(AssertionError):
         close(poses, sequence(LogVGGT(small_config))(small_variables, camera, register, full()))
 
@@ -134,14 +134,14 @@ def by_hand(model: LogVGGT, variables, camera, register) -> np.ndarray:
     for trigger in range(num_triggers(num_frames, settings.period)):
         start, stop = trigger_range(trigger, num_frames, settings.period)
         past = register[:, :stop]
-        refined[:, start:stop] = model.refine_tokens(variables, camera[:, start:stop], past, full(stop))
+        refined[:, start:stop] = model.refinement.refine_tokens(variables, camera[:, start:stop], past, full(stop))
         if settings.context is None:
-            poses.append(model.decode_cameras(variables, refined[:, :stop], full(stop))[:, start:])
+            poses.append(model.refinement.decode_cameras(variables, refined[:, :stop], full(stop))[:, start:])
             continue
         for first in range(start, stop, group):
             last = min(first + group, stop)
             seen = sorted({0, *range(max(0, last - settings.context), last)})
-            decoded = model.decode_cameras(variables, refined[:, seen], full(len(seen)))
+            decoded = model.refinement.decode_cameras(variables, refined[:, seen], full(len(seen)))
             poses.append(decoded[:, [seen.index(f) for f in range(first, last)]])
     return np.concatenate(poses, axis=1)
 

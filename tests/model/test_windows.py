@@ -133,7 +133,7 @@ def assert_same_predictions(actual, expected, lengths):
 
 @functools.lru_cache
 def scan(model: LogVGGT):
-    return jax.jit(model.run_windows)
+    return jax.jit(model.windows.scan)
 
 
 def changed_frames(model, variables, images, frame, name="camera_tokens"):
@@ -220,7 +220,7 @@ def test_scan_temporaries_do_not_grow_with_the_sequence(small_config, small_vari
 
     def temporaries(num_frames):
         images = jax.ShapeDtypeStruct((1, num_frames, HEIGHT, WIDTH, 3), jnp.uint8)
-        compiled = jax.jit(model.run_windows).lower(small_variables, images).compile()
+        compiled = jax.jit(model.windows.scan).lower(small_variables, images).compile()
         return compiled.memory_analysis().temp_size_in_bytes
 
     assert temporaries(100) == temporaries(1000)

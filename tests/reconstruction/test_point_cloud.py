@@ -6,16 +6,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from plyfile import PlyData
+import trimesh
 
+from logvggt_jax.errors import InputError
 from logvggt_jax.reconstruction.point_cloud import (
     VERTEX,
     PointFilter,
     PointSelection,
+    count_points,
     frame_vertices,
-    write_point_cloud,
+    read_points,
+    write_points,
 )
-from logvggt_jax.reconstruction.viewer import read_points
 
 
 def random_frames(count: int = 5) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -56,28 +58,41 @@ def test_ply_holds_what_was_written(tmp_path: Path) -> None:
     for chunk in chunks:
         for name in VERTEX.names:
             chunk[name] = generator.integers(0, 256, len(chunk))
-    assert write_point_cloud(tmp_path / "p.ply", iter(chunks)) == 12
-    data = PlyData.read(str(tmp_path / "p.ply"))
-    assert not data.text
-    np.testing.assert_array_equal(data["vertex"].data, np.concatenate(chunks))
+    write_points(tmp_path / "p.ply", 12, iter(chunks))
+    written = np.concatenate(chunks)
     points, colours = read_points(tmp_path / "p.ply")
-    assert points.shape == colours.shape == (12, 3)
-    assert colours.dtype == np.uint8
+    assert points.dtype == np.float32 and colours.dtype == np.uint8
+    # Another library reads the same.
+    cloud = trimesh.load(tmp_path / "p.ply")
+    for found, colour in ((points, colours), (cloud.vertices, cloud.colors[:, :3])):
+        np.testing.assert_array_equal(found, np.stack([written[name] for name in "xyz"], axis=-1))
+        np.testing.assert_array_equal(colour, np.stack([written[name] for name in ("red", "green", "blue")], axis=-1))
+    assert count_points(tmp_path / "p.ply") == 12
     assert [path.name for path in tmp_path.iterdir()] == ["p.ply"]
 
 
 def test_an_empty_cloud_is_a_valid_file(tmp_path: Path) -> None:
-    assert write_point_cloud(tmp_path / "p.ply", iter([])) == 0
-    assert len(PlyData.read(str(tmp_path / "p.ply"))["vertex"].data) == 0
+    write_points(tmp_path / "p.ply", 0, iter([]))
+    assert count_points(tmp_path / "p.ply") == 0
+    assert read_points(tmp_path / "p.ply")[0].shape == (0, 3)
 
 
-def test_a_broken_frame_leaves_no_file(tmp_path: Path) -> None:
-    def chunks():
-        yield np.zeros(3, VERTEX)
-        raise ValueError("frame 1 is broken")
+def test_other_and_damaged_files_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "p.ply"
+    with pytest.raises(InputError, match=r"p\.ply does not exist"):
+        count_points(path)
+    write_points(path, 3, [np.zeros(3, VERTEX)])
+    whole = path.read_bytes()
+    for content in (whole[:-1], whole + b"\0", whole[:50], b"", whole.replace(b"float x", b"float w")):
+        path.write_bytes(content)
+        with pytest.raises(InputError, match=r"p\.ply is not a point cloud of this program, or is cut off"):
+            count_points(path)
 
-    with pytest.raises(ValueError, match="frame 1"):
-        write_point_cloud(tmp_path / "p.ply", chunks())
+
+@pytest.mark.parametrize("announced", [2, 4])
+def test_a_wrong_number_of_points_leaves_no_file(tmp_path: Path, announced: int) -> None:
+    with pytest.raises(ValueError, match=f"{announced} vertices announced, 3 given"):
+        write_points(tmp_path / "p.ply", announced, [np.zeros(3, VERTEX)])
     assert list(tmp_path.iterdir()) == []
 
 
@@ -94,7 +109,8 @@ def test_each_frame_is_written_before_the_next_is_made(tmp_path: Path) -> None:
             assert sum(alive) <= 2
             yield np.zeros(10, VERTEX).view(Frame)
 
-    assert write_point_cloud(tmp_path / "p.ply", chunks()) == 200
+    write_points(tmp_path / "p.ply", 200, chunks())
+    assert count_points(tmp_path / "p.ply") == 200
 
 
 def test_percentile_leaves_out_the_least_confident() -> None:

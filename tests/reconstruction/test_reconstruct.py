@@ -9,17 +9,18 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from plyfile import PlyData
 
 from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.data.feeding.transforms import preprocess
 from logvggt_jax.geometry import decode_poses, unproject
+from logvggt_jax.reconstruction.cameras_file import read_cameras
 from logvggt_jax.reconstruction.depth_files import as_stored, read_depth
-from logvggt_jax.reconstruction.point_cloud import PointFilter
-from logvggt_jax.reconstruction.reconstruct import Reconstruction, reconstruct
+from logvggt_jax.reconstruction.exporters.tum import read_trajectory
+from logvggt_jax.reconstruction.point_cloud import PointFilter, count_points
+from logvggt_jax.reconstruction.reconstruct import reconstruct
+from logvggt_jax.reconstruction.result import Reconstruction
 from logvggt_jax.reconstruction.room_sequence import write_room_sequence
 from logvggt_jax.reconstruction.sources import open_source
-from logvggt_jax.reconstruction.trajectory_files import read_cameras, read_trajectory
 from logvggt_jax.streaming.chunks import ChunkPlan
 from logvggt_jax.streaming.offline import predict_plain
 from logvggt_jax.streaming.windows import StreamSession
@@ -88,11 +89,11 @@ def expected(model: LogVGGT, variables: dict, room: Path) -> dict[str, np.ndarra
 
 def test_result_says_where_everything_lies(result: Reconstruction) -> None:
     assert sorted(path.name for path in result.folder.iterdir()) == sorted(
-        ["cameras.json", "trajectory.txt", "points.ply", "depth", "previews"]
+        ["cameras.json", "trajectory.txt", "points.ply", "depth", "images", "previews"]
     )
     assert result.num_frames == COUNT
     assert result.depth_size == (28, 42)
-    for name in ("cameras.json", "trajectory.txt", "points.ply", "depth", "previews"):
+    for name in ("cameras.json", "trajectory.txt", "points.ply", "depth", "images", "previews"):
         assert str(result.folder / name) in result.summary()
     assert len(list((result.folder / "previews").glob("*.png"))) == 3
     picture = cv2.imread(str(result.folder / "previews" / "frame-000003.png"))
@@ -124,14 +125,21 @@ def test_cameras_and_trajectory_agree(result: Reconstruction, expected: dict) ->
 
 
 def test_points_are_the_depth_maps_unprojected(result: Reconstruction, expected: dict) -> None:
-    vertices = PlyData.read(str(result.folder / "points.ply"))["vertex"].data
+    points, colours = result.points()
     valid = expected["depth"] > 1e-8
-    assert len(vertices) == result.num_points == valid.sum()
+    assert len(points) == result.num_points == valid.sum()
     world = unproject(expected["depth"], expected["intrinsics"], expected["extrinsics"])[valid]
-    points = np.stack([vertices[name] for name in "xyz"], axis=-1)
     np.testing.assert_allclose(points, world, rtol=2e-3, atol=2e-3 * np.abs(world).max())
-    colours = np.stack([vertices[name] for name in ("red", "green", "blue")], axis=-1)
-    np.testing.assert_array_equal(colours, expected["images"][valid])
+    # A few grey levels is what storing the frames as JPEG costs.
+    difference = np.abs(colours.astype(int) - expected["images"][valid])
+    assert difference.mean() < 2.5 and np.percentile(difference, 99) <= 8
+
+
+def test_the_frames_are_kept_as_the_model_saw_them(result: Reconstruction, expected: dict) -> None:
+    opened = Reconstruction.open(result.folder)
+    for index in range(COUNT):
+        difference = np.abs(opened.image(index).astype(int) - expected["images"][index])
+        assert difference.mean() < 2.5
 
 
 def test_a_video_gives_the_same_results_as_a_folder_of_its_frames(
@@ -180,7 +188,7 @@ def test_a_limit_on_points_holds(model: LogVGGT, variables: dict, room: Path, tm
     )
     assert limited.num_frames == 3
     assert limited.num_points == 100
-    assert len(PlyData.read(str(tmp_path / "out" / "points.ply"))["vertex"].data) == 100
+    assert count_points(tmp_path / "out" / "points.ply") == 100
     assert read_trajectory(tmp_path / "out" / "trajectory.txt")[0].tolist() == [0, 2, 4]
 
 
@@ -223,7 +231,7 @@ def test_few_frames_are_alive_at_a_time(
 
     monkeypatch.setattr(reconstruct_module, "_pictures", pictures)
     reconstruct(room, tmp_path / "out", model=model, variables=variables, longer_edge=LONGER_EDGE, progress=False)
-    assert len(made) == 80
+    assert len(made) == 40  # once each
     # A window, the frame at hand and the one read ahead.
     assert max(alive) <= 6
 
@@ -271,25 +279,6 @@ def test_bad_arguments_are_named(
         run(num_previews=-1)
     assert list(tmp_path.iterdir()) == []
     assert (result.folder / "cameras.json").is_file()
-
-
-def test_a_source_that_changes_meanwhile_is_noticed(
-    model: LogVGGT, variables: dict, room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    original = reconstruct_module._pictures
-    passes = []
-
-    def shrinking(source, longer_edge):
-        passes.append(0)
-        pictures = original(source, longer_edge)
-        for index, picture in enumerate(pictures):
-            if len(passes) == 1 or index < 2:
-                yield picture
-
-    monkeypatch.setattr(reconstruct_module, "_pictures", shrinking)
-    with pytest.raises(ValueError, match="frame-000002 is gone"):
-        reconstruct(room, tmp_path / "out", model=model, variables=variables, longer_edge=LONGER_EDGE, progress=False)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_no_field_of_view_is_reported_and_replaced(model: LogVGGT, variables: dict, room: Path, tmp_path: Path) -> None:

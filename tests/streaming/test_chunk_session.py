@@ -8,8 +8,8 @@ import pytest
 from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.geometry import decode_poses
 from logvggt_jax.streaming import ChunkPlan, ChunkSession
-from logvggt_jax.streaming import chunk_session as module
-from logvggt_jax.streaming.offline import ChunkPrediction
+from logvggt_jax.streaming import chunks as module
+from logvggt_jax.streaming.offline import PlainPrediction
 
 SIZE = (28, 42)
 IMAGES = np.random.default_rng(0).integers(0, 256, (9, *SIZE, 3), np.uint8)
@@ -20,7 +20,7 @@ def session(small_config: ModelConfig, monkeypatch: pytest.MonkeyPatch) -> Chunk
     """Chunks of four whose predictor turns the camera by a tenth of a radian a frame, in front of random depth."""
     depth = np.random.default_rng(1).uniform(1, 4, (256, *SIZE)).astype(np.float32)
 
-    def predict(model: LogVGGT, variables: dict, images: np.ndarray) -> ChunkPrediction:
+    def predict(model: LogVGGT, variables: dict, images: np.ndarray) -> PlainPrediction:
         angle = 0.1 * np.arange(len(images))
         zero, one = np.zeros_like(angle), np.ones_like(angle)
         rows = [[np.cos(angle), zero, np.sin(angle), zero], [zero, one, zero, zero]]
@@ -28,7 +28,7 @@ def session(small_config: ModelConfig, monkeypatch: pytest.MonkeyPatch) -> Chunk
         numbers = images[:, 0, 0, 0]
         intrinsics = np.tile(np.array([[40.0, 0, 21], [0, 40.0, 14], [0, 0, 1]], np.float32), (len(images), 1, 1))
         extrinsics = np.moveaxis(np.array(rows, np.float32), 2, 0)
-        return ChunkPrediction(depth[numbers], np.full((len(images), *SIZE), 2.0, np.float32), extrinsics, intrinsics)
+        return PlainPrediction(depth[numbers], np.full((len(images), *SIZE), 2.0, np.float32), extrinsics, intrinsics)
 
     monkeypatch.setattr(module, "predict_plain", predict)
     return ChunkSession(LogVGGT(small_config), {}, ChunkPlan(4, 2))

@@ -9,19 +9,19 @@ import pytest
 
 from logvggt_jax.geometry import Similarity, compose, quaternion_to_matrix, relative_to_first, umeyama, unproject
 from logvggt_jax.streaming.chunks import ChunkChain, ChunkPlan, align, move
-from logvggt_jax.streaming.offline import ChunkPrediction
+from logvggt_jax.streaming.offline import PlainPrediction
 
 FRAMES, HEIGHT, WIDTH = 23, 12, 16
 
 
 @pytest.fixture(scope="module")
-def truth() -> ChunkPrediction:
+def truth() -> PlainPrediction:
     """A sequence with random depth and poses; the world is the first camera."""
     generator = np.random.default_rng(0)
     rotation = quaternion_to_matrix(generator.normal(size=(FRAMES, 4)) * 0.2 + [0, 0, 0, 1])
     poses = np.concatenate([rotation, generator.normal(size=(FRAMES, 3, 1))], axis=2)
     intrinsics = np.tile(np.array([[14.0, 0, 8], [0, 13.0, 6], [0, 0, 1]]), (FRAMES, 1, 1))
-    return ChunkPrediction(
+    return PlainPrediction(
         depth=generator.uniform(1.0, 5.0, (FRAMES, HEIGHT, WIDTH)).astype(np.float32),
         depth_confidence=1 + generator.uniform(0.0, 4.0, (FRAMES, HEIGHT, WIDTH)).astype(np.float32),
         extrinsics=relative_to_first(poses)[:, :3].astype(np.float32),
@@ -37,18 +37,18 @@ def images() -> list[np.ndarray]:
 class Oracle:
     """Knows a frame by its number; a chunk comes in its first camera's frame and in a random unit."""
 
-    def __init__(self, truth: ChunkPrediction) -> None:
+    def __init__(self, truth: PlainPrediction) -> None:
         self.truth = truth
         self.chunks: list[list[int]] = []
         self.generator = np.random.default_rng(1)
 
-    def __call__(self, chunk: np.ndarray) -> ChunkPrediction:
+    def __call__(self, chunk: np.ndarray) -> PlainPrediction:
         numbers = chunk[:, 0, 0, 0].tolist()
         self.chunks.append(numbers)
         unit = 1.0 if len(self.chunks) == 1 else self.generator.uniform(0.3, 3.0)
         poses = relative_to_first(compose(self.truth.extrinsics[numbers], np.eye(4)).astype(np.float64))
         poses[:, :3, 3] *= unit
-        return ChunkPrediction(
+        return PlainPrediction(
             depth=unit * self.truth.depth[numbers],
             depth_confidence=self.truth.depth_confidence[numbers],
             extrinsics=poses[:, :3],
@@ -56,17 +56,17 @@ class Oracle:
         )
 
 
-def run(predict: Oracle, plan: ChunkPlan, count: int = FRAMES) -> ChunkPrediction:
+def run(predict: Oracle, plan: ChunkPlan, count: int = FRAMES) -> PlainPrediction:
     chain = ChunkChain(predict, plan)
     parts = [part for image in images()[:count] if (part := chain.push(image)) is not None]
     last = chain.close()
     assert last is not None
     fields = zip(*(part[:4] for part in (*parts, last)), strict=True)
-    return ChunkPrediction(*(np.concatenate(field) for field in fields))
+    return PlainPrediction(*(np.concatenate(field) for field in fields))
 
 
 @pytest.mark.parametrize(("size", "overlap"), [(8, 4), (7, 1), (9, 6), (22, 3), (23, 11), (40, 5)])
-def test_chain_recovers_poses_and_the_scale_of_depth(truth: ChunkPrediction, size: int, overlap: int) -> None:
+def test_chain_recovers_poses_and_the_scale_of_depth(truth: PlainPrediction, size: int, overlap: int) -> None:
     predict = Oracle(truth)
     result = run(predict, ChunkPlan(size, overlap))
     np.testing.assert_allclose(result.depth, truth.depth, rtol=1e-4)
@@ -77,15 +77,15 @@ def test_chain_recovers_poses_and_the_scale_of_depth(truth: ChunkPrediction, siz
 
 
 @pytest.mark.parametrize("count", range(1, 16))
-def test_every_length_gives_every_frame_once(truth: ChunkPrediction, count: int) -> None:
+def test_every_length_gives_every_frame_once(truth: PlainPrediction, count: int) -> None:
     predict = Oracle(truth)
     result = run(predict, ChunkPlan(6, 2), count)
     np.testing.assert_allclose(result.depth, truth.depth[:count], rtol=1e-4)
     assert predict.chunks == [list(range(*bounds)) for bounds in ChunkPlan(6, 2).ranges(count)]
 
 
-def test_wrong_pixels_move_the_similarity_little(truth: ChunkPrediction) -> None:
-    target = ChunkPrediction(*(x[:6] for x in truth[:4]))
+def test_wrong_pixels_move_the_similarity_little(truth: PlainPrediction) -> None:
+    target = PlainPrediction(*(x[:6] for x in truth[:4]))
     wrong = np.random.default_rng(2).random(target.depth.shape) < 0.1
     source = target._replace(depth=np.where(wrong, 3 * target.depth, target.depth))
     points = [unproject(p.depth, p.intrinsics, p.extrinsics).reshape(-1, 3) for p in (source, target)]
@@ -96,11 +96,11 @@ def test_wrong_pixels_move_the_similarity_little(truth: ChunkPrediction) -> None
     assert np.linalg.norm(robust.translation) < 0.2 * np.linalg.norm(plain.translation)
 
 
-def test_of_a_frame_in_two_chunks_the_later_counts(truth: ChunkPrediction) -> None:
+def test_of_a_frame_in_two_chunks_the_later_counts(truth: PlainPrediction) -> None:
     """The second chunk's own error at a frame it shares is what comes out."""
     predict = Oracle(truth)
 
-    def spoil(chunk: np.ndarray) -> ChunkPrediction:
+    def spoil(chunk: np.ndarray) -> PlainPrediction:
         prediction = predict(chunk)
         marked = prediction.depth_confidence.copy()
         marked[:] = len(predict.chunks)
@@ -110,9 +110,9 @@ def test_of_a_frame_in_two_chunks_the_later_counts(truth: ChunkPrediction) -> No
     assert result.depth_confidence[:, 0, 0].tolist() == [1] * 4 + [2] * 8
 
 
-def test_alignment_uses_what_both_are_confident_of(truth: ChunkPrediction) -> None:
+def test_alignment_uses_what_both_are_confident_of(truth: PlainPrediction) -> None:
     """Pixels that one of the two knows nothing of may hold anything."""
-    target = ChunkPrediction(*(x[:3] for x in truth[:4]))
+    target = PlainPrediction(*(x[:3] for x in truth[:4]))
     target = target._replace(depth_confidence=100 * target.depth_confidence)
     depth, confidence = target.depth.copy(), target.depth_confidence.copy()
     depth[:, :4], confidence[:, :4] = 50.0, 1.0
@@ -124,7 +124,7 @@ def test_alignment_uses_what_both_are_confident_of(truth: ChunkPrediction) -> No
     np.testing.assert_allclose(similarity.translation, 0, atol=1e-6)
 
 
-def test_points_move_with_depth_and_cameras(truth: ChunkPrediction) -> None:
+def test_points_move_with_depth_and_cameras(truth: PlainPrediction) -> None:
     rotation = quaternion_to_matrix(np.array([0.1, 0.3, -0.2, 0.9]))
     similarity = Similarity(2.5, rotation, np.array([1.0, -2.0, 0.5]))
     points = unproject(truth.depth, truth.intrinsics, truth.extrinsics)
@@ -135,7 +135,7 @@ def test_points_move_with_depth_and_cameras(truth: ChunkPrediction) -> None:
     np.testing.assert_allclose(again, moved.points, rtol=1e-3, atol=1e-3)
 
 
-def test_no_more_than_a_chunk_is_held(truth: ChunkPrediction) -> None:
+def test_no_more_than_a_chunk_is_held(truth: PlainPrediction) -> None:
     plan, alive, seen = ChunkPlan(6, 2), [], []
     chain = ChunkChain(Oracle(truth), plan)
     predictions: list[weakref.ref] = []
@@ -153,10 +153,10 @@ def test_no_more_than_a_chunk_is_held(truth: ChunkPrediction) -> None:
     )
 
 
-def test_chunks_that_do_not_fit_are_named(truth: ChunkPrediction) -> None:
+def test_chunks_that_do_not_fit_are_named(truth: PlainPrediction) -> None:
     predict = Oracle(truth)
 
-    def blind(chunk: np.ndarray) -> ChunkPrediction:
+    def blind(chunk: np.ndarray) -> PlainPrediction:
         prediction = predict(chunk)
         return (
             prediction

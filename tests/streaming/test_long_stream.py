@@ -22,7 +22,7 @@ def live_bytes() -> int:
 def test_long_stream(small_config, small_variables):
     model = LogVGGT(small_config)
     images = np.random.default_rng(0).integers(0, 256, (FRAMES, 28, 42, 3), dtype=np.uint8)
-    session = StreamSession(model, small_variables, chunk=CHUNK)
+    session = StreamSession(model, small_variables, first_capacity=CHUNK)
     depth, held = [], {}
     for index, frame in enumerate(images):
         # Copies: on a CPU the results are views of device buffers, which live as long as somebody holds them.

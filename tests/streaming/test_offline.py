@@ -9,21 +9,21 @@ import numpy as np
 import pytest
 
 from logvggt_jax import LogVGGT, ModelConfig, WindowConfig
-from logvggt_jax.model import logvggt as module
+from logvggt_jax.model import windows as module
 from logvggt_jax.streaming.chunks import ChunkChain, ChunkPlan
-from logvggt_jax.streaming.offline import ChunkPrediction, plain_vggt, predict_plain
+from logvggt_jax.streaming.offline import PlainPrediction, plain_vggt, predict_plain
 
 FRAMES = 6
 IMAGES = np.random.default_rng(0).integers(0, 256, (FRAMES, 28, 42, 3), np.uint8)
 
 
 @pytest.fixture(scope="module")
-def whole(small_config: ModelConfig, small_variables: dict) -> ChunkPrediction:
+def whole(small_config: ModelConfig, small_variables: dict) -> PlainPrediction:
     return predict_plain(LogVGGT(small_config), small_variables, IMAGES)
 
 
 def test_one_window_over_all_frames_whatever_its_stride(
-    small_config: ModelConfig, small_variables: dict, whole: ChunkPrediction
+    small_config: ModelConfig, small_variables: dict, whole: PlainPrediction
 ) -> None:
     model = LogVGGT(dataclasses.replace(small_config, windows=WindowConfig(FRAMES, FRAMES - 1)))
     predictions = jax.jit(model.apply)(small_variables, IMAGES[None])
@@ -31,7 +31,7 @@ def test_one_window_over_all_frames_whatever_its_stride(
     np.testing.assert_allclose(whole.extrinsics, predictions.extrinsics[0], rtol=2e-4, atol=2e-4)
 
 
-def test_every_frame_sees_every_other(small_config: ModelConfig, small_variables: dict, whole: ChunkPrediction) -> None:
+def test_every_frame_sees_every_other(small_config: ModelConfig, small_variables: dict, whole: PlainPrediction) -> None:
     changed = IMAGES.copy()
     changed[-1] = 255 - changed[-1]
     other = predict_plain(LogVGGT(small_config), small_variables, changed)
@@ -54,7 +54,7 @@ def test_one_frame_alone(small_config: ModelConfig, small_variables: dict) -> No
 
 @pytest.mark.parametrize("size", [FRAMES, FRAMES + 3])
 def test_a_chunk_as_long_as_the_sequence_is_plain_vggt(
-    small_config: ModelConfig, small_variables: dict, whole: ChunkPrediction, size: int
+    small_config: ModelConfig, small_variables: dict, whole: PlainPrediction, size: int
 ) -> None:
     chain = ChunkChain(lambda chunk: predict_plain(LogVGGT(small_config), small_variables, chunk), ChunkPlan(size, 2))
     parts = [part for image in IMAGES if (part := chain.push(image)) is not None]
@@ -66,7 +66,7 @@ def test_a_chunk_as_long_as_the_sequence_is_plain_vggt(
 
 
 def test_dense_heads_in_groups_give_the_same(
-    small_config: ModelConfig, small_variables: dict, whole: ChunkPrediction, monkeypatch: pytest.MonkeyPatch
+    small_config: ModelConfig, small_variables: dict, whole: PlainPrediction, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "_DENSE_PIXELS", 2 * 28 * 42)
     predictions = jax.jit(plain_vggt(LogVGGT(small_config), FRAMES).apply)(small_variables, IMAGES[None])

@@ -48,7 +48,7 @@ def assert_equals_whole(
 ) -> None:
     """Streams of `counts` frames give the depth in `whole` and the poses that the model's mode makes of its tokens."""
     rows = np.array(counts) - 1
-    expected = jax.jit(model.refine_sequence)(
+    expected = jax.jit(model.refinement.refine_sequence)(
         variables, whole.camera_tokens[rows], whole.register_tokens[rows], LENGTHS[rows]
     )
     for count, encodings in zip(counts, expected, strict=True):
@@ -67,7 +67,7 @@ def test_stream_equals_apply_for_every_length(
     small_config: ModelConfig, small_variables: dict, frames: np.ndarray, whole: Predictions
 ) -> None:
     for count in range(1, 14):
-        session = StreamSession(with_modes(small_config), small_variables, chunk=16)
+        session = StreamSession(with_modes(small_config), small_variables, first_capacity=16)
         results = stream(session, frames[:count])
         assert [result.index for result in results] == list(range(count))
         expected = jax.tree.map(lambda x, row=count - 1, stop=count: x[row, :stop], whole)
@@ -96,7 +96,7 @@ def test_stream_equals_whole_in_every_refinement_mode(
     small_config: ModelConfig, small_variables: dict, frames: np.ndarray, whole: Predictions, mode: dict
 ) -> None:
     model = with_modes(small_config, **mode)
-    assert_equals_whole(model, small_variables, frames, whole, [1, 4, 6, 10, 13], chunk=16)
+    assert_equals_whole(model, small_variables, frames, whole, [1, 4, 6, 10, 13], first_capacity=16)
 
 
 @pytest.mark.slow
@@ -105,7 +105,7 @@ def test_stream_equals_whole_with_other_windows(
 ) -> None:
     model = with_modes(small_config, size=5, stride=2, period=3)
     expected = jax.jit(model.apply)(small_variables, frames[None, :8])
-    session = StreamSession(model, small_variables, chunk=16)
+    session = StreamSession(model, small_variables, first_capacity=16)
     results = stream(session, frames[:8])
     np.testing.assert_allclose([r.depth for r in results], expected.depth[0], rtol=2e-5, atol=2e-5)
     np.testing.assert_allclose(session.cameras().pose_encoding, expected.pose_encoding[0], rtol=1e-4, atol=2e-5)
@@ -115,14 +115,14 @@ def test_buffers_that_grow_on_the_way_change_nothing(
     small_config: ModelConfig, small_variables: dict, frames: np.ndarray, whole: Predictions
 ) -> None:
     model = with_modes(small_config, period=5)
-    assert_equals_whole(model, small_variables, frames, whole, [13], chunk=8)
+    assert_equals_whole(model, small_variables, frames, whole, [13], first_capacity=8)
 
 
 def test_frames_in_any_grouping(small_config: ModelConfig, small_variables: dict, frames: np.ndarray) -> None:
     model = with_modes(small_config)
-    one_by_one = StreamSession(model, small_variables, chunk=16)
+    one_by_one = StreamSession(model, small_variables, first_capacity=16)
     expected = stream(one_by_one, frames)
-    grouped = StreamSession(model, small_variables, chunk=16)
+    grouped = StreamSession(model, small_variables, first_capacity=16)
     results = grouped.push(frames[:1]) + grouped.push(frames[1:8]) + grouped.push(frames[8:])
     results += grouped.close()
     np.testing.assert_array_equal([r.depth for r in results], [r.depth for r in expected])
@@ -132,17 +132,48 @@ def test_frames_in_any_grouping(small_config: ModelConfig, small_variables: dict
 def test_depth_comes_as_soon_as_its_last_window_is_done(
     small_config: ModelConfig, small_variables: dict, frames: np.ndarray
 ) -> None:
-    session = StreamSession(with_modes(small_config), small_variables, chunk=16)
+    session = StreamSession(with_modes(small_config), small_variables, first_capacity=16, ahead=0)
     final = [len(session.push(frame)) for frame in frames[:9]]
     assert final == [0, 0, 0, 2, 0, 2, 0, 2, 0]
     assert len(session.close()) == 3
     assert session.close() == []
 
 
+def test_a_window_ahead_delays_the_results_and_changes_nothing(
+    small_config: ModelConfig, small_variables: dict, frames: np.ndarray
+) -> None:
+    """The device works on a window while the caller has the results of the one before."""
+    model = with_modes(small_config, period=2)
+    sessions = [StreamSession(model, small_variables, first_capacity=16, ahead=ahead) for ahead in (0, 1)]
+    counts = [[len(session.push(frame)) for frame in frames[:9]] for session in sessions]
+    assert counts[1] == [0, 0, 0, 0, 0, 2, 0, 2, 0]
+    results = [session.push(frames[9:]) + session.close() for session in sessions]
+    assert [len(each) for each in results] == [7, 9]
+    for at_once, later in zip(results[0], results[1][2:], strict=True):
+        assert (at_once.index, at_once.pose_is_final) == (later.index, later.pose_is_final)
+        np.testing.assert_array_equal(at_once.depth, later.depth)
+        np.testing.assert_array_equal(at_once.pose_encoding, later.pose_encoding)
+    np.testing.assert_array_equal(sessions[0].cameras().extrinsics, sessions[1].cameras().extrinsics)
+
+
+@pytest.mark.parametrize("mode", [{"enabled": False}, {"period": 5}, {"context": 4}], ids=str)
+def test_other_modes_on_the_same_windows_are_streams_of_their_own(
+    small_config: ModelConfig, small_variables: dict, frames: np.ndarray, mode: dict
+) -> None:
+    session = StreamSession(with_modes(small_config), small_variables, first_capacity=16)
+    stream(session, frames)
+    own = StreamSession(with_modes(small_config, **mode), small_variables, first_capacity=16)
+    stream(own, frames)
+    cameras = session.cameras_with(with_modes(small_config, **mode).config.refinement)
+    np.testing.assert_allclose(cameras.pose_encoding, own.cameras().pose_encoding, rtol=1e-4, atol=2e-5)
+    assert cameras.is_final.all()
+    assert len(session.cameras().extrinsics) == len(frames)
+
+
 def test_online_poses_are_final_with_the_depth_and_never_move(
     small_config: ModelConfig, small_variables: dict, frames: np.ndarray
 ) -> None:
-    session = StreamSession(with_modes(small_config, period=2), small_variables, chunk=16)
+    session = StreamSession(with_modes(small_config, period=2), small_variables, first_capacity=16)
     results = stream(session, frames)
     assert all(result.pose_is_final for result in results)
     np.testing.assert_array_equal(
@@ -155,8 +186,8 @@ def test_provisional_poses_are_those_of_a_stream_that_ends_there(
     small_config: ModelConfig, small_variables: dict, frames: np.ndarray, whole: Predictions, mode: dict
 ) -> None:
     model = with_modes(small_config, **mode)
-    refine = jax.jit(model.refine_sequence)
-    session = StreamSession(model, small_variables, chunk=16, provisional=True)
+    refine = jax.jit(model.refinement.refine_sequence)
+    session = StreamSession(model, small_variables, first_capacity=16, provisional=True, ahead=0)
     results = session.push(frames[:8])
     assert len(results) == 6
     assert results[-1].pose_encoding is not None
@@ -180,7 +211,7 @@ def test_nothing_compiles_per_frame_and_the_state_does_not_grow(
     small_config: ModelConfig, small_variables: dict
 ) -> None:
     model = with_modes(small_config, period=2, context=3)
-    session = StreamSession(model, small_variables, chunk=64)
+    session = StreamSession(model, small_variables, first_capacity=64)
     frame = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     session.push(np.stack([frame] * 8))
 
@@ -200,8 +231,20 @@ def test_nothing_compiles_per_frame_and_the_state_does_not_grow(
     assert len(session._pending) < 2
 
 
+def test_programs_grow_with_the_logarithm_of_an_online_stream(small_config: ModelConfig, small_variables: dict) -> None:
+    """Buffers double: from 4 frames to 128 there are six sizes, and no more programs than that."""
+    session = StreamSession(with_modes(small_config, period=2, context=2), small_variables, first_capacity=4)
+    frame, before = np.zeros((HEIGHT, WIDTH, 3), np.uint8), session_module._fire._cache_size()
+    for _ in range(120):
+        session.push(frame)
+    session.close()
+    assert len(session.cameras().is_final) == 120
+    assert session._store.capacity == 128
+    assert session_module._fire._cache_size() - before <= 6
+
+
 def test_an_empty_stream_has_no_frames(small_config: ModelConfig, small_variables: dict) -> None:
-    session = StreamSession(with_modes(small_config), small_variables, chunk=16)
+    session = StreamSession(with_modes(small_config), small_variables, first_capacity=16)
     assert session.close() == []
     assert session.cameras().extrinsics.shape == (0, 3, 4)
 
@@ -217,14 +260,14 @@ def test_an_empty_stream_has_no_frames(small_config: ModelConfig, small_variable
     ],
 )
 def test_bad_frames_are_named(small_config: ModelConfig, small_variables: dict, bad: np.ndarray, message: str) -> None:
-    session = StreamSession(with_modes(small_config), small_variables, chunk=16)
+    session = StreamSession(with_modes(small_config), small_variables, first_capacity=16)
     session.push(np.zeros((28, 42, 3), np.float32))
     with pytest.raises(ValueError, match=message):
         session.push(bad)
 
 
 def test_a_closed_session_takes_no_frames(small_config: ModelConfig, small_variables: dict) -> None:
-    session = StreamSession(with_modes(small_config), small_variables, chunk=16)
+    session = StreamSession(with_modes(small_config), small_variables, first_capacity=16)
     session.close()
     with pytest.raises(ValueError, match="closed"):
         session.push(np.zeros((28, 42, 3), np.float32))

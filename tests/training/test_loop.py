@@ -23,7 +23,7 @@ from logvggt_jax.training.loop import NonFiniteTraining, train
 from logvggt_jax.training.metrics_log import MetricsLog, read_metrics
 from logvggt_jax.training.sharding import data_mesh
 from logvggt_jax.training.state import TrainState
-from logvggt_jax.weights.checkpoints import digests, load_model
+from logvggt_jax.weights.checkpoints import digests, load_model, read_provenance
 
 UNTIMED = ("time", "frames_per_second")
 
@@ -228,6 +228,8 @@ def test_real_model_trains_and_leaves_a_model_folder(run_config: TrainConfig, tm
     state = train(run_config, tmp_path, mesh=data_mesh(1))
     model, variables = load_model(tmp_path / "model")
     assert model.config == run_config.model
+    provenance = read_provenance(tmp_path / "model")
+    assert provenance.trained_for == "windows" and provenance.longer_edge == 42
     jax.tree.map(np.testing.assert_array_equal, variables["params"], jax.device_get(state.params))
     losses = [entry["loss/total"] for entry in _numbers(tmp_path)]
     assert all(np.isfinite(losses))

@@ -17,30 +17,22 @@ from logvggt_jax.training.config import LossConfig, OptimizerConfig, StageConfig
 from logvggt_jax.training.optimizer import learning_rate_schedule, make_optimizer
 from logvggt_jax.training.sharding import check_batch_size, data_mesh, put_batch, replicated
 from logvggt_jax.training.state import initial_state
-from logvggt_jax.training.step import CompiledSteps, make_loss, make_train_step
+from logvggt_jax.training.step import loss_and_gradients, make_loss_terms, make_train_step
 
 Clips = dict[str, np.ndarray]
 STAGES = (StageConfig("only", 8, 5, 8, 1, 1, ((28, 42),)),)
 
 
 def _gradients(model: Any, config: LossConfig, mesh: Mesh, params: Any, clips: Clips) -> tuple[Any, Any]:
-    loss = make_loss(model, config)
+    terms = make_loss_terms(model, config)
 
-    def value_and_gradients(params: Any, batch: Any) -> Any:
-        return jax.value_and_grad(loss, has_aux=True)(params, batch)
+    def logged_and_gradients(params: Any, batch: Any) -> Any:
+        return loss_and_gradients(terms, config, params, batch)[1:]
 
-    sharded = jax.shard_map(value_and_gradients, mesh=mesh, in_specs=(P(), P("data")), out_specs=(P(), P()))
-    (_, metrics), gradients = jax.jit(sharded)(jax.device_put(params, replicated(mesh)), put_batch(clips, mesh))
-    return jax.device_get(metrics), jax.device_get(gradients)
-
-
-def _start(model: Any, config: LossConfig, optimizer_config: OptimizerConfig, mesh: Mesh, params: Any) -> Any:
-    optimizer = make_optimizer(optimizer_config, params, frozen=("encoder",))
-    schedule = learning_rate_schedule(optimizer_config, STAGES)
-    step = make_train_step(make_loss(model, config), optimizer, schedule, mesh)
-    # A copy: the state is donated.
-    state = initial_state(jax.tree.map(jnp.array, params), optimizer)
-    return step, jax.device_put(state, replicated(mesh))
+    sharded = jax.shard_map(
+        logged_and_gradients, mesh=mesh, in_specs=(P(), P("data")), out_specs=(P(), P()), check_vma=False
+    )
+    return jax.device_get(jax.jit(sharded)(jax.device_put(params, replicated(mesh)), put_batch(clips, mesh)))
 
 
 def test_gradient_on_many_devices_is_that_on_one(
@@ -78,14 +70,23 @@ def test_total_is_the_weighted_sum_of_its_terms(
     assert metrics["loss/total"] == pytest.approx(5.0 * metrics["loss/camera"] + 2.0 * depth, rel=1e-5)
 
 
-def test_released_trainers_losses_are_an_option(
+def test_released_trainers_losses_are_averaged_over_devices_as_they_are(
     pixel_model: Any, loss_config: LossConfig, pixel_params: Any, clips: Clips
 ) -> None:
+    """Its data parallelism averages what each device finds over its own pixels, quantiles among them."""
     config = dataclasses.replace(loss_config, name="vggt", quantile=0.98, camera_weight=5.0)
+    halves = [{key: value[part] for key, value in clips.items()} for part in (slice(0, 4), slice(4, 8))]
+    alone = [_gradients(pixel_model, config, data_mesh(1), pixel_params, half) for half in halves]
     metrics, gradients = _gradients(pixel_model, config, data_mesh(2), pixel_params, clips)
-    terms = {name for name in metrics if name.startswith("loss/")}
-    assert {"loss/camera_rotation", "loss/depth_regression"} <= terms
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
+    assert {"loss/camera_rotation", "loss/depth_regression"} <= metrics.keys()
+    for name in (name for name in metrics if name.startswith("loss/")):
+        assert metrics[name] == pytest.approx((alone[0][0][name] + alone[1][0][name]) / 2, rel=1e-5), name
+    jax.tree.map(
+        lambda a, b, both: np.testing.assert_allclose(both, (a + b) / 2, rtol=2e-5, atol=1e-6),
+        alone[0][1],
+        alone[1][1],
+        gradients,
+    )
 
 
 def test_steps_learn_and_are_traced_once(
@@ -93,15 +94,15 @@ def test_steps_learn_and_are_traced_once(
 ) -> None:
     mesh = data_mesh(4)
     traces = 0
-    loss = make_loss(pixel_model, loss_config)
+    terms = make_loss_terms(pixel_model, loss_config)
 
     def counted(params: Any, batch: Any) -> Any:
         nonlocal traces
         traces += 1
-        return loss(params, batch)
+        return terms(params, batch)
 
     optimizer = make_optimizer(optimizer_config, pixel_params, frozen=("encoder",))
-    step = make_train_step(counted, optimizer, learning_rate_schedule(optimizer_config, STAGES), mesh)
+    step = make_train_step(counted, loss_config, optimizer, learning_rate_schedule(optimizer_config, STAGES), mesh)
     state = jax.device_put(initial_state(jax.tree.map(jnp.array, pixel_params), optimizer), replicated(mesh))
     losses, kinds = [], jax.tree.map(lambda x: (x.shape, x.dtype, x.weak_type), state)
     for _ in range(6):
@@ -114,20 +115,6 @@ def test_steps_learn_and_are_traced_once(
     np.testing.assert_array_equal(state.params["encoder"]["kernel"], pixel_params["encoder"]["kernel"])
 
 
-def test_compiled_steps_refuse_another_state(
-    pixel_model: Any, loss_config: LossConfig, optimizer_config: OptimizerConfig, pixel_params: Any, clips: Clips
-) -> None:
-    mesh = data_mesh(1)
-    step, state = _start(pixel_model, loss_config, optimizer_config, mesh, pixel_params)
-    steps, batch = CompiledSteps(step), put_batch(clips, mesh)
-    assert not steps.has(batch)
-    steps.compile(state, batch)
-    assert steps.has(batch)
-    assert not steps.has(put_batch({key: value[:4] for key, value in clips.items()}, mesh))
-    with pytest.raises(TypeError):
-        steps(state._replace(step=jnp.zeros((), jnp.float32)), batch)
-
-
 @pytest.mark.parametrize("broken", ["loss", "gradient"])
 def test_non_finite_updates_are_skipped_and_counted(
     pixel_model: Any,
@@ -138,18 +125,22 @@ def test_non_finite_updates_are_skipped_and_counted(
     broken: str,
 ) -> None:
     mesh = data_mesh(2)
-    loss = make_loss(pixel_model, loss_config)
+    terms = make_loss_terms(pixel_model, loss_config)
 
     def breakable(params: Any, batch: Any) -> Any:
         """Black pictures make the loss NaN, or leave it finite and make its gradient NaN."""
-        value, metrics = loss(params, batch)
-        light = jnp.where(jax.lax.psum(batch["images"].astype(jnp.float32).sum(), "data") > 0, 1.0, 0.0)
+        means, figures = terms(params, batch)
+        light = jnp.where(batch["images"].astype(jnp.float32).sum() > 0, 1.0, 0.0)
         if broken == "loss":
-            return value + jnp.where(light > 0, 0.0, jnp.nan), metrics
-        return value + jnp.sqrt(light * params["camera_head"]["bias"].sum() ** 2), metrics
+            added = jnp.where(light > 0, 0.0, jnp.nan)
+        else:
+            added = jnp.sqrt(light * params["camera_head"]["bias"].sum() ** 2)
+        camera = means["camera"]
+        return {**means, "camera": camera._replace(numerator=camera.numerator + added)}, figures
 
     optimizer = make_optimizer(optimizer_config, pixel_params, frozen=())
-    step = make_train_step(breakable, optimizer, learning_rate_schedule(optimizer_config, STAGES), mesh)
+    schedule = learning_rate_schedule(optimizer_config, STAGES)
+    step = make_train_step(breakable, loss_config, optimizer, schedule, mesh)
     state = jax.device_put(initial_state(jax.tree.map(jnp.array, pixel_params), optimizer), replicated(mesh))
     good = put_batch(clips, mesh)
     bad = put_batch({**clips, "images": np.zeros_like(clips["images"])}, mesh)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from typing import Any
 
 import pytest
+from ml_collections import ConfigDict
 
 from logvggt_jax.data.feeding.augmentation import ColourAugmentation
 from logvggt_jax.data.feeding.holdouts import HoldOut
+from logvggt_jax.errors import InputError
 from logvggt_jax.training.config import TrainConfig
 
 
@@ -39,10 +42,25 @@ def test_every_data_setting_survives_the_mapping(run_config: TrainConfig) -> Non
     assert found == config and hash(found) == hash(config)
 
 
-def test_stages_run_in_the_order_of_their_names(run_config: TrainConfig) -> None:
-    values = _mapping(run_config)
-    values["stages"] = {"b": values["stages"]["first"], "a": values["stages"]["second"]}
-    assert [stage.name for stage in TrainConfig.from_dict(values).stages] == ["a", "b"]
+def test_settings_survive_the_form_that_checkpoints_store(run_config: TrainConfig) -> None:
+    stored = json.loads(json.dumps(run_config.to_dict()))
+    assert TrainConfig.from_dict(stored) == run_config
+    assert stored == run_config.to_dict()
+
+
+def test_stages_run_in_the_order_written(run_config: TrainConfig) -> None:
+    fields = _mapping(run_config)["stages"]["first"]
+
+    def order(stages: Any) -> list[str]:
+        return [stage.name for stage in TrainConfig.from_dict({**_mapping(run_config), "stages": stages}).stages]
+
+    assert order({"warm-up": fields, "main": fields}) == ["warm-up", "main"]
+    names = [f"stage_{number}" for number in (1, 2, 10, 11)]
+    assert order(dict.fromkeys(names, fields)) == names
+    assert order([{**fields, "name": name} for name in ("b", "a")]) == ["b", "a"]
+    # ConfigDict sorts what it holds; a name's number decides where that lost the order.
+    assert order(ConfigDict(dict.fromkeys(names, fields)).to_dict()) == names
+    assert order(ConfigDict({"b": fields, "a": fields}, sort_keys=False).to_dict()) == ["b", "a"]
 
 
 @pytest.mark.parametrize(
@@ -54,7 +72,7 @@ def test_stages_run_in_the_order_of_their_names(run_config: TrainConfig) -> None
         (("data", "sources", "rooms", "path"), "unknown field config.data.sources.rooms.path"),
         (("data", "hold_out", "scannet", "name"), "unknown field config.data.hold_out.scannet.name"),
         (("data", "augmentation", "noise"), "unknown field config.data.augmentation.noise; ColourAugmentation knows"),
-        (("model", "widht"), "unknown field model.widht"),
+        (("model", "widht"), "unknown field config.model.widht"),
     ],
 )
 def test_unknown_fields_are_named(run_config: TrainConfig, path: tuple[str, ...], message: str) -> None:
@@ -72,35 +90,50 @@ def test_unknown_fields_are_named(run_config: TrainConfig, path: tuple[str, ...]
 def test_missing_fields_are_named(run_config: TrainConfig) -> None:
     values = _mapping(run_config)
     del values["loss"]["gamma"]
-    with pytest.raises(ValueError, match=r"missing field config\.loss\.gamma of LossConfig"):
+    with pytest.raises(ValueError, match=r"missing field config\.loss\.gamma, a number; LossConfig knows"):
         TrainConfig.from_dict(values)
 
 
 @pytest.mark.parametrize(
     ("part", "field", "value", "message"),
     [
-        ("loss", "name", "huber", "loss.name must be one of"),
-        ("loss", "gamma", 0.0, "loss.gamma must lie in"),
-        ("optimizer", "schedule", "step", "optimizer.schedule must be one of"),
-        ("optimizer", "clip_norm", 0.0, "optimizer.clip_norm must be positive"),
+        ("loss", "name", "huber", r"^config\.loss\.name must be one of"),
+        ("loss", "gamma", 0.0, r"^config\.loss\.gamma must lie in"),
+        ("optimizer", "schedule", "step", r"^config\.optimizer\.schedule must be one of"),
+        ("optimizer", "clip_norm", 0.0, r"^config\.optimizer\.clip_norm must lie in \(0, inf\), got 0\.0"),
+        ("optimizer", "b1", 1.5, r"^config\.optimizer\.b1 must lie in \[0, 1\), got 1\.5"),
+        ("optimizer", "learning_rate", "1e-3", r"^config\.optimizer\.learning_rate must be a number, got '1e-3'"),
+        ("data", "max_broken", 1.0, r"^config\.data\.max_broken must lie in \[0, 1\), got 1\.0"),
     ],
 )
 def test_values_out_of_range_are_refused(
     run_config: TrainConfig, part: str, field: str, value: Any, message: str
 ) -> None:
-    with pytest.raises(ValueError, match=message):
-        dataclasses.replace(getattr(run_config, part), **{field: value})
+    values = _mapping(run_config)
+    values[part][field] = value
+    with pytest.raises(InputError, match=message):
+        TrainConfig.from_dict(values)
 
 
-def test_data_settings_are_checked(run_config: TrainConfig) -> None:
-    with pytest.raises(ValueError, match=r"data set 'rooms': stride must be a pair 1 <= low <= high, got \(3, 2\)"):
-        dataclasses.replace(run_config.data.sources[0], stride=(3, 2))
-    with pytest.raises(ValueError, match=r"data\.max_broken must lie in \[0, 1\), got 1\.0"):
-        dataclasses.replace(run_config.data, max_broken=1.0)
-
-
-def test_stages_are_checked(run_config: TrainConfig) -> None:
-    with pytest.raises(ValueError, match="min_stride=3 exceeds max_stride=2"):
-        dataclasses.replace(run_config.stages[0], min_stride=3)
-    with pytest.raises(ValueError, match="stage 'first': steps must be >= 1"):
-        dataclasses.replace(run_config.stages[0], steps=0)
+@pytest.mark.parametrize(
+    ("path", "value", "message"),
+    [
+        (("stages", "first", "min_stride"), 3, r"config\.stages\.first\.min_stride=3 exceeds max_stride=2"),
+        (("stages", "first", "steps"), 0, r"config\.stages\.first\.steps must be a positive integer, got 0"),
+        (("stages", "first", "steps"), "50", r"config\.stages\.first\.steps must be a whole number, got '50'"),
+        (
+            ("data", "sources", "rooms", "stride"),
+            (3, 2),
+            r"config\.data\.sources\.rooms\.stride must be a pair 1 <= low <= high, got \(3, 2\)",
+        ),
+    ],
+)
+def test_parts_are_checked_under_their_names(
+    run_config: TrainConfig, path: tuple[str, ...], value: Any, message: str
+) -> None:
+    target = values = _mapping(run_config)
+    for name in path[:-1]:
+        target = target[name]
+    target[path[-1]] = value
+    with pytest.raises(InputError, match=f"^{message}"):
+        TrainConfig.from_dict(values)

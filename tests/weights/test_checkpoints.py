@@ -4,6 +4,7 @@ import dataclasses
 import gc
 import json
 import shutil
+import time
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +13,7 @@ import orbax.checkpoint as ocp
 import pytest
 from safetensors.numpy import save_file
 
+from logvggt_jax.errors import InputError
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.weights import checkpoints
 from logvggt_jax.weights.checkpoints import (
@@ -19,9 +21,11 @@ from logvggt_jax.weights.checkpoints import (
     digests,
     from_pretrained,
     load_model,
+    read_provenance,
     save_model,
     verify_digests,
 )
+from logvggt_jax.weights.provenance import Provenance
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +52,9 @@ def vggt_file(tmp_path_factory, vggt_state_dict):
 def abandoned_reads():
     """When one read fails Orbax drops the others; their complaints belong to the test that made them."""
     yield
-    gc.collect()
+    for _ in range(3):  # on busy cores they end a little later
+        time.sleep(0.1)
+        gc.collect()
 
 
 def _edit(folder, change):
@@ -89,6 +95,21 @@ def test_parameters_saved_on_several_devices_load_on_one(tmp_path, small_config,
     save_model(tmp_path / "model", small_config, everywhere)
     _, variables = load_model(tmp_path / "model")
     _assert_same(variables["params"], small_variables["params"])
+
+
+def test_a_folder_says_what_its_weights_were_trained_for(tmp_path, folder, vggt_file, small_config, small_variables):
+    provenance = Provenance("windows", 224, "CC-BY-4.0", "rooms")
+    save_model(tmp_path / "new", small_config, small_variables["params"], provenance)
+    assert read_provenance(tmp_path / "new") == provenance
+    assert read_provenance(vggt_file).trained_for == "vggt"
+    # Folders of before the record load, and say that they do not know.
+    _edit(folder, lambda description: description.pop("provenance"))
+    assert read_provenance(folder) == Provenance()
+    _assert_same(load_model(folder)[1], small_variables)
+    for wrong in ({"trained_for": "chess"}, {"longer_edge": 500}, {"author": "me"}, ["windows"]):
+        _edit(folder, lambda description, wrong=wrong: description.update(provenance=wrong))
+        with pytest.raises(InputError, match=r"config\.json: .*provenance"):
+            read_provenance(folder)
 
 
 def test_a_relative_path_works(tmp_path, monkeypatch, saved, small_config, small_variables):
@@ -173,7 +194,7 @@ def test_a_configuration_of_another_model_names_the_parameter(folder):
     ("change", "words"),
     [
         (lambda d: d["config"]["encoder"].update(widht=3), r"unknown field model\.encoder\.widht"),
-        (lambda d: d["config"]["windows"].update(stride=4), r"WindowConfig\.stride=4"),
+        (lambda d: d["config"]["windows"].update(stride=4), r"model\.windows\.stride=4"),
         (lambda d: d.update(version=99), r"format version 99"),
         (lambda d: d.update(format="other"), r"not the description of a model of this package"),
         (lambda d: d.pop("digests"), r"config or digests are missing"),
@@ -223,6 +244,7 @@ def test_a_converted_vggt_equals_the_one_converted_in_memory(tmp_path, vggt_file
     assert f"{len(report.used)} tensors used, 2 skipped, 12 parameters initialised" in capsys.readouterr().out
     assert [entry.name for entry in tmp_path.iterdir()] == ["model"]
     model, variables = load_model(tmp_path / "model")
+    assert read_provenance(tmp_path / "model") == Provenance("vggt", 518, None, f"VGGT checkpoint {vggt_file}")
     direct, direct_variables = from_pretrained(vggt_file, point_head=True)
     assert model == direct == LogVGGT(vggt_config)
     _assert_same(variables, direct_variables)

@@ -1,12 +1,15 @@
 """Downloads, with the real client against a server on this machine that answers as the hub does."""
 
 import http.server
+import json
 import threading
 
 import numpy as np
 import pytest
 from safetensors.numpy import save
 
+from logvggt_jax.errors import InputError
+from logvggt_jax.weights import read_provenance
 from logvggt_jax.weights.hub import download, resolve
 
 constants = pytest.importorskip("huggingface_hub.constants")
@@ -14,10 +17,10 @@ COMMIT = "0123456789abcdef0123456789abcdef01234567"
 
 
 class Hub:
-    """Serves `files` ("owner/name/file" -> bytes) and records the requests."""
+    """Serves `files` ("owner/name/file" -> bytes) under `licence` and records the requests."""
 
     def __init__(self):
-        self.files, self.requests = {}, []
+        self.files, self.requests, self.licence = {}, [], "cc-by-nc-4.0"
         hub = self
 
         class Handler(http.server.BaseHTTPRequestHandler):
@@ -37,6 +40,9 @@ class Hub:
 
     def answer(self, handler, body):
         self.requests.append((handler.command, handler.path))
+        if handler.path.startswith("/api/models/"):
+            self.describe(handler, handler.path.removeprefix("/api/models/"))
+            return
         repository, _, file = handler.path.lstrip("/").partition("/resolve/main/")
         content = self.files.get(f"{repository}/{file}")
         known = any(name.startswith(f"{repository}/") for name in self.files)
@@ -50,6 +56,18 @@ class Hub:
         handler.end_headers()
         if body and content is not None:
             handler.wfile.write(content)
+
+    def describe(self, handler, repository):
+        names = [name.removeprefix(f"{repository}/") for name in self.files if name.startswith(f"{repository}/")]
+        siblings = [{"rfilename": name} for name in names]
+        description = {"id": repository, "siblings": siblings, "cardData": {"license": self.licence}}
+        content = json.dumps(description).encode()
+        handler.send_response(200 if names else 404)
+        if not names:
+            handler.send_header("X-Error-Code", "RepoNotFound")
+        handler.send_header("Content-Length", str(len(content)))
+        handler.end_headers()
+        handler.wfile.write(content)
 
     def close(self):
         self.server.shutdown()
@@ -84,6 +102,29 @@ def test_the_pickle_is_taken_where_there_is_nothing_else(hub):
     assert download("owner/vggt").read_bytes() == b"pickle"
 
 
+def test_the_only_checkpoint_is_taken_whatever_its_name(hub):
+    hub.files = {"owner/vggt/README.md": b"text", "owner/vggt/vggt_1B_commercial.pt": b"pickle"}
+    assert download("owner/vggt").read_bytes() == b"pickle"
+
+
+def test_of_several_checkpoints_the_user_chooses(hub):
+    hub.files = {"owner/vggt/large.pt": b"large", "owner/vggt/small/weights.safetensors": b"small"}
+    with pytest.raises(
+        InputError, match=r"several checkpoints, large\.pt, small/weights\.safetensors; give one as hf:owner/vggt/large"
+    ):
+        download("owner/vggt")
+    assert resolve("hf:owner/vggt/small/weights.safetensors").read_bytes() == b"small"
+    with pytest.raises(FileNotFoundError, match=r"owner/vggt: the repository holds no medium\.pt"):
+        resolve("hf:owner/vggt/medium.pt")
+
+
+def test_weights_from_the_hub_are_vggts_under_the_repositorys_licence(hub):
+    hub.files = {"owner/vggt/model.pt": b"pickle"}
+    provenance = read_provenance("hf:owner/vggt")
+    assert provenance.trained_for == "vggt" and provenance.licence == "cc-by-nc-4.0"
+    assert "owner/vggt" in provenance.source
+
+
 def test_a_cached_file_serves_offline(hub):
     hub.files = {"owner/vggt/model.safetensors": b"weights"}
     path = download("owner/vggt")
@@ -102,9 +143,7 @@ def test_an_unknown_repository_and_one_without_weights_are_named(hub):
     hub.files = {"owner/other/README.md": b"text"}
     with pytest.raises(FileNotFoundError, match=r"owner/vggt: no such repository on the hub"):
         download("owner/vggt")
-    with pytest.raises(
-        FileNotFoundError, match=r"owner/other: the repository holds no model\.safetensors or model\.pt"
-    ):
+    with pytest.raises(FileNotFoundError, match=r"owner/other on the hub: holds no \.safetensors or \.pt file"):
         download("owner/other")
 
 
@@ -112,6 +151,8 @@ def test_a_path_that_exists_is_never_a_repository(hub, tmp_path, monkeypatch):
     (tmp_path / "owner" / "vggt").mkdir(parents=True)
     monkeypatch.chdir(tmp_path)
     assert resolve("owner/vggt").is_dir()
+    with pytest.raises(FileNotFoundError, match=r"owner/vgtt: no such file or folder"):
+        resolve("owner/vgtt")  # a slip of the keyboard asks no server
     with pytest.raises(FileNotFoundError, match=r"owner/vggt\.safetensors: no such file"):
         resolve("owner/vggt.safetensors")
     with pytest.raises(FileNotFoundError, match=r"a/b/c: no such file"):

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
+from logvggt_jax.errors import InputError
 from logvggt_jax.weights.files import find_weights, open_state_dict
 
 
@@ -14,6 +15,14 @@ def test_a_folder_prefers_safetensors(tmp_path, write_torch_file):
     save_file({"w": np.ones(1, np.float32)}, tmp_path / "model.safetensors")
     with open_state_dict(tmp_path) as tensors:
         assert tensors["w"] == 1
+
+
+def test_a_folder_means_its_only_checkpoint_and_of_several_the_user_chooses(tmp_path):
+    save_file({"w": np.ones(1, np.float32)}, tmp_path / "vggt_1B_commercial.safetensors")
+    assert find_weights(tmp_path).name == "vggt_1B_commercial.safetensors"
+    save_file({"w": np.ones(1, np.float32)}, tmp_path / "other.safetensors")
+    with pytest.raises(InputError, match=r"several checkpoints, other\.safetensors, vggt_1B_commercial\.safetensors"):
+        find_weights(tmp_path)
 
 
 @pytest.mark.parametrize("suffix", [".safetensors", ".pt"])
@@ -53,7 +62,7 @@ def test_paths_that_hold_no_weights_are_named(tmp_path):
     other.write_bytes(b"x")
     with pytest.raises(FileNotFoundError, match=r"nothing: no such file"):
         open_state_dict(tmp_path / "nothing")
-    with pytest.raises(FileNotFoundError, match=r"holds no model\.safetensors or model\.pt"):
+    with pytest.raises(FileNotFoundError, match=r"holds no \.safetensors or \.pt file"):
         open_state_dict(tmp_path)
     with pytest.raises(ValueError, match=r"unknown suffix '\.ckpt'"):
         open_state_dict(other)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from logvggt_jax.data.checks.report import SequenceReport
 from logvggt_jax.data.errors import MissingFiles, MissingPackage
 from logvggt_jax.data.readers.folder_dataset import FolderDataset
 from logvggt_jax.errors import InputError
+from logvggt_jax.files import atomic_file
 from logvggt_jax.frames import Frames
 from logvggt_jax.geometry import camera_centres, unproject
 
@@ -56,12 +56,8 @@ def write_check_picture(path: Path, dataset: FolderDataset, sequences: Sequence[
         )
         _draw_from_above(row[4], dataset.extrinsics(sequence.name), views)
     figure.suptitle(dataset.title, fontsize=10)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.png")
-    try:
+    with atomic_file(path) as temporary:
         figure.savefig(temporary, dpi=110)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def view_from_above(extrinsics: np.ndarray) -> np.ndarray:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import multiprocessing
 import os
-import shutil
-import uuid
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
@@ -18,7 +17,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from logvggt_jax.data.dataset import check_indices, check_sequence
 from logvggt_jax.data.rooms.rooms import Rooms
-from logvggt_jax.errors import InputError
+from logvggt_jax.errors import InputError, OutputExists
+from logvggt_jax.files import atomic_folder
 from logvggt_jax.frames import Frames
 
 _ARRAYS = ("images", "depth", "intrinsics", "extrinsics")
@@ -104,10 +104,8 @@ def render_pool(
 
     folder = Path(cache_dir).absolute() / f"rooms-{_digest(rooms)}"
     if not folder.exists():
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        unfinished = folder.with_name(f".{folder.name}.{uuid.uuid4().hex}")
-        unfinished.mkdir()
-        try:
+        # Another process may finish the same pool meanwhile; its bytes are the same.
+        with contextlib.suppress(OutputExists), atomic_folder(folder) as unfinished:
             maps: dict[str, np.ndarray] = {
                 name: np.lib.format.open_memmap(unfinished / f"{name}.npy", "w+", dtype, shape)
                 for name, (shape, dtype) in shapes.items()
@@ -117,14 +115,6 @@ def render_pool(
                 array.flush()  # type: ignore[attr-defined]
             del maps
             (unfinished / "options.json").write_text(json.dumps(rooms.identity, indent=2) + "\n")
-            try:
-                unfinished.rename(folder)
-            except OSError:
-                # Another process may have finished the same pool meanwhile; its bytes are the same.
-                if not folder.exists():
-                    raise
-        finally:
-            shutil.rmtree(unfinished, ignore_errors=True)
     return RoomPool(rooms, _open_arrays(folder, rooms), folder)
 
 

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from logvggt_jax.evaluation.costs.operations import count_flops
+from logvggt_jax.model.aggregator import WindowTokens
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.model.refinement import num_triggers
 from logvggt_jax.model.windows import num_windows
@@ -79,20 +80,20 @@ def sequence_parts(model: LogVGGT, num_frames: int, image_size: tuple[int, int])
         return jax.ShapeDtypeStruct((1, count), bool)
 
     state = jax.eval_shape(model.start, variables, images(overlap))
-    window = jax.eval_shape(model.encode, variables, images(config.windows.size))
-    tokens = jax.eval_shape(model.attend_window, variables, state, window, mask(config.windows.size))
+    window = jax.eval_shape(model.windows.encode, variables, images(config.windows.size))
+    tokens = jax.eval_shape(model.windows.attend, variables, state, window, mask(config.windows.size))
 
     def dense(count: int, calls: int) -> Part:
         key, special = tokens
         key = jax.ShapeDtypeStruct((*key.shape[:2], count, *key.shape[3:]), key.dtype)
         special = jax.ShapeDtypeStruct((1, count, *special.shape[2:]), special.dtype)
-        decode = functools.partial(model.decode_dense, image_size=image_size)
-        return Part("dense head", decode, (key, special, mask(count)), calls)
+        decode = functools.partial(model.windows.decode_dense, image_size=image_size)
+        return Part("dense head", decode, (WindowTokens(key, special), mask(count)), calls)  # type: ignore[arg-type]
 
     parts = [
-        Part("encoder", model.encode, (images(overlap),), 1),
-        Part("encoder", model.encode, (images(stride),), windows),
-        Part("backbone", model.attend_window, (state, window, mask(config.windows.size)), windows),
+        Part("encoder", model.windows.encode, (images(overlap),), 1),
+        Part("encoder", model.windows.encode, (images(stride),), windows),
+        Part("backbone", model.windows.attend, (state, window, mask(config.windows.size)), windows),
         dense(stride, windows),
         dense(overlap, 1),
     ]
@@ -100,33 +101,25 @@ def sequence_parts(model: LogVGGT, num_frames: int, image_size: tuple[int, int])
 
 
 def _refinement_parts(model: LogVGGT, num_frames: int) -> list[Part]:
+    """The halves of a trigger, as often as there are triggers, and the projection of the registers."""
     settings, width = model.config.refinement, 2 * model.config.encoder.embed_dim
-    stride, registers = model.config.windows.stride, model.config.aggregator.num_registers
-    period = num_frames if settings.period is None else min(settings.period, num_frames)
-    triggers = num_triggers(num_frames, period)
-
-    def camera(count: int) -> jax.ShapeDtypeStruct:
-        return jax.ShapeDtypeStruct((1, count, width), jnp.float32)
-
-    def mask(count: int) -> jax.ShapeDtypeStruct:
-        return jax.ShapeDtypeStruct((1, count), bool)
-
+    size = num_frames if settings.period is None else min(settings.period, num_frames)
+    triggers = num_triggers(num_frames, size)
+    # The last trigger has its full size, see `Refinement.fire_all`.
+    count = triggers * size
+    variables = abstract_variables(model)
+    tokens = jax.ShapeDtypeStruct((1, count, width), jnp.float32)
+    scalar, lengths = jax.ShapeDtypeStruct((), jnp.int32), jax.ShapeDtypeStruct((1,), jnp.int32)
+    span = (lengths, scalar, scalar)
     parts = []
     if settings.enabled:
-        variables = abstract_variables(model)
-        register_tokens = jax.ShapeDtypeStruct((1, num_frames, registers, width), jnp.float32)
-        projected = jax.eval_shape(model.project_registers, variables, register_tokens)
-        parts.append(Part("GCCR", model.project_registers, (register_tokens,), 1))
-        parts.append(Part("GCCR", model.attend_registers, (camera(period), projected, mask(num_frames)), triggers))
-    if settings.context is None:
-        # A trigger decodes all frames, also those to come, which are masked: one shape for all triggers.
-        seen = num_frames if triggers == 1 else triggers * period + stride
-        parts.append(Part("camera head", model.decode_cameras, (camera(seen), mask(seen)), triggers))
-    else:
-        seen = 1 + settings.context
-        groups = triggers * -(-period // stride)
-        parts.append(Part("camera head", model.decode_cameras, (camera(seen), mask(seen)), groups))
-    return parts
+        register_tokens = jax.ShapeDtypeStruct((1, count, model.config.aggregator.num_registers, width), jnp.float32)
+        registers = jax.eval_shape(model.refinement.project_registers, variables, register_tokens)
+        refine = functools.partial(model.refinement.refine_span, size=size)
+        parts.append(Part("GCCR", model.refinement.project_registers, (register_tokens,), 1))
+        parts.append(Part("GCCR", refine, (tokens, registers, tokens, *span), triggers))
+    decode = functools.partial(model.refinement.decode_span, size=size)
+    return [*parts, Part("camera head", decode, (tokens, *span), triggers)]
 
 
 def flops_by_part(model: LogVGGT, num_frames: int, image_size: tuple[int, int]) -> dict[str, float]:

@@ -12,12 +12,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from logvggt_jax.config import ModelConfig
+from logvggt_jax.config import ModelConfig, require_counts
+from logvggt_jax.errors import InputError
 from logvggt_jax.evaluation.costs.parts import PARTS, live_device_bytes, sequence_parts, time_part
-from logvggt_jax.evaluation.environment import describe_device
-from logvggt_jax.evaluation.methods.method import Method
+from logvggt_jax.evaluation.environment import code_version, describe_device
+from logvggt_jax.evaluation.methods.method import Checkpoint, Method, PredictionError
 from logvggt_jax.evaluation.progress import progress_display
-from logvggt_jax.evaluation.records import plain, record_key, write_text
+from logvggt_jax.evaluation.records import plain, record_key
+from logvggt_jax.files import write_text
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.streaming import StreamSession
 
@@ -46,10 +48,9 @@ class TimingConfig:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "lengths", tuple(sorted(self.lengths)))
-        if any(not isinstance(n, int) or n < 1 for n in self.lengths):
-            raise ValueError(f"timings.lengths must be numbers of frames, 1 or more each, got {self.lengths}")
-        if not isinstance(self.rounds, int) or self.rounds < 1:
-            raise ValueError(f"timings.rounds must be at least 1, got {self.rounds!r}")
+        if any(n < 1 for n in self.lengths):
+            raise InputError(f"TimingConfig.lengths must be numbers of frames, 1 or more each, got {self.lengths}")
+        require_counts(self, "rounds")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,14 +113,13 @@ def time_stream(
 
 
 def measured_timings(
-    model: LogVGGT,
-    variables: Any,
+    checkpoint: Checkpoint,
     references: Sequence[Method],
     config: TimingConfig,
     output: Path,
     *,
     longer_edge: int,
-    identity: str,
+    fresh: bool = False,
 ) -> dict[str, Any]:
     """Frames a second of the model and its references by length, and the time by part of the longest sequence.
 
@@ -127,18 +127,18 @@ def measured_timings(
     again.
 
     Args:
-      model: of the checkpoint; its mode of refinement is replaced by each of the paper's.
-      variables: {"params": …}.
+      checkpoint: the model; its mode of refinement is replaced by each of the paper's.
       references: other rows. A sequence that one of them cannot predict has the reason in place of its rates.
       config: what is timed.
       output: folder of the evaluation.
       longer_edge: pixels; pictures are 4 : 3.
-      identity: of the parameters.
+      fresh: measure again, whatever is there.
 
     Returns:
       JSON values: `device`, `dtype`, `image_size`, `windows`, `frames_per_second` (by row and length a list of rates,
       or the reason why there are none), `part_frames` and `parts` (`name`, `seconds`) with GCCR once at the end.
     """
+    model, variables = checkpoint.model, checkpoint.variables
     image_size = (max(round(longer_edge * _ASPECT / 14), 1) * 14, longer_edge)
     setting = {
         "device": describe_device(),
@@ -148,13 +148,13 @@ def measured_timings(
         "lengths": list(config.lengths),
         "rounds": config.rounds,
     }
+    rows = [[reference.name, reference.identity] for reference in references]
     key = record_key(
-        setting, model.config.to_dict(), [(r.name, r.knows) for r in references], identity, jax.__version__
+        code_version("evaluation/costs"), setting, model.config.to_dict(), rows, checkpoint.digest, jax.__version__
     )
     kept = output / "timings.json"
-    if (found := _read(kept)).get("key") == key:
+    if not fresh and (found := _read(kept)).get("key") == key:
         return found
-    variables = jax.device_put(variables)
     pictures = random_pictures(image_size)
     modes = refinement_modes(model.config, model.config.windows.size)
     full = LogVGGT(modes["full"])
@@ -188,7 +188,7 @@ def _method_rates(method: Method, images: np.ndarray, rounds: int) -> list[float
         started = time.perf_counter()
         try:
             method.predict(images)
-        except ValueError as error:
+        except PredictionError as error:
             return str(error)
         except jax.errors.JaxRuntimeError as error:
             if "RESOURCE_EXHAUSTED" not in str(error):

@@ -10,7 +10,8 @@ import numpy as np
 
 from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.data.feeding.transforms import fit
-from logvggt_jax.evaluation.methods.method import ClipPrediction, Method, network
+from logvggt_jax.errors import InputError
+from logvggt_jax.evaluation.methods.method import Checkpoint, ClipPrediction, Method, network
 from logvggt_jax.model.logvggt import LogVGGT
 
 
@@ -49,7 +50,7 @@ def depth_statistics(
       max_frames: that many frames at most, the same number of evenly spaced ones from each sequence.
 
     Raises:
-      ValueError: no frame has a valid depth.
+      InputError: no frame has a valid depth.
     """
     depth_sum, valid_count = np.zeros(image_size), np.zeros(image_size)
     intrinsics: list[np.ndarray] = []
@@ -64,7 +65,7 @@ def depth_statistics(
             valid_count += valid
             intrinsics.append(frames.intrinsics[0])
     if not valid_count.any():
-        raise ValueError(f"depth_statistics: {source} have no valid depth; baselines need some")
+        raise InputError(f"{source} have no valid depth; the baselines need some, or config.baselines=False")
     mean_depth = float(depth_sum.sum() / valid_count.sum())
     mean_map = np.where(valid_count > 0, depth_sum / np.maximum(valid_count, 1), mean_depth)
     return DepthStatistics(mean_depth, mean_map, np.mean(intrinsics, axis=0), source)
@@ -105,7 +106,8 @@ def static_camera() -> Method:
 def untrained(model: LogVGGT, image_size: tuple[int, int], *, seed: int = 0) -> Method:
     """The same network with random parameters."""
     variables = model.init(jax.random.key(seed), jnp.zeros((1, 1, *image_size, 3), jnp.uint8))
-    return network(model, variables, name="untrained network", knows=f"nothing (random parameters, seed {seed})")
+    knows = f"nothing (random parameters, seed {seed})"
+    return network(Checkpoint(model, variables, knows), name="untrained network", knows=knows)
 
 
 def all_baselines(
@@ -139,7 +141,8 @@ def _fixed_depth(name: str, knows: str, depth: np.ndarray, statistics: DepthStat
         )
 
     knows = f"{knows} of {statistics.source}; static camera"
-    return Method(name, knows, predict, pose=False)
+    identity = [array.tolist() for array in (depth, statistics.intrinsics)]
+    return Method(name, knows, predict, identity, pose=False)
 
 
 def _identities(count: int) -> np.ndarray:

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
+from logvggt_jax.evaluation.records import record_key
 from logvggt_jax.evaluation.streaming import stream_clip
-from logvggt_jax.model.logvggt import LogVGGT
+from logvggt_jax.model.logvggt import LogVGGT, Variables
+from logvggt_jax.weights.checkpoints import digests, load_model
 
 
 class ClipPrediction(NamedTuple):
@@ -27,6 +30,27 @@ class ClipPrediction(NamedTuple):
     intrinsics: np.ndarray | None
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class Checkpoint:
+    """A model that rows are made of.
+
+    Attributes:
+      model: the model.
+      variables: {"params": …}, on the device.
+      digest: of the parameters.
+    """
+
+    model: LogVGGT
+    variables: Variables
+    digest: str
+
+    @classmethod
+    def load(cls, path: str | Path) -> Checkpoint:
+        """The model of a folder; errors as of `logvggt_jax.weights.load_model`."""
+        model, variables = load_model(path)
+        return cls(model, jax.device_put(variables), record_key(digests(variables["params"])))
+
+
 class PredictionError(ValueError):
     """A method cannot predict a clip: too long for the memory, nothing to align. The clip counts as failed for it."""
 
@@ -40,6 +64,8 @@ class Method:
       knows: what the method was given besides the images, in words, for the reader of the table.
       predict: images [T, H, W, 3] uint8, a memory map where they are many, to the clip's prediction; raises
         PredictionError where it has none.
+      identity: what decides the predictions of given images besides the code, as JSON values: sizes, parameters,
+        settings. What it does not name is taken for unchanged by a later run.
       depth: whether depth is measured.
       pose: whether poses are measured.
       points: whether the point cloud is measured.
@@ -50,19 +76,17 @@ class Method:
     name: str
     knows: str
     predict: Callable[[np.ndarray], ClipPrediction]
+    identity: Any = None
     depth: bool = True
     pose: bool = True
     points: bool = True
     static: bool = False
 
 
-def network(
-    model: LogVGGT, variables: dict[str, Any], *, name: str = "LoG-VGGT", knows: str = "its training"
-) -> Method:
+def network(checkpoint: Checkpoint, *, name: str = "LoG-VGGT", knows: str = "its training") -> Method:
     """The model as a method: clips of any length are streamed, see `stream_clip`."""
-    on_device = jax.device_put(variables)
 
     def predict(images: np.ndarray) -> ClipPrediction:
-        return ClipPrediction(*stream_clip(model, on_device, images))
+        return ClipPrediction(*stream_clip(checkpoint.model, checkpoint.variables, images))
 
-    return Method(name, knows, predict)
+    return Method(name, knows, predict, identity=["windows", checkpoint.model.config.to_dict(), checkpoint.digest])

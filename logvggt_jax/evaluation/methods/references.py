@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any
 
 import jax
 import numpy as np
 
-from logvggt_jax.evaluation.methods.method import ClipPrediction, Method, PredictionError
-from logvggt_jax.model.logvggt import LogVGGT
+from logvggt_jax.config import require_counts
+from logvggt_jax.evaluation.methods.method import Checkpoint, ClipPrediction, Method, PredictionError
 from logvggt_jax.streaming.chunks import ChunkChain, ChunkPlan
 from logvggt_jax.streaming.offline import predict_plain
 
@@ -31,9 +30,7 @@ class ReferenceConfig:
     chunk_overlap: int = 30
 
     def __post_init__(self) -> None:
-        limit = self.max_frames
-        if limit is not None and (isinstance(limit, bool) or not isinstance(limit, int) or limit < 1):
-            raise ValueError(f"references.max_frames must be at least 1 frame or None, got {limit!r}")
+        require_counts(self, "max_frames")
         self.plan()
 
     def plan(self) -> ChunkPlan:
@@ -41,27 +38,14 @@ class ReferenceConfig:
         return ChunkPlan(self.chunk_size, self.chunk_overlap)
 
 
-def reference_methods(model: LogVGGT, variables: dict[str, Any], config: ReferenceConfig) -> list[Method]:
-    """VGGT offline and plain VGGT on chunks.
-
-    Args:
-      model: whose parts are used; its windows are not.
-      variables: {"params": …}.
-      config: limits.
-    """
-    variables = jax.device_put(variables)
-    return [
-        offline_vggt(model, variables, max_frames=config.max_frames),
-        chunked_vggt(model, variables, config.plan()),
-    ]
-
-
-def offline_vggt(model: LogVGGT, variables: dict[str, Any], *, max_frames: int | None = None) -> Method:
+def offline_vggt(checkpoint: Checkpoint, limits: ReferenceConfig) -> Method:
     """All frames at once with full global attention.
 
     Its `predict` raises PredictionError for a clip longer than `max_frames`, or one that the device's memory does
     not hold.
     """
+
+    max_frames = limits.max_frames
 
     def predict(images: np.ndarray) -> ClipPrediction:
         count, height, width = images.shape[:3]
@@ -71,7 +55,7 @@ def offline_vggt(model: LogVGGT, variables: dict[str, Any], *, max_frames: int |
                 "and time allow"
             )
         try:
-            prediction = predict_plain(model, variables, images)
+            prediction = predict_plain(checkpoint.model, checkpoint.variables, images)
         except jax.errors.JaxRuntimeError as error:
             if "RESOURCE_EXHAUSTED" not in str(error):
                 raise
@@ -81,17 +65,20 @@ def offline_vggt(model: LogVGGT, variables: dict[str, Any], *, max_frames: int |
             ) from error
         return ClipPrediction(prediction.depth, prediction.extrinsics, prediction.intrinsics)
 
-    return Method("VGGT offline", "its training; all frames in one window of full global attention", predict)
+    knows = "its training; all frames in one window of full global attention"
+    return Method("VGGT offline", knows, predict, ["offline", checkpoint.model.config.to_dict(), checkpoint.digest])
 
 
-def chunked_vggt(model: LogVGGT, variables: dict[str, Any], plan: ChunkPlan) -> Method:
+def chunked_vggt(checkpoint: Checkpoint, limits: ReferenceConfig) -> Method:
     """Plain VGGT on overlapping chunks, chained by robust similarities.
 
     Its `predict` raises PredictionError where neighbouring chunks cannot be aligned.
     """
 
+    plan = limits.plan()
+
     def predict(images: np.ndarray) -> ClipPrediction:
-        chain = ChunkChain(functools.partial(predict_plain, model, variables), plan)
+        chain = ChunkChain(functools.partial(predict_plain, checkpoint.model, checkpoint.variables), plan)
         try:
             chunks = [chunk for image in images if (chunk := chain.push(image)) is not None]
             last = chain.close()
@@ -105,4 +92,5 @@ def chunked_vggt(model: LogVGGT, variables: dict[str, Any], plan: ChunkPlan) -> 
         f"its training; windows of {plan.size} frames, {plan.overlap} shared with the next, without memory, chained by "
         "robust similarities"
     )
-    return Method("VGGT on chunks", knows, predict)
+    identity = ["chunks", dataclasses.asdict(plan), checkpoint.model.config.to_dict(), checkpoint.digest]
+    return Method("VGGT on chunks", knows, predict, identity)

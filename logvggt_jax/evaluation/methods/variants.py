@@ -7,11 +7,11 @@ import functools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import jax
 import numpy as np
 
 from logvggt_jax.config import ModelConfig
-from logvggt_jax.evaluation.methods.method import ClipPrediction, Method
+from logvggt_jax.errors import InputError
+from logvggt_jax.evaluation.methods.method import Checkpoint, ClipPrediction, Method
 from logvggt_jax.evaluation.streaming import (
     StreamedWindows,
     refined_cameras,
@@ -73,33 +73,33 @@ VARIANTS: Mapping[str, Variant] = {
 }
 
 
-def variant_methods(model: LogVGGT, variables: dict[str, Any], names: Sequence[str]) -> list[Method]:
+def variant_methods(checkpoint: Checkpoint, names: Sequence[str]) -> list[Method]:
     """Every named variant twice: the camera head's trunk over all frames, and limited to K.
 
     All share the checkpoint's parameters; none was trained for what it changes. A variant that is the same model as
     an earlier one is left out.
 
     Args:
-      model: of the checkpoint.
-      variables: {"params": …}.
+      checkpoint: whose sizes and parameters they have.
       names: of `VARIANTS`.
 
     Raises:
-      ValueError: a name that is not known.
+      InputError: a name that is not known.
     """
     for name in names:
         if name not in VARIANTS:
-            raise ValueError(f"variants: unknown {name!r}; known are {', '.join(VARIANTS)}")
-    clips = _LastClip(jax.device_put(variables))
+            raise InputError(f"variants: unknown {name!r}; known are {', '.join(VARIANTS)}")
+    base, clips = checkpoint.model.config, _LastClip(checkpoint.variables)
     methods: dict[ModelConfig, Method] = {}
     for name in names:
         for limited in (False, True):
             variant = VARIANTS[name]
-            config = variant.config(model.config, limited_trunk=limited)
+            config = variant.config(base, limited_trunk=limited)
             trunk = f"trunk {config.refinement.context}" if limited else "trunk all"
-            knows = "its training" if config == model.config else "its training, which was not for this variant"
+            knows = "its training" if config == base else "its training, which was not for this variant"
             predict = functools.partial(clips.predict, LogVGGT(config))
-            methods.setdefault(config, Method(f"{variant.label}, {trunk}", knows, predict))
+            identity = ["windows", config.to_dict(), checkpoint.digest]
+            methods.setdefault(config, Method(f"{variant.label}, {trunk}", knows, predict, identity))
     return list(methods.values())
 
 

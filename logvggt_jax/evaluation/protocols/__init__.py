@@ -5,6 +5,7 @@ from __future__ import annotations
 import fnmatch
 from collections.abc import Sequence
 
+from logvggt_jax.errors import InputError
 from logvggt_jax.evaluation.protocols import bonn, co3dv2, kitti, nrgbd, rooms, scannet, seven_scenes, sintel, tum
 from logvggt_jax.evaluation.protocols.protocol import DepthMeasure, PointsMeasure, Protocol, ProtocolSettings
 
@@ -45,11 +46,11 @@ def chosen_protocols(settings: ProtocolSettings, patterns: Sequence[str]) -> lis
     """Those benchmarks whose name matches one of the patterns (`seven_scenes-*`, `*-depth-110`), in their order.
 
     Raises:
-      ValueError: a pattern that matches none; names the benchmarks.
+      InputError: a pattern that matches none; names the benchmarks.
     """
     protocols = paper_protocols(settings)
     names = [protocol.name for protocol in protocols]
     for pattern in patterns:
         if not fnmatch.filter(names, pattern):
-            raise ValueError(f"no benchmark is named {pattern!r}; there are {', '.join(names)}")
+            raise InputError(f"no benchmark is named {pattern!r}; there are {', '.join(names)}")
     return [protocol for protocol in protocols if any(fnmatch.fnmatch(protocol.name, p) for p in patterns)]

@@ -2,26 +2,66 @@
 
 from __future__ import annotations
 
+import dataclasses
+
+from logvggt_jax.config import require_counts, require_within
+from logvggt_jax.errors import InputError
 from logvggt_jax.evaluation.protocols.frame_selection import Clips
 from logvggt_jax.evaluation.protocols.images import Fit
 from logvggt_jax.evaluation.protocols.protocol import DepthMeasure, PointsMeasure, Protocol
-from logvggt_jax.evaluation.settings import EvaluationConfig
 
 
-def clip_protocols(dataset: str, split: str, config: EvaluationConfig) -> list[Protocol]:
-    """One benchmark for each clip length of `config`."""
+@dataclasses.dataclass(frozen=True)
+class ClipSettings:
+    """Which clips are cut and how they are compared (`evaluation` in configs/eval/rooms.py and its like).
+
+    Attributes:
+      image_size: (H, W) of the model's input, multiples of 14; frames are resized and cropped to it.
+      clip_lengths: frames of a clip.
+      stride: frames of the sequence from one frame of a clip to the next.
+      clips_per_sequence: clips with evenly spaced starts in each sequence.
+      max_sequences: only that many first sequences; None takes all.
+      max_points: points compared in each clip, drawn at random, the same for prediction and truth; None takes all.
+      icp_threshold: metres, of the ICP before the point metrics; None leaves it out.
+      seed: of the drawn points.
+      figures: clips of each length that are drawn, for the first method.
+    """
+
+    image_size: tuple[int, int]
+    clip_lengths: tuple[int, ...]
+    stride: int = 1
+    clips_per_sequence: int = 1
+    max_sequences: int | None = None
+    max_points: int | None = 20_000
+    icp_threshold: float | None = 0.1
+    seed: int = 0
+    figures: int = 1
+
+    def __post_init__(self) -> None:
+        if any(side < 14 or side % 14 for side in self.image_size):
+            raise InputError(f"ClipSettings.image_size must be (H, W), multiples of 14, got {self.image_size}")
+        if not self.clip_lengths or any(length < 2 for length in self.clip_lengths):
+            raise InputError(
+                f"ClipSettings.clip_lengths must be at least one number of 2 or more frames, got {self.clip_lengths}"
+            )
+        require_counts(self, "stride", "clips_per_sequence", "max_sequences", "max_points")
+        require_within(self, "(0, inf)", "icp_threshold")
+
+
+def clip_protocols(dataset: str, split: str, settings: ClipSettings) -> list[Protocol]:
+    """One benchmark for each clip length of the settings."""
     return [
         Protocol(
             name=f"{dataset}-clips-{length}",
             title=f"clips of {length} frames",
             dataset=dataset,
             splits=(split,),
-            frames=Clips(length, config.stride, config.clips_per_sequence),
-            images=Fit(config.image_size),
+            frames=Clips(length, settings.stride, settings.clips_per_sequence),
+            images=Fit(settings.image_size),
             depth=DepthMeasure(),
-            points=PointsMeasure(None, config.max_points, config.icp_threshold, config.seed),
+            points=PointsMeasure(None, settings.max_points, settings.icp_threshold, settings.seed),
             poses=True,
             trajectory=True,
         )
-        for length in config.clip_lengths
+        for length in settings.clip_lengths
     ]

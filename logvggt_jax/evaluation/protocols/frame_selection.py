@@ -10,13 +10,15 @@ from typing import Protocol
 
 import numpy as np
 
+from logvggt_jax.errors import InputError
+
 Indices = tuple[int, ...]
 
 
 class FrameSelection(Protocol):
     """From a sequence's name and number of frames to the frames of its clips.
 
-    `wanted` is the number of frames that the benchmark asks for, None for whole sequences. Raises ValueError, with
+    `wanted` is the number of frames that the benchmark asks for, None for whole sequences. Raises InputError, with
     the reason, for a sequence that gives no clip.
     """
 
@@ -41,7 +43,7 @@ class Clips:
     def __call__(self, sequence: str, num_frames: int) -> list[Indices]:
         span = (self.wanted - 1) * self.stride + 1
         if num_frames < span:
-            raise ValueError(f"has {num_frames} frames, {self.wanted} at stride {self.stride} need {span}")
+            raise InputError(f"has {num_frames} frames, {self.wanted} at stride {self.stride} need {span}")
         starts = np.unique(np.linspace(0, num_frames - span, self.clips_per_sequence).round().astype(int))
         return [tuple(range(int(start), int(start) + span, self.stride)) for start in starts]
 
@@ -80,7 +82,7 @@ class Leading:
         prepared = re.search(r"/(color|rgb)_\d+$", sequence) is not None
         start, stride = (0, 1) if prepared else (self.start, self.stride)
         if num_frames <= start:
-            raise ValueError(f"has {num_frames} frames, the first that counts is number {start}")
+            raise InputError(f"has {num_frames} frames, the first that counts is number {start}")
         return [tuple(range(start, num_frames, stride))[: self.wanted]]
 
     def describe(self) -> str:
@@ -110,4 +112,4 @@ class RandomFrames:
 
 def _check(num_frames: int) -> None:
     if num_frames < 1:
-        raise ValueError("has no frames")
+        raise InputError("has no frames")

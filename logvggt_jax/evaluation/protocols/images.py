@@ -8,12 +8,14 @@ reconstruction: crop about the principal point; video depth: whole picture; pose
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, ClassVar, Protocol
+from typing import ClassVar, Protocol
 
 import cv2
 import numpy as np
+from PIL import Image
 
 from logvggt_jax.data.feeding.transforms import PATCH, fit
+from logvggt_jax.errors import InputError
 from logvggt_jax.types import Frames
 
 _REFERENCE_EDGE = 518
@@ -141,14 +143,14 @@ def crop_about_principal_point(
       image [h, w, 3], depth [h, w], intrinsics [3, 3].
 
     Raises:
-      ValueError: the principal point lies outside the picture.
+      InputError: the principal point lies outside the picture.
     """
     source_height, source_width = image.shape[:2]
     centre_u, centre_v = (round(float(c)) for c in intrinsics[:2, 2])
     half_width = min(centre_u, source_width - centre_u)
     half_height = min(centre_v, source_height - centre_v)
     if half_width < 1 or half_height < 1:
-        raise ValueError(
+        raise InputError(
             f"the principal point ({centre_u}, {centre_v}) lies outside the image of size "
             f"{(source_height, source_width)}: correct the intrinsics"
         )
@@ -157,7 +159,7 @@ def crop_about_principal_point(
     depth = depth[top : top + 2 * half_height, left : left + 2 * half_width]
     cropped = np.array(image.shape[1::-1], np.float64)
     target = np.array(size[::-1])
-    scale = float((target / cropped).max()) + 1e-8
+    scale = float(np.max(target / cropped)) + 1e-8
     covering = np.floor(cropped * scale).astype(int)
     image = resize_image(image, (int(covering[1]), int(covering[0])))
     depth = cv2.resize(depth, (int(covering[0]), int(covering[1])), interpolation=cv2.INTER_NEAREST)
@@ -173,15 +175,6 @@ def resize_image(image: np.ndarray, size: tuple[int, int], *, lanczos: bool = Tr
     """Image [H, W, 3] uint8 at `size` (h, w) by Pillow's antialiased Lanczos filter where it shrinks, else bicubic."""
     if image.shape[:2] == size:
         return image
-    pillow = _pillow()
     shrinks = size[0] * size[1] < image.shape[0] * image.shape[1]
-    resampling = pillow.Resampling.LANCZOS if lanczos and shrinks else pillow.Resampling.BICUBIC
-    return np.asarray(pillow.fromarray(image).resize((size[1], size[0]), resampling))
-
-
-def _pillow() -> Any:
-    try:
-        from PIL import Image
-    except ImportError as error:
-        raise ImportError(f'pictures are resized by Pillow ({error}): pip install "logvggt-jax[eval]"') from error
-    return Image
+    resampling = Image.Resampling.LANCZOS if lanczos and shrinks else Image.Resampling.BICUBIC
+    return np.asarray(Image.fromarray(image).resize((size[1], size[0]), resampling))

@@ -7,6 +7,8 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
+from logvggt_jax.config import require_counts, require_within
+from logvggt_jax.errors import InputError
 from logvggt_jax.evaluation.protocols.frame_selection import FrameSelection
 from logvggt_jax.evaluation.protocols.images import ImageRule
 
@@ -95,8 +97,13 @@ class Protocol:
         """Whether a sequence of the data set belongs to the benchmark."""
         return re.fullmatch(self.sequences, sequence) is not None
 
+    def measures(self) -> dict[str, Any]:
+        """What decides the numbers of given frames: the images' rule and the metrics, as JSON values."""
+        described = self.describe()
+        return {name: described[name] for name in ("images", "depth", "points", "poses", "trajectory")}
+
     def describe(self) -> dict[str, Any]:
-        """All settings that the results depend on, as JSON values."""
+        """All settings, as JSON values, for the report."""
         settings = dataclasses.asdict(self)
         for part in ("frames", "images"):
             settings[part] = {"rule": type(getattr(self, part)).__name__, **settings[part]}
@@ -105,7 +112,7 @@ class Protocol:
 
 @dataclasses.dataclass(frozen=True)
 class ProtocolSettings:
-    """What all benchmarks of a run share.
+    """What all benchmarks of the paper share (`protocol` in configs/eval/paper.py).
 
     Attributes:
       longer_edge: pixels of the network's images, a multiple of 14; 518 is the paper's. The middle crop of
@@ -123,12 +130,12 @@ class ProtocolSettings:
     rooms: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if not isinstance(self.longer_edge, int) or self.longer_edge < 28 or self.longer_edge % 14:
-            raise ValueError(f"longer_edge must be a multiple of 14, at least 28, got {self.longer_edge!r}")
-        if self.max_points is not None and (not isinstance(self.max_points, int) or self.max_points < 1):
-            raise ValueError(f"max_points must be a positive whole number or None, got {self.max_points!r}")
-        if self.icp_threshold is not None and not self.icp_threshold > 0:
-            raise ValueError(f"icp_threshold must be positive or None, got {self.icp_threshold}")
+        if self.longer_edge < 28 or self.longer_edge % 14:
+            raise InputError(
+                f"ProtocolSettings.longer_edge must be a multiple of 14, at least 28, got {self.longer_edge}"
+            )
+        require_counts(self, "max_points")
+        require_within(self, "(0, inf)", "icp_threshold")
 
     @property
     def points(self) -> PointsMeasure:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from logvggt_jax.errors import MissingPackage
+from logvggt_jax.files import atomic_file
 from logvggt_jax.geometry import camera_centres, invert
+from logvggt_jax.metrics import NotMeasurable
 from logvggt_jax.metrics.depth import align_depth, resize_depth
 from logvggt_jax.metrics.trajectory import align_trajectory
 
@@ -37,7 +39,7 @@ def trajectory_plot(path: Path, predicted_extrinsics: np.ndarray, true_extrinsic
         curves["prediction, aligned"] = align_trajectory(poses, invert(np.asarray(true_extrinsics, np.float64)))[
             :, :3, 3
         ]
-    except ValueError:
+    except NotMeasurable:
         note = "; the prediction stands still or is straight and cannot be aligned"
     # The two principal directions of the true positions show most of the path whatever the world's axes are.
     axes = np.linalg.svd(true - true.mean(0))[2][:2]
@@ -203,7 +205,7 @@ def _figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, li
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise ImportError(f'plots need matplotlib ({error}): pip install "logvggt-jax[eval]"') from error
+        raise MissingPackage(f'plots need matplotlib ({error}): pip install "logvggt-jax[eval]"') from error
     figure = Figure(figsize=size, layout="constrained")
     FigureCanvasAgg(figure)
     return figure, list(np.ravel(figure.subplots(rows, columns, squeeze=False)))
@@ -211,9 +213,5 @@ def _figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, li
 
 def _save(figure: Any, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.png")
-    try:
+    with atomic_file(path) as temporary:
         figure.savefig(temporary, dpi=130)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)

@@ -14,10 +14,10 @@ from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from logvggt_jax.evaluation.records import write_text
 from logvggt_jax.evaluation.report.page import html_page
 from logvggt_jax.evaluation.report.paper_tables import paper_tables
 from logvggt_jax.evaluation.report.tables import MARK, Table, benchmark_tables, coverage_table
+from logvggt_jax.files import write_text
 
 # Of output that goes to a file: the widest of the paper's tables is not cut.
 _FILE_WIDTH = 240

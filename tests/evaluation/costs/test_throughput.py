@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -13,10 +14,7 @@ from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.evaluation.costs import throughput
 from logvggt_jax.evaluation.costs.parts import PARTS
 from logvggt_jax.evaluation.costs.throughput import TimingConfig, measured_timings, random_pictures, time_stream
-from logvggt_jax.evaluation.methods.method import ClipPrediction, Method, PredictionError
-from logvggt_jax.evaluation.settings import BenchmarkRun
-
-SETTING = {"longer_edge": 42, "identity": "parameters"}
+from logvggt_jax.evaluation.methods.method import Checkpoint, ClipPrediction, Method, PredictionError
 
 
 def short_only(images: np.ndarray) -> ClipPrediction:
@@ -28,9 +26,14 @@ def short_only(images: np.ndarray) -> ClipPrediction:
 def test_every_row_is_timed_once_and_kept(
     small_config: ModelConfig, small_variables: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    model, references = LogVGGT(small_config), [Method("short only", "nothing", short_only)]
+    checkpoint = Checkpoint(LogVGGT(small_config), small_variables, "digest")
+    references = [Method("short only", "nothing", short_only)]
     config = TimingConfig(lengths=(7, 5), rounds=2)
-    report = measured_timings(model, small_variables, references, config, tmp_path, **SETTING)
+
+    def measure(checkpoint: Checkpoint = checkpoint, *, longer_edge: int = 42, fresh: bool = False) -> dict[str, Any]:
+        return measured_timings(checkpoint, references, config, tmp_path, longer_edge=longer_edge, fresh=fresh)
+
+    report = measure()
     assert report["image_size"] == [28, 42] and report["lengths"] == [5, 7] and report["part_frames"] == 7
     rates = dict(report["frames_per_second"])
     assert rates.pop("short only")["7"] == "too long"
@@ -47,13 +50,14 @@ def test_every_row_is_timed_once_and_kept(
 
     with monkeypatch.context() as patch:
         patch.setattr(throughput, "time_stream", again)
-        assert measured_timings(model, small_variables, references, config, tmp_path, **SETTING) == report
-        for changed in ({"longer_edge": 56}, {"identity": "others"}):
+        assert measure() == report
+        others = dataclasses.replace(checkpoint, digest="others")
+        for changed in ({"longer_edge": 56}, {"checkpoint": others}, {"fresh": True}):
             with pytest.raises(AssertionError, match="measured again"):
-                measured_timings(model, small_variables, references, config, tmp_path, **{**SETTING, **changed})
+                measure(**changed)
         (tmp_path / "timings.json").write_text("{")
         with pytest.raises(AssertionError, match="measured again"):
-            measured_timings(model, small_variables, references, config, tmp_path, **SETTING)
+            measure()
 
 
 def test_a_stream_is_timed_from_its_first_frame_to_its_cameras(
@@ -63,18 +67,3 @@ def test_a_stream_is_timed_from_its_first_frame_to_its_cameras(
     assert 0 < run.first_result < run.seconds and run.live_bytes > 0
     # Windows end with frames 4, 6 and 8; the last frame waits for the end.
     assert len(run.steps) == 3 and sum(run.steps) < run.seconds
-
-
-@pytest.mark.parametrize(
-    ("timings", "message"),
-    [
-        ({"lengths": (0,)}, "timings.lengths must be numbers of frames, 1 or more each"),
-        ({"rounds": 0}, "timings.rounds must be at least 1, got 0"),
-        ({"length": (5,)}, "unknown field timings.length"),
-    ],
-)
-def test_wrong_settings_are_named(timings: dict[str, Any], message: str) -> None:
-    protocol = {"longer_edge": 42}
-    values = {"title": "t", "benchmarks": ("*",), "baselines": False, "protocol": protocol, "timings": timings}
-    with pytest.raises(ValueError, match=message):
-        BenchmarkRun.from_dict(values)

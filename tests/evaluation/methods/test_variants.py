@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from logvggt_jax import LogVGGT, ModelConfig, WindowConfig
+from logvggt_jax.errors import InputError
 from logvggt_jax.evaluation.methods import variants as module
-from logvggt_jax.evaluation.methods.method import ClipPrediction
+from logvggt_jax.evaluation.methods.method import Checkpoint, ClipPrediction
 from logvggt_jax.evaluation.methods.variants import VARIANTS, variant_methods
 
 FRAMES = 9
@@ -20,7 +21,7 @@ NAMES = ("full", "gccr_online", "no_cwa")
 
 @pytest.fixture(scope="module")
 def predictions(small_config: ModelConfig, small_variables: dict) -> dict[str, ClipPrediction]:
-    methods = variant_methods(LogVGGT(small_config), small_variables, NAMES)
+    methods = variant_methods(Checkpoint(LogVGGT(small_config), small_variables, ""), NAMES)
     return {method.name: method.predict(IMAGES) for method in methods}
 
 
@@ -57,7 +58,7 @@ def test_windows_run_once_for_all_refinements(
     runs = []
     original = module.stream_windows
     monkeypatch.setattr(module, "stream_windows", lambda model, *rest: runs.append(model) or original(model, *rest))
-    methods = variant_methods(LogVGGT(small_config), small_variables, ("full", "no_gccr", "no_cwa"))
+    methods = variant_methods(Checkpoint(LogVGGT(small_config), small_variables, ""), ("full", "no_gccr", "no_cwa"))
     for _ in range(2):
         images = IMAGES.copy()
         predictions = {method.name: method.predict(images) for method in methods}
@@ -68,7 +69,7 @@ def test_windows_run_once_for_all_refinements(
 def test_the_same_model_has_one_row(small_config: ModelConfig, small_variables: dict) -> None:
     base = LogVGGT(dataclasses.replace(small_config, windows=WindowConfig(4, 2, cache="input")))
     names = ("full", "cache_input", "cache_output", "windows_4_2")
-    rows = [method.name for method in variant_methods(base, small_variables, names)]
+    rows = [method.name for method in variant_methods(Checkpoint(base, small_variables, ""), names)]
     assert rows == ["full, trunk all", "full, trunk 4", "cache of outputs, trunk all", "cache of outputs, trunk 4"]
 
 
@@ -91,5 +92,5 @@ def test_every_variant_is_a_valid_model() -> None:
 
 
 def test_an_unknown_variant_is_named(small_config: ModelConfig, small_variables: dict) -> None:
-    with pytest.raises(ValueError, match="unknown 'no_gcrc'; known are full, no_gccr"):
-        variant_methods(LogVGGT(small_config), small_variables, ("full", "no_gcrc"))
+    with pytest.raises(InputError, match="unknown 'no_gcrc'; known are full, no_gccr"):
+        variant_methods(Checkpoint(LogVGGT(small_config), small_variables, ""), ("full", "no_gcrc"))

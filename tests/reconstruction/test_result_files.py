@@ -1,4 +1,4 @@
-"""What is written can be read back, appears whole or not at all, and follows its format."""
+"""What is written can be read back and follows its format."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from logvggt_jax.files import atomic_file, output_folder
 from logvggt_jax.geometry import camera_centres, invert, quaternion_to_matrix, rotation_angle
+from logvggt_jax.reconstruction.cameras_file import read_cameras, write_cameras
 from logvggt_jax.reconstruction.depth_files import (
     as_stored,
     depth_picture,
@@ -18,13 +18,8 @@ from logvggt_jax.reconstruction.depth_files import (
     write_depth,
     write_picture,
 )
+from logvggt_jax.reconstruction.exporters.tum import read_trajectory, write_trajectory
 from logvggt_jax.reconstruction.room_sequence import write_room_sequence
-from logvggt_jax.reconstruction.trajectory_files import (
-    read_cameras,
-    read_trajectory,
-    write_cameras,
-    write_trajectory,
-)
 
 
 def random_extrinsics(count: int) -> np.ndarray:
@@ -111,77 +106,6 @@ def test_depth_picture_is_brighter_when_nearer_and_black_where_invalid(tmp_path:
     assert brightness[1] > brightness[2] > brightness[3]
     write_picture(tmp_path / "p.png", picture)
     np.testing.assert_array_equal(cv2.imread(str(tmp_path / "p.png"))[..., ::-1], picture)
-
-
-def test_a_file_appears_whole_or_not_at_all(tmp_path: Path) -> None:
-    path = tmp_path / "f.txt"
-    path.write_text("old")
-    with pytest.raises(RuntimeError), atomic_file(path) as temporary:
-        temporary.write_text("half")
-        raise RuntimeError
-    assert path.read_text() == "old"
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_a_folder_appears_whole_or_not_at_all(tmp_path: Path) -> None:
-    target = tmp_path / "deep" / "out"
-    with pytest.raises(KeyboardInterrupt), output_folder(target, overwrite=False, marker="done") as folder:
-        (folder / "done").touch()
-        raise KeyboardInterrupt
-    assert list((tmp_path / "deep").iterdir()) == []
-    with output_folder(target, overwrite=False, marker="done") as folder:
-        assert not target.exists()
-        (folder / "done").write_text("1")
-    assert (target / "done").read_text() == "1"
-    assert list((tmp_path / "deep").iterdir()) == [target]
-
-
-def test_only_results_are_overwritten_and_only_when_asked(tmp_path: Path) -> None:
-    target = tmp_path / "out"
-    target.mkdir()
-    (target / "thesis.tex").write_text("years of work")
-    for overwrite in (False, True):
-        with (
-            pytest.raises(FileExistsError, match=str(target)),
-            output_folder(target, overwrite=overwrite, marker="done"),
-        ):
-            pass
-    (target / "done").touch()
-    with pytest.raises(RuntimeError), output_folder(target, overwrite=True, marker="done"):
-        raise RuntimeError
-    assert (target / "thesis.tex").exists()
-    with output_folder(target, overwrite=True, marker="done") as folder:
-        (folder / "new").touch()
-    assert [path.name for path in target.iterdir()] == ["new"]
-    assert list(tmp_path.iterdir()) == [target]
-
-
-def test_a_folder_that_cannot_be_replaced_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    target = tmp_path / "out"
-    target.mkdir()
-    (target / "done").write_text("old")
-    original = Path.rename
-
-    def refuse(self: Path, new: Path) -> Path:
-        if self.name == "out.partial":
-            raise PermissionError(f"{self} is in use")
-        return original(self, new)
-
-    monkeypatch.setattr(Path, "rename", refuse)
-    with pytest.raises(PermissionError), output_folder(target, overwrite=True, marker="done") as folder:
-        (folder / "done").write_text("new")
-    assert (target / "done").read_text() == "old"
-    assert list(tmp_path.iterdir()) == [target]
-
-
-def test_two_runs_do_not_write_into_one_folder(tmp_path: Path) -> None:
-    with (
-        output_folder(tmp_path / "out", overwrite=False, marker="done"),
-        pytest.raises(FileExistsError, match=r"out\.partial exists"),
-        output_folder(tmp_path / "out", overwrite=False, marker="done"),
-    ):
-        pass
-    assert (tmp_path / "out").is_dir()
 
 
 def test_room_sequence_has_consistent_depth_poses_and_intrinsics(tmp_path: Path) -> None:

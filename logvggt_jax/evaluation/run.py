@@ -1,0 +1,71 @@
+"""A whole evaluation, from a configuration's values to the tables on disk."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from logvggt_jax.evaluation.costs.throughput import measured_timings
+from logvggt_jax.evaluation.datasets import open_run
+from logvggt_jax.evaluation.methods.method import Checkpoint
+from logvggt_jax.evaluation.methods.rows import model_rows
+from logvggt_jax.evaluation.methods.variants import variant_methods
+from logvggt_jax.evaluation.report.report import write_report
+from logvggt_jax.evaluation.runner import evaluate
+from logvggt_jax.evaluation.settings import PaperRun, read_run
+
+
+def run_evaluation(
+    configuration: Mapping[str, Any],
+    checkpoint: str | Path,
+    output: str | Path,
+    *,
+    data_root: str | Path | None = None,
+    fresh: bool = False,
+    command: str,
+) -> dict[str, Any]:
+    """Evaluates a checkpoint and writes clips.jsonl, results.json, tables, figures and report.
+
+    Args:
+      configuration: as a file of configs/eval gives it.
+      checkpoint: model folder.
+      output: folder of the results. What an interrupted run of the same code has measured is taken over; other
+        results are replaced once these are complete.
+      data_root: folder of the data set, where it is read from disk; for the paper's benchmarks that of their folders.
+      fresh: measure everything anew.
+      command: what a reader has to run to get the same numbers.
+
+    Returns:
+      The content of results.json, see `evaluate`.
+
+    Raises:
+      InputError: a setting, the data or the checkpoint cannot be used.
+    """
+    run, output = read_run(configuration), Path(output)
+    benchmarks, baselines = open_run(run, data_root)
+    loaded = Checkpoint.load(checkpoint)
+    rows = model_rows(loaded, run.methods, run.references)
+
+    def timings() -> dict[str, Any]:
+        assert isinstance(run, PaperRun) and run.timings is not None
+        others = [row for row, name in zip(rows, run.methods, strict=True) if name != "windows"]
+        edge = run.protocol.longer_edge
+        return measured_timings(loaded, others, run.timings, output, longer_edge=edge, fresh=fresh)
+
+    results = evaluate(
+        benchmarks,
+        [*rows, *variant_methods(loaded, run.variants), *baselines(loaded.model)],
+        output,
+        title=run.title,
+        command=command,
+        configuration=dataclasses.asdict(run),
+        checkpoint=loaded.digest,
+        max_sequences=run.max_sequences,
+        figures=run.figures,
+        fresh=fresh,
+        timings=timings if isinstance(run, PaperRun) and run.timings and run.timings.lengths else None,
+    )
+    write_report(results, output)
+    return results

@@ -1,0 +1,40 @@
+"""What the model's functions may be given: shapes and dtypes, checked before anything is traced."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+
+def check_array(name: str, array: jax.Array, shape: tuple[int | None, ...], kind: Any) -> None:
+    """Raises ValueError unless an array has this shape (None: any size) and its dtype is of this kind."""
+    found = tuple(array.shape)
+    fits = len(found) == len(shape) and all(a in (b, None) for a, b in zip(shape, found, strict=True))
+    if not fits or not jnp.issubdtype(array.dtype, kind):
+        wanted = ", ".join("any" if size is None else str(size) for size in shape)
+        kind_name = "bool" if kind is jnp.bool_ else "floating point"
+        raise ValueError(f"{name} must be {kind_name} [{wanted}], got {array.dtype} {list(found)}")
+
+
+def check_images(images: jax.Array, patch_size: int, name: str = "images") -> None:
+    """Raises ValueError unless images are [B, T, H, W, 3], uint8 or floating point, H and W multiples of a patch."""
+    shape = tuple(images.shape)
+    if len(shape) != 5 or shape[-1] != 3 or 0 in shape:
+        raise ValueError(f"{name} must have shape [B, T, H, W, 3] with T >= 1, got {shape}")
+    if shape[2] % patch_size or shape[3] % patch_size:
+        raise ValueError(
+            f"{name} have height {shape[2]} and width {shape[3]}, which must be multiples of {patch_size}; "
+            "logvggt_jax.preprocess resizes frames of any size"
+        )
+    if images.dtype != jnp.uint8 and not jnp.issubdtype(images.dtype, jnp.floating):
+        raise ValueError(f"{name} must be uint8 or floating point in [0, 1], got dtype {images.dtype}")
+
+
+def checked_mask(images: jax.Array, mask: jax.Array | None) -> jax.Array:
+    """The frame mask bool [B, T] of images [B, T, …]: all frames where None is given."""
+    if mask is None:
+        return jnp.ones(images.shape[:2], bool)
+    check_array("frame_mask", mask, images.shape[:2], jnp.bool_)
+    return jnp.asarray(mask)

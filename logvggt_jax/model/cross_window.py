@@ -1,0 +1,82 @@
+"""Cross-window attention: what a window leaves behind at the key layers, and how the next window reads it.
+
+Paper, equation of cross-window attention, at every key layer l of window i:
+
+    H_i^(l+1) = F( Q(H_i^(l)), K([H_i^(l), C_{i−1}^(l)]), V([H_i^(l), C_{i−1}^(l)]) )
+
+F is the block's own attention, with its own norm, projections, key norm and rotary embedding for both halves and no
+parameter of its own; residual, MLP and LayerScale stay VGGT's. The paper leaves open what the cache C holds. Here
+C_{i−1}^(l) are all tokens of the frames that windows i − 1 and i share, as the global block of layer l left them in
+window i − 1 (`WindowConfig.cache = "output"`), or as that block met them (`"input"`). With inputs cached, every hop
+from window to window climbs one key layer: frame 0 reaches as many later windows as there are key layers.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from logvggt_jax.model.memory import Keys, LayerMemory, Project
+
+
+@struct.dataclass
+class CachedTokens:
+    """C_{i−1}^(l) of one key layer.
+
+    Attributes:
+      tokens: [B, F, P, C], of the F frames that the windows share.
+      length: int32 [B], how many of the F frames count, always the first ones; 0 before the first window.
+    """
+
+    tokens: jax.Array
+    length: jax.Array
+
+    def extend(self, own: Keys, project: Project) -> tuple[Keys, LayerMemory]:
+        """Keys and values [H, C]; the cache is replaced by the windows, not by the block."""
+        batch, frames, tokens, width = self.tokens.shape
+        cached = project(self.tokens.astype(jnp.float32).reshape(batch, frames * tokens, width))
+        empty = self.length == 0
+        count = jnp.int32(own.key.shape[1]) if own.valid is None else own.valid
+        keys = Keys(
+            _joined(own.key, cached.key, empty),
+            _joined(own.value, cached.value, empty),
+            count + self.length * tokens,
+        )
+        return keys, self
+
+
+@struct.dataclass
+class CrossWindowMemory:
+    """The caches of all key layers.
+
+    Attributes:
+      tokens: [B, key layers, F, P, C].
+      length: int32 [B], see `CachedTokens`.
+      key_layers: static.
+    """
+
+    tokens: jax.Array
+    length: jax.Array
+    key_layers: tuple[int, ...] = struct.field(pytree_node=False)
+
+    def at(self, layer: int) -> CachedTokens | None:
+        """The cache of `layer`; None for layers that are not key layers."""
+        if layer not in self.key_layers:
+            return None
+        return CachedTokens(self.tokens[:, self.key_layers.index(layer)], self.length)
+
+    def updated(self, layer: int, memory: LayerMemory) -> CrossWindowMemory:
+        """The same: what a window leaves is known when it has run."""
+        del layer, memory
+        return self
+
+
+def _joined(own: jax.Array, cached: jax.Array, empty: jax.Array) -> jax.Array:
+    """Both halves [B, N + E, …] such that those that count come first: attention does not care for the order.
+
+    The cache is whole or empty, and padding ends the window: before the window's own keys it leaves no gap but when
+    it is empty, and then it goes to the end.
+    """
+    cache_last, cache_first = jnp.concatenate([own, cached], axis=1), jnp.concatenate([cached, own], axis=1)
+    return jnp.where(empty[:, None, None, None], cache_last, cache_first)

@@ -1,0 +1,140 @@
+"""A result folder, read back: cameras, depth, images and points of a reconstruction."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+
+from logvggt_jax.errors import InputError
+from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE, read_cameras
+from logvggt_jax.reconstruction.depth_files import read_depth, read_picture
+from logvggt_jax.reconstruction.point_cloud import count_points, read_points
+
+TRAJECTORY_FILE = "trajectory.txt"
+POINTS_FILE = "points.ply"
+DEPTH_FOLDER = "depth"
+IMAGE_FOLDER = "images"
+PREVIEW_FOLDER = "previews"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Reconstruction:
+    """What `reconstruct` has written; the one way to read it for viewer and exporters.
+
+    Attributes:
+      folder: where it lies.
+      names: N frame names, in order.
+      timestamps: [N] float64, seconds of a video, positions in a folder.
+      extrinsics: [N, 3, 4] float64, world-to-camera (OpenCV); the world is the first camera's frame, lengths are up to
+        one common scale.
+      intrinsics: [N, 3, 3] float64, pixels of the original images.
+      depth_intrinsics: [N, 3, 3] float64, pixels of depth, confidence and image; centres at integers.
+      image_size: (H, W) of the original images.
+      depth_size: (h, w) of depth, confidence and image.
+      seconds: from the first frame to the last depth map, compilation included; None for a folder opened later.
+    """
+
+    folder: Path
+    names: tuple[str, ...]
+    timestamps: np.ndarray
+    extrinsics: np.ndarray
+    intrinsics: np.ndarray
+    depth_intrinsics: np.ndarray
+    image_size: tuple[int, int]
+    depth_size: tuple[int, int]
+    seconds: float | None = None
+
+    @classmethod
+    def open(cls, folder: str | Path) -> Reconstruction:
+        """The reconstruction in a folder that `reconstruct` has written.
+
+        Raises:
+          InputError: the folder is not one, or a file of it is missing or cut off. What else is wrong with a file is
+            said when it is read.
+        """
+        folder = Path(folder).expanduser()
+        result = cls.with_cameras_of(folder)
+        files = [depth_file(folder, name) for name in result.names]
+        if (folder / IMAGE_FOLDER).exists():  # results of earlier versions have none
+            files += [image_file(folder, name) for name in result.names]
+        for file in files:
+            if not file.is_file():
+                raise InputError(f"{file} is missing: the reconstruction is damaged or incomplete; make it again")
+        count_points(folder / POINTS_FILE)
+        return result
+
+    @classmethod
+    def with_cameras_of(cls, folder: Path) -> Reconstruction:
+        """As `open`, for a folder that holds cameras and whose other files need not be complete."""
+        document = read_cameras(folder / CAMERAS_FILE)
+        frames = document["frames"]
+
+        def stacked(key: str) -> np.ndarray:
+            return np.stack([frame[key] for frame in frames])
+
+        return cls(
+            folder=folder,
+            names=tuple(frame["name"] for frame in frames),
+            timestamps=np.array([frame["timestamp"] for frame in frames], np.float64),
+            extrinsics=stacked("extrinsics"),
+            intrinsics=stacked("intrinsics"),
+            depth_intrinsics=stacked("depth_intrinsics"),
+            image_size=tuple(document["image_size"]),
+            depth_size=tuple(document["depth_size"]),
+        )
+
+    @property
+    def num_frames(self) -> int:
+        """Frames of the sequence."""
+        return len(self.names)
+
+    @property
+    def num_points(self) -> int:
+        """Points of the cloud."""
+        return count_points(self.folder / POINTS_FILE)
+
+    def depth(self, index: int) -> np.ndarray:
+        """Depth of a frame, [h, w] float32: z-depth in the unit of the extrinsics."""
+        return read_depth(depth_file(self.folder, self.names[index]))[0]
+
+    def confidence(self, index: int) -> np.ndarray:
+        """Confidence of a frame's depth, [h, w] float32, at least 1."""
+        return read_depth(depth_file(self.folder, self.names[index]))[1]
+
+    def image(self, index: int) -> np.ndarray:
+        """A frame as the model saw it, [h, w, 3] uint8 RGB, to the few grey levels that JPEG costs."""
+        return read_picture(image_file(self.folder, self.names[index]))
+
+    def points(self) -> tuple[np.ndarray, np.ndarray]:
+        """The cloud: points [M, 3] float32 in the world, and colours [M, 3] uint8."""
+        return read_points(self.folder / POINTS_FILE)
+
+    def summary(self) -> str:
+        """One line a result, with its place."""
+        height, width = self.depth_size
+        lines = [
+            (CAMERAS_FILE, f"intrinsics and world-to-camera extrinsics of {self.num_frames} frames"),
+            (TRAJECTORY_FILE, "camera-to-world trajectory, TUM format"),
+            (f"{DEPTH_FOLDER}/*.npz", f"depth and confidence, {height} x {width}, float16"),
+            (f"{IMAGE_FOLDER}/*.jpg", "the frames at that size"),
+            (f"{PREVIEW_FOLDER}/*.png", "some images beside their depth"),
+            (POINTS_FILE, f"{self.num_points:,} coloured points"),
+        ]
+        took = ""
+        if self.seconds:
+            took = f" in {self.seconds:.1f} s ({self.num_frames / self.seconds:.2f} frames/s)"
+        return "\n".join(
+            [f"{self.num_frames} frames{took}", *(f"  {self.folder / name}: {what}" for name, what in lines)]
+        )
+
+
+def depth_file(folder: Path, name: str) -> Path:
+    """Where a result folder keeps the depth of the frame of this name."""
+    return folder / DEPTH_FOLDER / f"{name}.npz"
+
+
+def image_file(folder: Path, name: str) -> Path:
+    """Where a result folder keeps the image of the frame of this name."""
+    return folder / IMAGE_FOLDER / f"{name}.jpg"

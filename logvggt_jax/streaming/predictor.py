@@ -1,0 +1,104 @@
+"""Methods that turn frames into predictions: one protocol, one registry.
+
+Reconstruction, evaluation, timing and the command line open a method by its name and know no other way: a published
+number is a number of the code that users run. A new method is a file of this folder and a line of `METHODS`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import numpy as np
+
+from logvggt_jax.errors import InputError
+from logvggt_jax.model.logvggt import LogVGGT, Variables
+from logvggt_jax.streaming.chunks import ChunkPlan, ChunkSession
+from logvggt_jax.streaming.offline import OfflineSession, OfflineSettings
+from logvggt_jax.streaming.results import Cameras, FrameResult
+from logvggt_jax.streaming.windows import StreamSession, WindowSettings
+
+
+class Predictor(Protocol):
+    """One sequence on its way through a method."""
+
+    @property
+    def num_frames(self) -> int:
+        """Frames handed out so far."""
+        ...
+
+    def push(self, frames: np.ndarray | jax.Array | Sequence[np.ndarray]) -> list[FrameResult]:
+        """Takes frames and returns those that became final, oldest first.
+
+        Args:
+          frames: one frame [H, W, 3] or several [n, H, W, 3], uint8 or floating point in [0, 1]; H and W are
+            multiples of the patch size and the same in every call, as is the dtype.
+
+        Raises:
+          ValueError: another shape or dtype, or the sequence is closed.
+          PredictionError: the method cannot go on, for want of memory or of an alignment.
+        """
+        ...
+
+    def close(self) -> list[FrameResult]:
+        """Ends the sequence: the frames still held, oldest first. Afterwards every pose is final."""
+        ...
+
+    def cameras(self) -> Cameras:
+        """Cameras of the frames whose pose is final."""
+        ...
+
+
+class Method(NamedTuple):
+    """A line of the registry.
+
+    Attributes:
+      open: model, variables and settings to a predictor of one sequence.
+      settings: the frozen dataclass of what can be set, all fields with defaults.
+      trained_for: what its weights have to be trained for: `windows` (LoG-VGGT) or `vggt` (plain VGGT).
+      summary: what the method does, in a few words.
+    """
+
+    open: Callable[[LogVGGT, Variables, Any], Predictor]
+    settings: type
+    trained_for: str
+    summary: str
+
+
+METHODS: Mapping[str, Method] = {
+    "windows": Method(
+        StreamSession.from_settings,
+        WindowSettings,
+        "windows",
+        "LoG-VGGT: overlapping windows that hand tokens on, poses refined globally",
+    ),
+    "offline": Method(
+        OfflineSession, OfflineSettings, "vggt", "plain VGGT: all frames in one window of full global attention"
+    ),
+    "chunks": Method(
+        ChunkSession, ChunkPlan, "vggt", "plain VGGT on overlapping chunks, chained by robust similarities"
+    ),
+}
+
+
+def open_predictor(method: str, model: LogVGGT, variables: Variables, settings: Any = None) -> Predictor:
+    """A method's predictor for one sequence.
+
+    Args:
+      method: a name of `METHODS`.
+      model: the model, whose parts the method uses.
+      variables: {"params": …}.
+      settings: of the method's own settings class; None for its defaults.
+
+    Raises:
+      InputError: the method is not known.
+      ValueError: settings of another method.
+    """
+    if method not in METHODS:
+        raise InputError(f"unknown method {method!r}; known are {', '.join(METHODS)}")
+    found = METHODS[method]
+    settings = found.settings() if settings is None else settings
+    if not isinstance(settings, found.settings):
+        raise ValueError(f"method {method!r} takes {found.settings.__name__}, got {type(settings).__name__}")
+    return found.open(model, variables, settings)

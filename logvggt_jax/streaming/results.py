@@ -1,0 +1,110 @@
+"""What comes out of a stream, frame by frame, and what may go in."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from logvggt_jax.errors import InputError
+from logvggt_jax.geometry import decode_poses
+
+
+class PredictionError(InputError):
+    """A method cannot predict a sequence: too long for the memory, nothing to align."""
+
+
+@dataclasses.dataclass(frozen=True)
+class FrameResult:
+    """One frame whose depth is final, numpy arrays.
+
+    Attributes:
+      index: position in the stream, from 0.
+      depth: [H, W] float32, z-depth in the unit of the poses' translations.
+      confidence: [H, W] float32, at least 1.
+      pose_encoding: [9] float32, see `logvggt_jax.geometry.decode_poses`; None while the frame has no pose.
+      pose_is_final: whether `pose_encoding` stays as it is.
+      points: [H, W, 3] float32 in the first camera's frame; None without point head.
+      points_confidence: [H, W] float32; None without point head.
+    """
+
+    index: int
+    depth: np.ndarray
+    confidence: np.ndarray
+    pose_encoding: np.ndarray | None
+    pose_is_final: bool
+    points: np.ndarray | None
+    points_confidence: np.ndarray | None
+
+
+class Cameras(NamedTuple):
+    """Cameras of the first N frames of a stream, numpy arrays.
+
+    Attributes:
+      pose_encoding: [N, 9] float32.
+      extrinsics: [N, 3, 4] float32, world-to-camera (OpenCV); the world is the first camera's frame.
+      intrinsics: [N, 3, 3] float32, pixels of the model's input.
+      is_final: bool [N], False where later frames may still move the pose.
+    """
+
+    pose_encoding: np.ndarray
+    extrinsics: np.ndarray
+    intrinsics: np.ndarray
+    is_final: np.ndarray
+
+
+def decoded_cameras(encodings: np.ndarray, image_size: tuple[int, int], *, final: int) -> Cameras:
+    """Cameras of pose encodings [N, 9] for images of (H, W) pixels, the first `final` of which are final."""
+    # A field of view of zero, which untrained models predict, is an infinite focal length.
+    with np.errstate(divide="ignore"):
+        extrinsics, intrinsics = decode_poses(encodings, image_size)
+    return Cameras(encodings, extrinsics, intrinsics, np.arange(len(encodings)) < final)
+
+
+def checked_frames(
+    frames: np.ndarray | jax.Array | Sequence[np.ndarray], *, patch_size: int, before: np.ndarray | None
+) -> np.ndarray:
+    """Frames [n, H, W, 3] of one frame [H, W, 3] or several, fit for the model.
+
+    Args:
+      frames: uint8 or floating point in [0, 1].
+      patch_size: H and W must be multiples of it.
+      before: an earlier frame [H, W, 3] of the same stream, whose shape and dtype these must have.
+
+    Raises:
+      ValueError: another shape or dtype.
+    """
+    frames = np.asarray(frames)
+    frames = frames[None] if frames.ndim == 3 else frames
+    shape = frames.shape
+    if len(shape) != 4 or shape[-1] != 3 or 0 in shape:
+        raise ValueError(f"frames must have shape [n, H, W, 3] or [H, W, 3], got {shape}")
+    if shape[1] % patch_size or shape[2] % patch_size:
+        raise ValueError(
+            f"frames of {shape[1]} x {shape[2]} pixels: height and width must be multiples of {patch_size}; "
+            "logvggt_jax.preprocess resizes frames of any size"
+        )
+    if frames.dtype != np.uint8 and not np.issubdtype(frames.dtype, np.floating):
+        raise ValueError(f"frames must be uint8 or floating point in [0, 1], got dtype {frames.dtype}")
+    if before is not None and (before.shape != shape[1:] or before.dtype != frames.dtype):
+        raise ValueError(
+            f"frames of a stream must be alike: {before.dtype} {before.shape} before, now {frames.dtype} {shape[1:]}"
+        )
+    return frames
+
+
+@contextlib.contextmanager
+def device_memory(what: str, mend: str) -> Iterator[None]:
+    """Turns the device's being out of memory into a PredictionError: what did not fit, and what lowers it."""
+    try:
+        yield
+    except jax.errors.JaxRuntimeError as error:
+        if "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        reason = str(error).splitlines()[0]
+        device = jax.devices()[0].device_kind
+        raise PredictionError(f"{what} did not fit the memory of {device}: {mend} ({reason})") from error

@@ -1,0 +1,32 @@
+"""What a model's weights were trained for, where they come from, and under which licence."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Literal
+
+from logvggt_jax.config import require_counts
+from logvggt_jax.errors import InputError
+
+
+@dataclasses.dataclass(frozen=True)
+class Provenance:
+    """Kept in a model folder beside the sizes; None where it is not known.
+
+    Attributes:
+      trained_for: `windows`, LoG-VGGT's windows with memory between them; or `vggt`, all frames at once, as public
+        VGGT weights are.
+      longer_edge: pixels of the longer edge of the largest images that they were trained on, a multiple of 14.
+      licence: of the weights, as their source names it.
+      source: file, hub repository or training run, in a few words.
+    """
+
+    trained_for: Literal["windows", "vggt"] | None = None
+    longer_edge: int | None = None
+    licence: str | None = None
+    source: str | None = None
+
+    def __post_init__(self) -> None:
+        require_counts(self, "longer_edge")
+        if self.longer_edge is not None and self.longer_edge % 14:
+            raise InputError(f"Provenance.longer_edge must be a multiple of 14 pixels, got {self.longer_edge}")

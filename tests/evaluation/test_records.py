@@ -1,0 +1,133 @@
+"""What a later run takes over from an earlier one in the same folder, and what it leaves alone."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from known_answers import SETTINGS, benchmarks_of, failing, run
+
+from logvggt_jax.data.rooms.rooms import Rooms
+from logvggt_jax.evaluation import environment, runner
+from logvggt_jax.evaluation.environment import code_version
+from logvggt_jax.evaluation.methods.baselines import static_camera
+from logvggt_jax.evaluation.runner import Benchmark
+
+
+def records(folder: Path) -> list[dict[str, Any]]:
+    lines = [json.loads(line) for line in (folder / "clips.jsonl").read_text().splitlines()]
+    return [line for line in lines if "key" in line]
+
+
+def test_a_killed_evaluation_goes_on_where_it_stopped(rooms: Rooms, tmp_path: Path) -> None:
+    whole = run(rooms, [static_camera()], tmp_path / "whole")
+    method, calls = failing("killed", at_call=3)
+    with pytest.raises(RuntimeError, match="killed"):
+        run(rooms, [method], tmp_path / "killed")
+    lines = tmp_path / "killed" / "clips.jsonl"
+    assert len(lines.read_text().splitlines()) == 1 + 2
+    # What a kill in the middle of a write leaves behind.
+    with lines.open("a") as file:
+        file.write('{"key": "half')
+    resumed = run(rooms, [method], tmp_path / "killed")
+    assert len(calls) == 3 + 2, "two of four clips were left, and the third call had failed"
+    assert resumed["summary"] == whole["summary"]
+    again = run(rooms, [method], tmp_path / "killed")
+    assert len(calls) == 5
+    assert again["summary"] == whole["summary"]
+    for name in ("whole", "killed"):
+        assert len(records(tmp_path / name)) == 4
+
+
+def test_results_of_other_settings_or_parameters_are_not_taken_over(rooms: Rooms, tmp_path: Path) -> None:
+    method, calls = failing("", at_call=-1)
+    for identity in ("a", "b"):
+        run(rooms, [dataclasses.replace(method, identity=identity)], tmp_path)
+    assert len(calls) == 8
+    run(rooms, [dataclasses.replace(method, identity="b")], tmp_path, dataclasses.replace(SETTINGS, seed=1))
+    assert len(calls) == 12
+    assert len(records(tmp_path)) == 4
+
+
+def test_other_code_measures_again(rooms: Rooms, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    method, calls = failing("", at_call=-1)
+    run(rooms, [method], tmp_path)
+    monkeypatch.setattr(runner, "code_version", lambda: "other")
+    run(rooms, [method], tmp_path)
+    assert len(calls) == 8
+
+
+def test_the_prose_of_a_protocol_measures_nothing_again(
+    rooms: Rooms, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    method, calls = failing("", at_call=-1)
+    run(rooms, [method], tmp_path)
+    reworded = [
+        Benchmark(dataclasses.replace(b.protocol, title="new title", decisions=("Reworded.",)), b.dataset, b.split)
+        for b in benchmarks_of(rooms)
+    ]
+    monkeypatch.setattr("known_answers.benchmarks_of", lambda *_: reworded)
+    results = run(rooms, [method], tmp_path)
+    assert len(calls) == 4
+    assert results["benchmarks"][0]["title"] == "new title"
+
+
+def test_a_fresh_run_measures_all_again(rooms: Rooms, tmp_path: Path) -> None:
+    method, calls = failing("", at_call=-1)
+    for fresh in (False, True):
+        run(rooms, [method], tmp_path, fresh=fresh)
+    assert len(calls) == 8
+    assert len(records(tmp_path)) == 4
+
+
+def test_the_version_of_the_code_is_that_of_its_statements(tmp_path: Path) -> None:
+    """Of the parts that decide numbers, and not of their comments and docstrings."""
+
+    def version(name: str, text: str) -> str:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+        code_version.cache_clear()
+        return code_version(package=tmp_path)
+
+    for name in environment._DECIDING:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch() if name.endswith(".py") else (tmp_path / name).mkdir(exist_ok=True)
+    first = version("model/layers.py", 'def f(x):\n    """Doubles."""\n    return 2 * x\n')
+    assert first == version("model/layers.py", 'def f(x):\n    """Twice x."""\n    # so\n    return 2 * x\n')
+    assert first == version("evaluation/report/tables.py", "x = 1\n")
+    assert first != version("model/layers.py", 'def f(x):\n    """Doubles."""\n    return 3 * x\n')
+    code_version.cache_clear()
+
+
+def test_other_results_stay_until_the_new_ones_are_complete(rooms: Rooms, tmp_path: Path) -> None:
+    old, _ = failing("", at_call=-1)
+    run(rooms, [old], tmp_path)
+    figures = tmp_path / "figures"
+    figures.mkdir()
+    theirs = [tmp_path / "report.md", tmp_path / "results.json", figures / "a_room_from_0_9_frames_depth.png"]
+    for path in (theirs[0], theirs[2], tmp_path / "notes.txt", figures / "mine.png"):
+        path.write_text("old")
+    before, measured = theirs[1].read_text(), records(tmp_path)
+    new, _ = failing("killed", at_call=3)
+    new = dataclasses.replace(new, identity="new")
+    with pytest.raises(RuntimeError, match="killed"):
+        run(rooms, [new], tmp_path)
+    assert theirs[1].read_text() == before and theirs[0].exists() and theirs[2].exists()
+    assert records(tmp_path)[:4] == measured and len(records(tmp_path)) == 4 + 2
+    run(rooms, [new], tmp_path)
+    assert len(records(tmp_path)) == 4
+    assert theirs[1].read_text() != "old" and not theirs[0].exists() and not theirs[2].exists()
+    assert (tmp_path / "notes.txt").exists() and (figures / "mine.png").exists()
+
+
+def test_results_name_the_environments_that_measured_them(
+    rooms: Rooms, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for device, methods in (("first", 1), ("second", 2), ("third", 2)):
+        monkeypatch.setattr(runner, "environment", lambda device=device: {"device": device})
+        rows = [static_camera(), dataclasses.replace(static_camera(), name="another")]
+        results = run(rooms, rows[:methods], tmp_path)
+    assert [each["device"] for each in results["environments"]] == ["first", "second"]

@@ -1,0 +1,109 @@
+"""Whole evaluations as eval.py makes them: a configuration and a model folder in, tables out."""
+
+from __future__ import annotations
+
+import copy
+import csv
+import importlib
+import io
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from logvggt_jax.config import ModelConfig
+from logvggt_jax.errors import InputError
+from logvggt_jax.evaluation.report.report import print_report
+from logvggt_jax.evaluation.run import run_evaluation
+from logvggt_jax.weights import save_model
+
+ROOT = Path(__file__).parents[2]
+
+
+def configuration(name: str, changes: dict[str, Any]) -> dict[str, Any]:
+    """A file of configs/eval with some fields changed, by their dotted names."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(ROOT))
+        values = copy.deepcopy(importlib.import_module(f"configs.eval.{name}").get_config().to_dict())
+    for path, value in changes.items():
+        *parents, field = path.split(".")
+        target = values
+        for parent in parents:
+            target = target[parent]
+        target[field] = value
+    return values
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "data_root", "message"),
+    [
+        ("rooms", {}, None, "no-model"),
+        ("rooms", {}, "d", "leave --data_root=d out"),
+        ("rooms", {"evaluation.stride": 0}, None, r"config\.evaluation\.stride must be"),
+        ("rooms", {"references.chunk_overlap": 12}, None, "below the chunk size 12, got 12"),
+        ("rooms", {"rooms.number": 3}, None, "unknown option 'number'"),
+        ("seven_scenes", {}, None, "give its folder with --data_root"),
+        ("seven_scenes", {}, "no-data", "no-data"),
+        ("paper", {}, "no-data", "no-data: no such folder"),
+        ("paper", {"benchmarks": ("sintell",)}, None, "no benchmark is named 'sintell'"),
+    ],
+)
+def test_what_cannot_be_used_is_named_before_anything_is_written(
+    name: str, changes: dict[str, Any], data_root: str | None, message: str, tmp_path: Path
+) -> None:
+    values = configuration(name, changes)
+    with pytest.raises(InputError, match=message) as raised:
+        run_evaluation(values, tmp_path / "no-model", tmp_path / "out", data_root=data_root, command="command")
+    assert "\n" not in str(raised.value)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("field", "message"), [("methods", "unknown 'w'; known are windows"), ("variants", "'w'")])
+def test_unknown_rows_are_named(
+    field: str, message: str, small_config: ModelConfig, small_variables: dict[str, Any], tmp_path: Path
+) -> None:
+    save_model(tmp_path / "model", small_config, small_variables["params"])
+    with pytest.raises(InputError, match=message):
+        run_evaluation(
+            configuration("rooms", {field: ("w",), "baselines": False}),
+            tmp_path / "model",
+            tmp_path / "out",
+            command="command",
+        )
+
+
+def test_model_references_and_baselines_make_a_table(
+    small_config: ModelConfig, small_variables: dict[str, Any], tmp_path: Path
+) -> None:
+    save_model(tmp_path / "model", small_config, small_variables["params"])
+    clips = {"image_size": (28, 42), "clip_lengths": (4,), "max_points": 800, "figures": 1}
+    changes = {f"evaluation.{name}": value for name, value in clips.items()} | {"rooms.num_rooms": 1}
+    values, output = configuration("rooms", changes), tmp_path / "out"
+    results = run_evaluation(values, tmp_path / "model", output, command="command")
+    assert json.loads((output / "results.json").read_text()) == results
+    assert not results["skipped"] and not results["failures"]
+    names = ["LoG-VGGT", "VGGT offline", "VGGT on chunks"]
+    names += ["constant depth", "mean depth map", "static camera", "untrained network"]
+    assert [method["name"] for method in results["methods"]] == names
+    assert [entry["method"] for entry in results["summary"]] == names
+    trained, untrained = results["summary"][0], results["summary"][-1]
+    assert trained["scale/abs_rel"] != untrained["scale/abs_rel"]
+
+    print_report(results, Console(file=(terminal := io.StringIO())))
+    markdown, shown = (output / "report.md").read_text(), f"{trained['scale/abs_rel']:.4f}"
+    for text in (terminal.getvalue(), markdown):
+        assert all(name in text for name in names)
+        assert "training rooms" in text and "†" in text and shown in text
+        assert "To get these numbers again: command" in text
+    # The pictures of the first clip are drawn for the first row, and the page holds them.
+    stems = {path.stem.rpartition("_")[2] for path in (output / "figures").iterdir()}
+    assert stems == {"depth", "points", "trajectory"}
+    page = (output / "report.html").read_text()
+    assert page.count("data:image/png;base64,") == 3
+    assert not re.search(r'(src|href)="(?!data:)', page), "the page refers to no other file"
+    rows = list(csv.reader((output / "tables" / "01-depth-clips-of-4-frames.csv").read_text().splitlines()))
+    assert rows[0][:2] == ["method", "Abs Rel (scale) ↓"]
+    assert rows[1][:2] == ["LoG-VGGT", shown]

@@ -1,0 +1,68 @@
+"""What configuration files may say, and how mistakes are named."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from logvggt_jax.errors import InputError
+from logvggt_jax.evaluation.protocols.clips import ClipSettings
+from logvggt_jax.evaluation.settings import ClipRun, PaperRun, read_run
+
+CLIPS = {"image_size": [28, 42], "clip_lengths": [4]}
+CLIP_RUN = {"title": "t", "dataset": "rooms", "split": "test", "baselines": False, "evaluation": CLIPS}
+PAPER_RUN = {"title": "t", "benchmarks": ["*"], "baselines": True, "protocol": {"longer_edge": 70}}
+
+
+def test_the_kind_of_a_run_follows_from_its_fields() -> None:
+    clips, paper = read_run(CLIP_RUN), read_run(PAPER_RUN)
+    assert isinstance(clips, ClipRun) and clips.evaluation == ClipSettings(image_size=(28, 42), clip_lengths=(4,))
+    assert isinstance(paper, PaperRun) and paper.protocol.longer_edge == 70 and paper.benchmarks == ("*",)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"image_size": (56, 71)}, r"config\.evaluation\.image_size must be \(H, W\), multiples of 14"),
+        ({"clip_lengths": ()}, r"config\.evaluation\.clip_lengths must be"),
+        ({"clip_lengths": (1,)}, r"config\.evaluation\.clip_lengths must be"),
+        ({"stride": 0}, r"config\.evaluation\.stride must be a positive integer, got 0"),
+        ({"stride": "2"}, r"config\.evaluation\.stride must be a whole number, got '2'"),
+        ({"max_points": 0}, r"config\.evaluation\.max_points must be"),
+        ({"icp_threshold": -1.0}, r"config\.evaluation\.icp_threshold must lie in \(0, inf\)"),
+        ({"length": 4}, r"unknown field config\.evaluation\.length"),
+    ],
+)
+def test_wrong_clips_are_named(values: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        read_run({**CLIP_RUN, "evaluation": {**CLIPS, **values}})
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("protocol", {"longer_edge": 71}, r"config\.protocol\.longer_edge must be a multiple of 14"),
+        ("protocol", {"long_edge": 70}, r"unknown field config\.protocol\.long_edge"),
+        ("protocol", {"max_points": 0}, r"config\.protocol\.max_points must be"),
+        ("benchmarks", (), r"config\.benchmarks must name at least one"),
+        ("max_sequences", 0, r"config\.max_sequences must be a positive integer"),
+        ("references", {"max_frames": 0}, r"config\.references\.max_frames must be"),
+        ("references", {"chunk_size": 4, "chunk_overlap": 4}, "below the chunk size 4, got 4"),
+        ("timings", {"lengths": (0,)}, r"config\.timings\.lengths must be numbers of frames, 1 or more each"),
+        ("timings", {"rounds": 0}, r"config\.timings\.rounds must be"),
+        ("timings", {"length": (5,)}, r"unknown field config\.timings\.length"),
+    ],
+)
+def test_wrong_settings_of_the_papers_run_are_named(field: str, value: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        read_run({**PAPER_RUN, field: value})
+
+
+def test_missing_and_unknown_fields_are_named() -> None:
+    with pytest.raises(InputError, match=r"unknown field config\.data_set"):
+        read_run({**CLIP_RUN, "data_set": "rooms"})
+    with pytest.raises(InputError, match=r"missing field config\.evaluation, "):
+        read_run({name: value for name, value in CLIP_RUN.items() if name != "evaluation"})
+    with pytest.raises(InputError, match=r"missing field config\.evaluation\.clip_lengths"):
+        read_run({**CLIP_RUN, "evaluation": {"image_size": (28, 42)}})

@@ -1,0 +1,111 @@
+"""Files and folders appear whole or not at all, whatever happens while they are written."""
+
+from __future__ import annotations
+
+import errno
+from pathlib import Path
+
+import pytest
+
+from logvggt_jax.errors import DiskError, MissingInput, OutputExists
+from logvggt_jax.files import atomic_file, atomic_folder, check_output, write_text
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+@pytest.mark.parametrize("failure", [RuntimeError, KeyboardInterrupt])
+def test_a_file_appears_whole_or_not_at_all(tmp_path: Path, failure: type[BaseException]) -> None:
+    path = tmp_path / "f.txt"
+    write_text(path, "old")
+    with pytest.raises(failure), atomic_file(path) as temporary:
+        temporary.write_text("half")
+        raise failure
+    assert path.read_text() == "old"
+    assert names(tmp_path) == ["f.txt"]
+
+
+def test_two_writers_of_one_file_do_not_meet(tmp_path: Path) -> None:
+    path = tmp_path / "picture.png"
+    with atomic_file(path) as first, atomic_file(path) as second:
+        assert first != second and first.suffix == second.suffix == ".png"
+        second.write_text("second")
+        first.write_text("first")
+    assert path.read_text() == "first"
+    assert names(tmp_path) == ["picture.png"]
+
+
+def test_what_the_disk_refuses_is_one_line_that_names_the_file(tmp_path: Path) -> None:
+    with pytest.raises(MissingInput, match=r"^\S+nowhere/f\.txt: No such file or directory$"):
+        write_text(tmp_path / "nowhere" / "f.txt", "")
+    with pytest.raises(DiskError, match=r"^\S+f\.txt: No space left on device$"), atomic_file(tmp_path / "f.txt"):
+        raise OSError(errno.ENOSPC, "No space left on device")
+    (tmp_path / "file").touch()
+    with (
+        pytest.raises(DiskError, match=r"file/deep/out\.\S+partial: Not a directory"),
+        atomic_folder(tmp_path / "file" / "deep" / "out"),
+    ):
+        pass
+    assert names(tmp_path) == ["file"]
+
+
+def test_a_folder_appears_whole_or_not_at_all(tmp_path: Path) -> None:
+    target = tmp_path / "deep" / "out"
+    with pytest.raises(KeyboardInterrupt), atomic_folder(target) as folder:
+        (folder / "done").touch()
+        raise KeyboardInterrupt
+    assert names(tmp_path / "deep") == []
+    with atomic_folder(target) as folder:
+        assert not target.exists()
+        (folder / "done").write_text("1")
+    assert (target / "done").read_text() == "1"
+    assert names(tmp_path / "deep") == ["out"]
+
+
+def test_only_results_are_overwritten_and_only_when_asked(tmp_path: Path) -> None:
+    target = tmp_path / "out"
+    target.mkdir()
+    (target / "thesis.tex").write_text("years of work")
+    for overwrite in (False, True):
+        with pytest.raises(OutputExists, match=str(target)):
+            check_output(target, overwrite=overwrite, marker="done")
+    (target / "done").touch()
+    assert check_output(target, overwrite=True, marker="done") == target
+    with pytest.raises(OutputExists, match="--overwrite"), atomic_folder(target):
+        pass
+    with pytest.raises(RuntimeError), atomic_folder(target, replace=True):
+        raise RuntimeError
+    assert (target / "thesis.tex").exists()
+    with atomic_folder(target, replace=True) as folder:
+        (folder / "new").touch()
+    assert names(target) == ["new"]
+    assert names(tmp_path) == ["out"]
+
+
+def test_a_folder_that_cannot_be_replaced_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    target = tmp_path / "out"
+    target.mkdir()
+    (target / "done").write_text("old")
+    original = Path.rename
+
+    def refuse(self: Path, new: Path) -> Path:
+        if self.suffix == ".partial":
+            raise PermissionError(errno.EACCES, "in use")
+        return original(self, new)
+
+    monkeypatch.setattr(Path, "rename", refuse)
+    with pytest.raises(DiskError, match="out: in use"), atomic_folder(target, replace=True) as folder:
+        (folder / "done").write_text("new")
+    assert (target / "done").read_text() == "old"
+    assert names(tmp_path) == ["out"]
+
+
+def test_of_two_runs_the_second_to_end_leaves_the_first_result(tmp_path: Path) -> None:
+    target = tmp_path / "out"
+    with pytest.raises(OutputExists, match="out exists"), atomic_folder(target) as second:
+        (second / "done").write_text("second")
+        with atomic_folder(target) as first:
+            (first / "done").write_text("first")
+    assert (target / "done").read_text() == "first"
+    assert names(tmp_path) == ["out"]
