@@ -6,7 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from test_replica import write_scene
+from layouts.layout import VIEWS
+from layouts.replica import write
 
 SCRIPT = """
 import sys
@@ -17,14 +18,14 @@ from logvggt_jax.data import Frames, open_dataset
 for name, root in (("replica", sys.argv[1]), ("rooms", None)):
     dataset = open_dataset(name, root)
     assert isinstance(dataset.read(dataset.sequences[0], [0]), Frames)
-assert main(["data", "list"]) == 0
+assert main(["data", "list"]) == main(["data", "check", "replica", sys.argv[1]]) == 0
 loaded = {"jax", "jaxlib", "flax", "grain", "orbax"} & set(sys.modules)
 assert not loaded, loaded
 """
 
 
 def test_reading_data_loads_neither_jax_nor_grain(tmp_path: Path) -> None:
-    write_scene(tmp_path / "room0", 1)
+    write(tmp_path, VIEWS[:1])
     subprocess.run([sys.executable, "-c", SCRIPT, str(tmp_path)], check=True, capture_output=True, text=True)
 
 

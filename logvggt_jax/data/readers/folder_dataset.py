@@ -11,7 +11,7 @@ import zipfile
 import zlib
 from collections import Counter, OrderedDict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -56,6 +56,10 @@ class FrameRecord:
     quarter_turns: int = 0
 
 
+_FIELDS = tuple(field.name for field in fields(FrameRecord))
+_PATHS = ("image", "depth", "companion")
+
+
 class Dropped(NamedTuple):
     """A frame that does not count, and why: `no pose`, for example."""
 
@@ -70,8 +74,8 @@ def frame(
         return Dropped("no pose")
     if not np.isfinite(intrinsics).all():
         return Dropped("no intrinsics")
-    fields = {"name": image.stem, **others}
-    return FrameRecord(image=image, depth=depth, intrinsics=intrinsics, extrinsics=extrinsics, **fields)
+    others = {"name": image.stem, **others}
+    return FrameRecord(image=image, depth=depth, intrinsics=intrinsics, extrinsics=extrinsics, **others)
 
 
 @dataclass(frozen=True)
@@ -266,26 +270,12 @@ class FolderDataset(Reader):
 
 
 def _packed(listing: Listing, root: Path) -> bytes:
-    """A listing as the bytes of an npz file."""
-    frames = listing.frames
-
-    def paths(attribute: str) -> np.ndarray:
-        values = (getattr(record, attribute) for record in frames)
-        return np.array(["" if path is None else os.path.relpath(path, root) for path in values])
-
+    """A listing as the bytes of an npz file, a column for each field of its records."""
+    columns: dict[str, Any] = {name: [getattr(record, name) for record in listing.frames] for name in _FIELDS}
+    for name in _PATHS:
+        columns[name] = ["" if path is None else os.path.relpath(path, root) for path in columns[name]]
     buffer = io.BytesIO()
-    np.savez(
-        buffer,
-        names=np.array([record.name for record in frames]),
-        images=paths("image"),
-        depths=paths("depth"),
-        companions=paths("companion"),
-        intrinsics=np.stack([record.intrinsics for record in frames]),
-        extrinsics=np.stack([record.extrinsics for record in frames]),
-        depth_scales=np.array([record.depth_scale for record in frames]),
-        quarter_turns=np.array([record.quarter_turns for record in frames]),
-        dropped=np.array(json.dumps(dict(listing.dropped))),
-    )
+    np.savez(buffer, dropped=json.dumps(dict(listing.dropped)), **columns)
     return buffer.getvalue()
 
 
@@ -293,37 +283,14 @@ def _unpacked(payload: bytes, root: Path) -> Listing | None:
     """The listing that `_packed` stored; None where its bytes are damaged, which SQLite does not notice."""
     try:
         with np.load(io.BytesIO(payload), allow_pickle=False) as packed:
-            columns = {name: packed[name] for name in packed.files}
-        dropped = json.loads(str(columns.pop("dropped")))
+            columns: dict[str, Any] = {name: packed[name] for name in _FIELDS}
+            dropped = json.loads(str(packed["dropped"]))
     except (ValueError, KeyError, EOFError, OSError, zipfile.BadZipFile, zlib.error) as error:
         logging.warning("a damaged listing of %s is made anew (%r)", root, error)
         return None
-    frames = [
-        FrameRecord(
-            name=str(name),
-            image=root / str(image),
-            depth=root / str(depth),
-            companion=root / str(companion) if str(companion) else None,
-            intrinsics=intrinsics,
-            extrinsics=extrinsics,
-            depth_scale=float(depth_scale),
-            quarter_turns=int(quarter_turns),
-        )
-        for name, image, depth, companion, intrinsics, extrinsics, depth_scale, quarter_turns in zip(
-            *(
-                columns[name]
-                for name in (
-                    "names",
-                    "images",
-                    "depths",
-                    "companions",
-                    "intrinsics",
-                    "extrinsics",
-                    "depth_scales",
-                    "quarter_turns",
-                )
-            ),
-            strict=True,
-        )
-    ]
-    return Listing(frames, dropped)
+    for name in _FIELDS:
+        if columns[name].ndim == 1:  # Python's own values; matrices stay arrays
+            columns[name] = columns[name].tolist()
+    for name in _PATHS:
+        columns[name] = [root / path if path else None for path in columns[name]]
+    return Listing([FrameRecord(*row) for row in zip(*columns.values(), strict=True)], dropped)

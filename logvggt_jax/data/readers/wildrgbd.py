@@ -143,4 +143,6 @@ def _poses(files: SourceFiles, path: Path) -> dict[int, np.ndarray | None]:
         if not values[0].is_integer():
             raise InputError(f"{where}: expected a frame number first, got {values[0]:g}: fetch the file again")
         poses[int(values[0])] = world_to_camera(values[1:].reshape(4, 4), where, stored="camera_to_world")
+    if not poses:
+        raise InputError(f"{path}: no poses; fetch it again")
     return poses

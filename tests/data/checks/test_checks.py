@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 from pathlib import Path
@@ -11,7 +10,8 @@ import cv2
 import numpy as np
 import pytest
 from analytic_room import camera_to_world
-from test_replica import CAMERA, SIZE, write_scene
+from layouts.replica import write, write_camera
+from room_views import SIZE, room_views
 
 from logvggt_jax.data.checks.check import check_copy
 from logvggt_jax.data.checks.picture import view_from_above
@@ -20,8 +20,7 @@ from logvggt_jax.data.checks.picture import view_from_above
 @pytest.fixture(scope="module")
 def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sound")
-    write_scene(folder / "room0", 6)
-    (folder / "cam_params.json").write_text(json.dumps({"camera": CAMERA}))
+    write(folder, room_views(6))
     return folder
 
 
@@ -115,7 +114,7 @@ def test_every_kind_of_damage_is_named_and_counted_and_the_rest_goes_on(root: Pa
 
 
 def test_absurd_intrinsics_are_reported_for_every_frame_and_the_text_is_cut(root: Path):
-    (root / "cam_params.json").write_text(json.dumps({"camera": CAMERA | {"fx": 4e5}}))
+    write_camera(root, fx=4e5)
     report = check_copy("replica", root, all_images=True)
     assert report.problem_counts() == {"absurd intrinsics": 6}
     assert all("calibration" in problem.message for problem in report.problems)
@@ -124,8 +123,7 @@ def test_absurd_intrinsics_are_reported_for_every_frame_and_the_text_is_cut(root
 
 
 def test_a_sample_is_decoded_unless_all_images_are_asked_for(tmp_path: Path):
-    write_scene(tmp_path / "room0", 12)
-    (tmp_path / "cam_params.json").write_text(json.dumps({"camera": CAMERA}))
+    write(tmp_path, room_views(12))
     (tmp_path / "room0/results/frame000001.jpg").write_bytes(b"")
     report = check_copy("replica", tmp_path)
     assert report.problems == [] and report.sequences[0].decoded == 5

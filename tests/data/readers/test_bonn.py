@@ -1,4 +1,4 @@
-"""Bonn RGB-D Dynamic: a written sequence of known geometry comes back, and the prepared form with and without poses."""
+"""Bonn RGB-D Dynamic: where sequences lie, and the prepared form with and without poses."""
 
 from __future__ import annotations
 
@@ -6,25 +6,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from room_sequence import assert_shows_room
-from timed_sequence import DEPTHS, PICTURES, POSES, STEP, write_pictures, write_sequence, write_trajectory
+from layouts.timed import BONN_NAME as NAME
+from layouts.timed import BONN_VIEWS as VIEWS
+from layouts.timed import DEPTHS, PICTURES, POSES, STEP, write_pictures, write_sequence, write_trajectory
+from room_views import check_views
 
 from logvggt_jax.data.dataset import check_frames
 from logvggt_jax.data.readers.bonn import Bonn
 
-NAME = "rgbd_bonn_balloon2"
-INTRINSICS = np.array([[54.2822841, 0, 31.109352], [0, 54.257687, 23.3256098], [0, 0, 1]])
-ORDER = [3, 0, 1, 2]
 
-
-@pytest.mark.parametrize("part", [".", "rgbd_bonn_dataset"])
-def test_a_written_sequence_comes_back(tmp_path: Path, part: str):
-    write_sequence(tmp_path / part / NAME, INTRINSICS)
-    (tmp_path / part / "rgbd_bonn_groundtruth").mkdir()
-    bonn = Bonn(tmp_path)
-    assert bonn.sequences == (NAME,) and bonn.metric
-    assert bonn.frame_names(NAME) == [f"{time:.6f}" for time in PICTURES]
-    assert_shows_room(bonn.read(NAME, ORDER), ORDER, INTRINSICS, depth_step=STEP)
+def test_sequences_are_found_in_the_sets_own_folder_too(tmp_path: Path):
+    write_sequence(tmp_path / "rgbd_bonn_dataset" / NAME, VIEWS)
+    (tmp_path / "rgbd_bonn_dataset" / "rgbd_bonn_groundtruth").mkdir()
+    assert Bonn(tmp_path).sequences == (NAME,)
 
 
 def test_a_sequence_in_two_places_is_refused(tmp_path: Path):
@@ -34,15 +28,9 @@ def test_a_sequence_in_two_places_is_refused(tmp_path: Path):
         Bonn(tmp_path)
 
 
-@pytest.mark.parametrize("split", ["train", "val", "test"])
-def test_there_are_no_splits(tmp_path: Path, split: str):
-    with pytest.raises(ValueError, match=f"Bonn RGB-D Dynamic has no split '{split}'"):
-        Bonn(tmp_path, split)
-
-
 def write_prepared(folder: Path, pose_times: np.ndarray, *, depths: np.ndarray = DEPTHS) -> None:
-    write_pictures(folder / "rgb_110", folder / "depth_110", INTRINSICS, depths=depths)
-    write_trajectory(folder / "groundtruth_110.txt", pose_times)
+    write_pictures(folder / "rgb_110", folder / "depth_110", VIEWS, depths=depths)
+    write_trajectory(folder / "groundtruth_110.txt", VIEWS, pose_times)
 
 
 def test_the_prepared_form_pairs_pictures_and_depth_by_place(tmp_path: Path):
@@ -50,7 +38,7 @@ def test_the_prepared_form_pairs_pictures_and_depth_by_place(tmp_path: Path):
     write_prepared(tmp_path / NAME, PICTURES, depths=PICTURES + 0.025)
     bonn = Bonn(tmp_path)
     assert bonn.sequences == (f"{NAME}/rgb_110",)
-    assert_shows_room(bonn.read(bonn.sequences[0], ORDER), ORDER, INTRINSICS, depth_step=STEP)
+    check_views(bonn.read(bonn.sequences[0], range(5)), VIEWS, picture_error=0, depth_error=0.51 * STEP)
 
 
 def test_where_the_prepared_trajectory_misses_pictures_frames_count_without_poses(tmp_path: Path):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import json
 import os
 import sqlite3
 import sys
@@ -13,7 +12,8 @@ from pathlib import Path
 
 import pytest
 from absl import logging
-from test_replica import CAMERA, write_scene
+from layouts.layout import VIEWS
+from layouts.replica import write, write_camera, write_scene
 
 from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.data.readers.listing_index import ListingIndex, code_digest
@@ -25,8 +25,7 @@ def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A scene of three frames that has not changed for an hour, and a cache of its own."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     folder = tmp_path / "replica"
-    write_scene(folder / "room0", 3)
-    (folder / "cam_params.json").write_text(json.dumps({"camera": CAMERA}))
+    write(folder, VIEWS[:3])
     # Clocks of file systems tick slowly: a change now differs from one an hour ago in any case.
     for path in (folder, *folder.rglob("*")):
         before = path.stat().st_mtime - 3600
@@ -105,15 +104,15 @@ def test_sequences_added_and_removed_are_seen(root: Path):
     assert Replica(root).sequences == ("room0",)
     (root / "room0").rename(root / "room1")
     assert Replica(root).sequences == ("room1",)
-    write_scene(root / "room2", 1)
+    write_scene(root / "room2", VIEWS[:1])
     assert Replica(root).sequences == ("room1", "room2")
 
 
 def test_an_edited_calibration_and_pose_are_seen(root: Path):
     before = Replica(root).read("room0", [0])
-    (root / "cam_params.json").write_text(json.dumps({"camera": CAMERA | {"fx": 50.0}}))
+    write_camera(root, fx=50.0)
     after = Replica(root).read("room0", [0])
-    assert after.intrinsics[0, 0, 0] == 50 and before.intrinsics[0, 0, 0] == pytest.approx(40)
+    assert after.intrinsics[0, 0, 0] == 50 and before.intrinsics[0, 0, 0] == pytest.approx(55)
     (root / "cam_params.json").unlink()
     assert Replica(root).read("room0", [0]).intrinsics[0, 0, 0] == pytest.approx(600 * 64 / 1200)
     lines = (root / "room0/traj.txt").read_text().splitlines()
@@ -154,7 +153,7 @@ def test_a_cache_folder_that_cannot_be_written_only_warns(root: Path, warnings_o
 
 def test_copies_and_readers_do_not_share_an_index(root: Path):
     other = root.parent / "other"
-    write_scene(other / "room0", 2)
+    write_scene(other / "room0", VIEWS[:2])
     assert names(root) == ALL and names(other) == ALL[:2] and names(root) == ALL
     identities = ({"name": "replica"}, {"name": "nrgbd"}, {"name": "replica", "upright": False})
     paths = {ListingIndex(identity, folder, "code").path for identity in identities for folder in (root, other)}

@@ -1,4 +1,4 @@
-"""7-Scenes: a written scene of known geometry comes back, damage is named, real frames agree with each other."""
+"""7-Scenes: raw depth is carried into the colour camera, lists, real frames agree with each other."""
 
 from __future__ import annotations
 
@@ -134,8 +134,6 @@ def test_splits_follow_the_list_files(root: Path):
     assert SevenScenes(den).sequences == ("den/seq-01", "den/seq-02")
     assert SevenScenes(den, "train").sequences == ("den/seq-01",)
     assert SevenScenes(den, "test").sequences == ("den/seq-02",)
-    with pytest.raises(ValueError, match="7-Scenes has no split 'val'"):
-        SevenScenes(den, "val")
     with pytest.raises(FileNotFoundError, match=r"attic/TestSplit\.txt.*split='all'"):
         SevenScenes(root, "test")
     (den / "TestSplit.txt").write_text("sequence2\nsequence7\n")
@@ -147,8 +145,6 @@ def test_splits_follow_the_list_files(root: Path):
 
 
 def test_roots_without_sequences_or_of_two_kinds_are_refused(root: Path):
-    with pytest.raises(FileNotFoundError, match="absent: no such folder"):
-        SevenScenes(root / "absent")
     (root / "empty").mkdir()
     with pytest.raises(FileNotFoundError, match="no sequences of 7-Scenes"):
         SevenScenes(root / "empty")
@@ -173,43 +169,16 @@ def test_jpeg_colour_is_accepted(root: Path):
     assert np.abs(frames.images[0].astype(int) - picture(4, (48, 64))).max() < 6
 
 
-@pytest.mark.parametrize("kind", ["color.png", "depth.png", "pose.txt"])
-def test_a_missing_file_is_named(root: Path, kind: str):
-    (root / "den/seq-01" / f"frame-000001.{kind}").unlink()
-    with pytest.raises(FileNotFoundError, match=rf"frame-000001\.{kind}"):
+def test_missing_depth_is_named(root: Path):
+    (root / "den/seq-01/frame-000001.depth.png").unlink()
+    with pytest.raises(FileNotFoundError, match=r"frame-000001\.depth\.png: no such file, but frame"):
         SevenScenes(root).num_frames("den/seq-01")
-
-
-def test_frames_with_a_pose_that_is_not_finite_do_not_count(root: Path):
-    (root / "den/seq-01/frame-000000.pose.txt").write_text("nan " * 12 + "0 0 0 1")
-    assert SevenScenes(root).frame_names("den/seq-01") == ["frame-000001"]
-
-
-@pytest.mark.parametrize(
-    ("text", "complaint"),
-    [("1 0 0 0 0 1 0 0", "got 8"), ("1 0 0 zero " * 4, "zero"), ("2 0 0 0 0 2 0 0 0 0 2 0 0 0 0 1", "rigid")],
-)
-def test_a_bad_pose_is_named(root: Path, text: str, complaint: str):
-    (root / "den/seq-01/frame-000001.pose.txt").write_text(text)
-    with pytest.raises(ValueError, match=rf"frame-000001\.pose\.txt.*{complaint}"):
-        SevenScenes(root).num_frames("den/seq-01")
-
-
-@pytest.mark.parametrize("kind", ["color.png", "depth.png"])
-def test_a_truncated_picture_is_named(root: Path, kind: str):
-    path = root / "den/seq-01" / f"frame-000001.{kind}"
-    path.write_bytes(path.read_bytes()[:-30])
-    with pytest.raises(ValueError, match=rf"frame-000001\.{kind}.*truncated"):
-        SevenScenes(root).read("den/seq-01", [0, 1])
 
 
 def test_pictures_of_wrong_type_or_size_are_named(root: Path):
     folder = root / "den/seq-01"
     cv2.imwrite(str(folder / "frame-000000.depth.png"), np.zeros((48, 64), np.uint8))
     with pytest.raises(ValueError, match=r"frame-000000\.depth\.png.*uint8"):
-        SevenScenes(root).read("den/seq-01", [0])
-    cv2.imwrite(str(folder / "frame-000000.depth.proj.png"), np.zeros((40, 64), np.uint16))
-    with pytest.raises(ValueError, match=r"frame-000000\.depth\.proj\.png.*\(40, 64\)"):
         SevenScenes(root).read("den/seq-01", [0])
     write_frame(root / "den/seq-02", 1, size=(24, 32))
     with pytest.raises(ValueError, match=r"frame-000001\.color\.png.*\(24, 32\)"):

@@ -1,0 +1,49 @@
+"""Spring: stereo disparity of twice the picture's size in HDF5, rows of numbers for the cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import h5py
+import numpy as np
+from room_views import CENTRE, FOCAL, RoomView, write_image
+
+from layouts.layout import Layout
+from logvggt_jax.data.readers.spring import Spring
+
+BASELINE = 0.065
+
+
+def write_disparity(path: Path, disparity: np.ndarray, name: str = "disparity") -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with h5py.File(path, "w") as file:
+        file.create_dataset(name, data=disparity, compression="gzip")
+
+
+def write(root: Path, views: Sequence[RoomView]) -> None:
+    """Of the four values of disparity for each pixel the first is the pixel's own."""
+    folder = root / "train/0001"
+    for number, each in enumerate(views, 1):
+        write_image(folder / f"frame_left/frame_left_{number:04d}.png", each.picture)
+        disparity = np.zeros((2 * each.depth.shape[0], 2 * each.depth.shape[1]), np.float32)
+        disparity[::2, ::2] = np.divide(FOCAL * BASELINE, each.depth, out=0 * each.depth, where=each.depth > 0)
+        write_disparity(folder / f"disp1_left/disp1_left_{number:04d}.dsp5", disparity)
+    (folder / "cam_data").mkdir()
+    np.savetxt(folder / "cam_data/intrinsics.txt", [[FOCAL, FOCAL, *CENTRE]] * len(views))
+    np.savetxt(folder / "cam_data/extrinsics.txt", [each.extrinsics.ravel() for each in views])
+    np.savetxt(folder / "cam_data/focaldistance.txt", [[1.0]] * len(views))
+
+
+FILES = ("train/0001/frame_left/frame_left_0002.png", "train/0001/disp1_left/disp1_left_0002.dsp5")
+TABLES = ("train/0001/cam_data/intrinsics.txt", "train/0001/cam_data/extrinsics.txt")
+LAYOUT = Layout(
+    Spring,
+    "0001",
+    write,
+    names=[f"frame_left_{number:04d}" for number in range(1, 5)],
+    image=FILES[0],
+    depth=FILES[1],
+    needed=(*FILES, *TABLES),
+    tables=TABLES,
+)
