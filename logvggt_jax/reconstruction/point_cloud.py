@@ -1,14 +1,17 @@
 """Coloured point clouds from depth maps, chosen and written frame by frame at constant memory.
 
 Two passes. The first sees depth and confidence of every frame and counts, in a histogram of confidences, the points
-that qualify; then the threshold and the exact number of points are known. The second unprojects and writes frame by
-frame.
+that qualify; then the threshold and the exact number of points are known. The second chooses, unprojects and writes.
+Frames may go through either pass in any order and at the same time; only their share of the points (`quota`) and the
+file are in the frames' order.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import re
+import threading
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -16,7 +19,7 @@ import numpy as np
 
 from logvggt_jax.errors import InputError, MissingInput, disk_errors
 from logvggt_jax.files import atomic_file
-from logvggt_jax.geometry import unproject
+from logvggt_jax.geometry import unproject_pixels
 
 VERTEX = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")])
 
@@ -26,8 +29,8 @@ _HEADER = (
     + "end_header\n"
 )
 
-# Bins of log(confidence - 1): 0.5 % wide, from a pixel that the model is certain about to one it knows nothing of.
-_BIN_EDGES = np.linspace(-20.0, 20.0, 8001)
+# Confidences are counted as float16, as which they are stored: a bin a value, up to infinity.
+_NUM_BINS = int(np.float16(np.inf).view(np.uint16))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,54 +73,73 @@ class PointFilter:
 class PointSelection:
     """The candidates of a sequence, counted by confidence.
 
-    Call `count` for every frame, then `choose` for every frame in the same order.
+    Call `count` for every frame; then `choose` for every frame, and `quota` for every frame in order. `count` and
+    `choose` may be called by several threads. What follows from the counts is worked out once, when it is asked for.
     """
 
     def __init__(self, point_filter: PointFilter) -> None:
         self._filter = point_filter
-        self._histogram = np.zeros(len(_BIN_EDGES) + 1, np.int64)
+        self._histogram = np.zeros(_NUM_BINS, np.int64)
+        self._lock = threading.Lock()
         self._passed = 0
-        self._frame = 0
 
     def count(self, depth: np.ndarray, confidence: np.ndarray) -> None:
         """First pass over a frame: depth and confidence [H, W]."""
-        bins = _confidence_bin(confidence[self._filter.candidates(depth, confidence)])
-        self._histogram += np.bincount(bins, minlength=len(self._histogram))
+        _, bins = self._candidates(depth, confidence)
+        counts = np.bincount(bins, minlength=_NUM_BINS)
+        with self._lock:
+            self._histogram += counts
 
-    @property
+    @functools.cached_property
     def threshold_bin(self) -> int:
         """Points of lower bins are left out; the largest bin that leaves out at most the percentile."""
         below = np.concatenate([[0], np.cumsum(self._histogram)[:-1]])
         allowed = self._histogram.sum() * self._filter.confidence_percentile / 100
         return int(np.flatnonzero(below <= allowed)[-1])
 
-    @property
+    @functools.cached_property
     def num_qualified(self) -> int:
         """Candidates at or above the threshold."""
         return int(self._histogram[self.threshold_bin :].sum())
 
-    @property
+    @functools.cached_property
     def num_points(self) -> int:
-        """Points that `choose` hands out over all frames."""
+        """The sum of all quotas."""
         limit = self._filter.max_points
         return self.num_qualified if limit is None else min(self.num_qualified, limit)
 
-    def choose(self, depth: np.ndarray, confidence: np.ndarray) -> np.ndarray:
-        """Second pass over a frame: flat indices of its points, increasing."""
-        chosen = self._filter.candidates(depth, confidence)
-        indices = np.flatnonzero(chosen)
-        indices = indices[_confidence_bin(confidence.reshape(-1)[indices]) >= self.threshold_bin]
-        before, self._passed = self._passed, self._passed + len(indices)
-        self._frame += 1
-        if self.num_points == self.num_qualified:
-            return indices
+    def choose(self, frame: int, depth: np.ndarray, confidence: np.ndarray) -> tuple[np.ndarray, int]:
+        """Second pass over a frame: flat indices of its points, increasing, and how many pixels qualify.
+
+        There is an index too many where the frame's quota is rounded down.
+
+        Args:
+          frame: its number, which seeds what is left to chance.
+          depth: [H, W], as in the first pass.
+          confidence: [H, W], as in the first pass.
+        """
+        indices, bins = self._candidates(depth, confidence)
+        indices = indices[bins >= self.threshold_bin]
+        qualified = len(indices)
+        if self.num_points < self.num_qualified:
+            most = -(-qualified * self.num_points // self.num_qualified)
+            indices = indices[np.sort(np.random.default_rng(frame).choice(qualified, most, replace=False))]
+        return indices, qualified
+
+    def quota(self, qualified: int) -> int:
+        """How many points the next frame gets, of whose pixels so many qualify."""
+        before, self._passed = self._passed, self._passed + qualified
         # Shares rounded on the running total add up to num_points exactly.
-        quota = self._share(self._passed) - self._share(before)
-        picked = np.random.default_rng(self._frame).choice(len(indices), quota, replace=False)
-        return indices[np.sort(picked)]
+        return self._share(self._passed) - self._share(before)
 
     def _share(self, passed: int) -> int:
-        return passed * self.num_points // self.num_qualified
+        return passed * self.num_points // max(self.num_qualified, 1)
+
+    def _candidates(self, depth: np.ndarray, confidence: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Flat indices of a frame's candidates, increasing, and the bins of their confidences."""
+        indices = np.flatnonzero(self._filter.candidates(depth, confidence))
+        known = confidence.reshape(-1)[indices]
+        return indices, np.clip(known, 0.0, np.finfo(np.float16).max).astype(np.float16).view(np.uint16)
 
 
 def frame_vertices(
@@ -130,10 +152,10 @@ def frame_vertices(
       image: [H, W, 3] uint8 RGB of the same pixels.
       intrinsics: [3, 3] in these pixels.
       extrinsics: [3|4, 4] world-to-camera; the points are in the world.
-      indices: [n] flat pixel indices.
+      indices: [n] flat pixel indices, increasing.
     """
-    points = unproject(depth.astype(np.float64), intrinsics.astype(np.float64), extrinsics.astype(np.float64))
-    points, colours = points.reshape(-1, 3)[indices], image.reshape(-1, 3)[indices]
+    points = unproject_pixels(depth[None], intrinsics[None], extrinsics[None], indices)
+    colours = image.reshape(-1, 3)[indices]
     vertices = np.empty(len(indices), VERTEX)
     for axis, name in enumerate("xyz"):
         vertices[name] = points[:, axis]
@@ -157,7 +179,7 @@ def write_points(path: str | Path, count: int, frames: Iterable[np.ndarray]) -> 
     with atomic_file(path) as temporary, temporary.open("wb") as stream:
         stream.write(_HEADER.format(count=count).encode())
         for vertices in frames:
-            stream.write(vertices.astype(VERTEX, copy=False).tobytes())
+            stream.write(vertices.data)
             written += len(vertices)
         if written != count:
             raise ValueError(f"{path}: {count} vertices announced, {written} given")
@@ -193,11 +215,6 @@ def _stored_points(path: Path) -> np.ndarray:
     if not start.startswith(header) or path.stat().st_size != size:
         raise InputError(f"{path} is not a point cloud of this program, or is cut off; reconstruct again")
     return np.memmap(path, VERTEX, "r", len(header), (count,)) if count else np.empty(0, VERTEX)
-
-
-def _confidence_bin(confidence: np.ndarray) -> np.ndarray:
-    excess = np.maximum(confidence.astype(np.float64) - 1.0, 1e-30)
-    return np.searchsorted(_BIN_EDGES, np.log(excess), side="right")
 
 
 def _edges(depth: np.ndarray, threshold: float) -> np.ndarray:

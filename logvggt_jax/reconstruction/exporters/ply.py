@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
+from rich.console import Console
 from rich.progress import track
 
+from logvggt_jax.reconstruction.frame_pool import FramePool
 from logvggt_jax.reconstruction.point_cloud import PointFilter, PointSelection, frame_vertices, write_points
 from logvggt_jax.reconstruction.result import Reconstruction
 
@@ -24,14 +26,35 @@ def export_ply(
       progress: show a progress bar.
     """
     selection = PointSelection(point_filter or PointFilter())
-    for index in range(result.num_frames):
-        selection.count(result.depth(index), result.confidence(index))
+    with FramePool() as pool:
+        frames = pool.map(
+            lambda index: selection.count(*result.depth_and_confidence(index)), iter(range(result.num_frames))
+        )
+        console = Console(stderr=True)
+        for _ in track(frames, "Confidences", result.num_frames, console=console, disable=not progress):
+            pass
+        write_cloud(result, path, selection, pool)
+
+
+def write_cloud(
+    result: Reconstruction,
+    path: Path,
+    selection: PointSelection,
+    pool: FramePool,
+    *,
+    advance: Callable[[], object] = lambda: None,
+) -> None:
+    """Writes the points that a selection, which has counted all frames, chooses of them; calls `advance` at each."""
+
+    def chosen(index: int) -> tuple[np.ndarray, int]:
+        depth, confidence = result.depth_and_confidence(index)
+        indices, qualified = selection.choose(index, depth, confidence)
+        intrinsics, extrinsics = result.depth_intrinsics[index], result.extrinsics[index]
+        return frame_vertices(depth, result.image(index), intrinsics, extrinsics, indices), qualified
 
     def vertices() -> Iterator[np.ndarray]:
-        for index in track(range(result.num_frames), description="Points", disable=not progress):
-            depth = result.depth(index)
-            chosen = selection.choose(depth, result.confidence(index))
-            intrinsics, extrinsics = result.depth_intrinsics[index], result.extrinsics[index]
-            yield frame_vertices(depth, result.image(index), intrinsics, extrinsics, chosen)
+        for found, qualified in pool.map(chosen, iter(range(result.num_frames))):
+            yield found[: selection.quota(qualified)]
+            advance()
 
     write_points(path, selection.num_points, vertices())
