@@ -103,7 +103,7 @@ class ClockPredictor:
 
 
 def write_sequence(folder: Path, frames: int) -> float:
-    """JPEG files of 640 x 480 pixels whose detail falls with its frequency, as in photographs; their mean size in kB."""
+    """JPEG files of 640 x 480 whose detail falls with its frequency, as in photographs; their mean size in kB."""
     rng = np.random.default_rng(0)
     channels = np.stack([_surface(rng, (480, 640), 1.5) for _ in range(3)], axis=-1)
     noise = rng.normal(0, 3, (480, 640, 3))
@@ -152,7 +152,8 @@ def main() -> None:
         assert result.num_frames == options.frames and result.seconds is not None
         device = -(-options.frames // STRIDE) * step_seconds
         print(
-            f"{result.num_points:,} points; by the clock {seconds:.2f} s, of which {result.seconds:.2f} s to the last depth map"
+            f"{result.num_points:,} points; by the clock {seconds:.2f} s, {result.seconds:.2f} s of them to the last "
+            "depth map"
         )
     rows = (
         ("feeding thread, its processor time", 1000 * predictor.own_seconds / options.frames, MOST_FEEDING_MS, "ms"),

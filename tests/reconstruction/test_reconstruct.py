@@ -73,6 +73,11 @@ def result(model: LogVGGT, variables: dict, room: Path, tmp_path_factory: pytest
     )
 
 
+def as_stored(values: np.ndarray) -> np.ndarray:
+    """Values as files keep them: float16, within its range."""
+    return np.clip(values, -65504, 65504).astype(np.float16).astype(np.float32)
+
+
 @pytest.fixture(scope="module")
 def expected(model: LogVGGT, variables: dict, room: Path) -> dict[str, np.ndarray]:
     images, transform = preprocess([frame.image for frame in open_source(room)], longer_edge=LONGER_EDGE)
@@ -81,8 +86,8 @@ def expected(model: LogVGGT, variables: dict, room: Path) -> dict[str, np.ndarra
     extrinsics, intrinsics = decode_poses(session.cameras().pose_encoding, transform.size)
     return {
         "images": np.rint(images * 255).astype(np.uint8),
-        "depth": np.stack([result.depth for result in results]).astype(np.float16).astype(np.float32),
-        "confidence": np.stack([result.confidence for result in results]),
+        "depth": as_stored(np.stack([result.depth for result in results])),
+        "confidence": as_stored(np.stack([result.confidence for result in results])),
         "extrinsics": extrinsics,
         "intrinsics": intrinsics,
         "original": transform.intrinsics_to_original(intrinsics),
@@ -276,11 +281,7 @@ def test_the_number_of_workers_changes_no_byte(walk: Path, tmp_path: Path) -> No
         written[workers] = {file.relative_to(result.folder): file for file in files}
     assert written[1].keys() == written[4].keys()
     for name, file in written[1].items():
-        if file.suffix == ".npz":  # zip archives hold the time of writing
-            for one, four in zip(read_depth(file), read_depth(written[4][name]), strict=True):
-                np.testing.assert_array_equal(one, four)
-        else:
-            assert file.read_bytes() == written[4][name].read_bytes(), name
+        assert file.read_bytes() == written[4][name].read_bytes(), name
 
 
 @pytest.mark.parametrize("written", ["write_depth", "write_picture"])
@@ -349,7 +350,7 @@ def test_chunks_of_the_whole_sequence_are_plain_vggt(
     cameras = read_cameras(result.folder / "cameras.json")
     np.testing.assert_allclose([f["extrinsics"] for f in cameras["frames"]], plain.extrinsics, rtol=1e-5, atol=1e-5)
     depth, _ = read_depth(result.folder / "depth" / "frame-000006.npz")
-    np.testing.assert_allclose(depth, plain.depth[6], rtol=1e-3)
+    np.testing.assert_allclose(depth, as_stored(plain.depth[6]), rtol=1e-3)
 
 
 def test_bad_arguments_are_named(
