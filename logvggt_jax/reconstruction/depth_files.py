@@ -59,7 +59,8 @@ def write_picture(path: str | Path, image: np.ndarray) -> None:
     JPEG has a quality that keeps nearly every pixel to a few grey levels.
     """
     pixels = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-    _, encoded = cv2.imencode(Path(path).suffix, pixels, _JPEG)
+    suffix = Path(path).suffix
+    _, encoded = cv2.imencode(suffix, pixels, _JPEG if suffix == ".jpg" else ())
     with atomic_file(path) as temporary:
         temporary.write_bytes(encoded.tobytes())
 

@@ -92,7 +92,7 @@ def reconstruct(
 
     Frames are read once, ahead of the model, and kept at its size; depth maps are written as they become final. All
     that is not the model is done by worker threads, whose number changes no result. Memory on the host is constant
-    but for the cameras, memory on the device is the method's.
+    but for the cameras and at most 104 MB of candidates for the point cloud, memory on the device is the method's.
 
     Args:
       source_path: folder of images or video, see `open_source`.
@@ -158,7 +158,7 @@ def reconstruct_with(
             (folder / name).mkdir()
         task = bars.add_task("Depth and cameras", total=source.expected_frames)
         started = time.monotonic()
-        selection = PointSelection(point_filter or PointFilter())
+        selection = PointSelection(point_filter or PointFilter(), source.expected_frames)
         predictor = start()
         sequence = _stream(
             source, folder, predictor, pool, selection, longer_edge=longer_edge, advance=lambda: bars.advance(task)
@@ -209,7 +209,7 @@ def _stream(
     longer_edge: int,
     advance: Callable[[], object],
 ) -> _Sequence:
-    """The whole sequence through the predictor; images and depth go to disk, and the selection has counted all."""
+    """The whole sequence through the predictor; images and depth go to disk, and the selection sees all."""
     names: list[str] = []
     timestamps: list[float] = []
     transform = None
@@ -220,15 +220,20 @@ def _stream(
         write_picture(image_file(folder, frame.name), image)
         return _Picture(frame.name, frame.timestamp, image, transform)
 
-    def save(name: str, result: FrameResult) -> None:
-        selection.count(*write_depth(depth_file(folder, name), result.depth, result.confidence))
+    # Frames whose depth is not final yet.
+    images: dict[int, np.ndarray] = {}
+
+    def save(name: str, image: np.ndarray, result: FrameResult) -> None:
+        stored = write_depth(depth_file(folder, name), result.depth, result.confidence)
+        selection.see(result.index, *stored, image)
 
     def hand_on(results: list[FrameResult]) -> None:
         for result in results:
-            pool.submit(save, names[result.index], result)
+            pool.submit(save, names[result.index], images.pop(result.index), result)
             advance()
 
     for picture in pool.map(prepare, source.loaders()):
+        images[len(names)] = picture.image
         names.append(picture.name)
         timestamps.append(picture.timestamp)
         transform = picture.transform

@@ -25,13 +25,11 @@ def export_ply(
       point_filter: which pixels become points; None takes `PointFilter`'s defaults.
       progress: show a progress bar.
     """
-    selection = PointSelection(point_filter or PointFilter())
+    selection = PointSelection(point_filter or PointFilter(), result.num_frames)
     with FramePool() as pool:
-        frames = pool.map(
-            lambda index: selection.count(*result.depth_and_confidence(index)), iter(range(result.num_frames))
-        )
+        frames = pool.map(lambda index: selection.see(index, *_read(result, index)), iter(range(result.num_frames)))
         console = Console(stderr=True)
-        for _ in track(frames, "Confidences", result.num_frames, console=console, disable=not progress):
+        for _ in track(frames, "Points", result.num_frames, console=console, disable=not progress):
             pass
         write_cloud(result, path, selection, pool)
 
@@ -44,17 +42,19 @@ def write_cloud(
     *,
     advance: Callable[[], object] = lambda: None,
 ) -> None:
-    """Writes the points that a selection, which has counted all frames, chooses of them; calls `advance` at each."""
+    """Writes the points that a selection, which has seen all frames, chooses of them; calls `advance` at each."""
 
-    def chosen(index: int) -> tuple[np.ndarray, int]:
-        depth, confidence = result.depth_and_confidence(index)
-        indices, qualified = selection.choose(index, depth, confidence)
-        intrinsics, extrinsics = result.depth_intrinsics[index], result.extrinsics[index]
-        return frame_vertices(depth, result.image(index), intrinsics, extrinsics, indices), qualified
+    def vertices(index: int) -> np.ndarray:
+        points = selection.choose(index, lambda: _read(result, index))
+        return frame_vertices(points, result.depth_size, result.depth_intrinsics[index], result.extrinsics[index])
 
-    def vertices() -> Iterator[np.ndarray]:
-        for found, qualified in pool.map(chosen, iter(range(result.num_frames))):
-            yield found[: selection.quota(qualified)]
+    def advancing() -> Iterator[np.ndarray]:
+        for found in pool.map(vertices, iter(range(result.num_frames))):
+            yield found
             advance()
 
-    write_points(path, selection.num_points, vertices())
+    write_points(path, selection.num_points, advancing())
+
+
+def _read(result: Reconstruction, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return *result.depth_and_confidence(index), result.image(index)
