@@ -166,16 +166,10 @@ def _check_step(
     assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(lambda x: (x.shape, x.dtype), state)
     assert all(value.shape == () for value in metrics.values())
     program = traced.lower(lowering_platforms=(platform,)).as_text()
-    if attention == "cudnn":
-        # A frame and a global block in each pair of the aggregator, forward, once more where it is rematerialised,
-        # and backward; the frozen encoder forward alone. What is in the program once runs for every window.
-        blocks = 2 * config.model.aggregator.depth
-        assert program.count(backward) >= blocks
-        assert program.count(forward) >= 2 * blocks + config.model.encoder.depth
-    else:
-        # The kernel is a function of the program, one for each shape: of a frame and of a window with its cache.
-        assert program.count(backward) >= 2
-        assert program.count(forward) >= 2
+    # Layers and windows are loops, so that a kernel is in the program a few times and runs many: attention of a frame
+    # and of a window with its cache at least.
+    assert program.count(backward) >= 2
+    assert program.count(forward) >= 2
 
 
 @pytest.mark.parametrize(
