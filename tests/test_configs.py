@@ -17,6 +17,7 @@ import pytest
 from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.data.feeding.holdouts import PUBLISHED
 from logvggt_jax.data.rooms.rooms import Rooms
+from logvggt_jax.model.parameters import stack_layers
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.optimizer import learning_rate_schedule, make_optimizer
 from logvggt_jax.training.sharding import check_batch_size, data_mesh
@@ -84,7 +85,7 @@ def _abstract_run(config: TrainConfig, num_devices: int) -> tuple[TrainState, ja
     # Parameters do not depend on the form of attention, and tracing cuDNN's asks for a GPU.
     model = LogVGGT(dataclasses.replace(config.model, attention="xla"))
     images = jax.ShapeDtypeStruct((1, 1, 14, 14, 3), jnp.uint8)
-    params = jax.eval_shape(model.init, jax.random.key(0), images)["params"]
+    params = jax.eval_shape(lambda: stack_layers(model.init(jax.random.key(0), images))["params"])
     optimizer = make_optimizer(config.optimizer, params, frozen=("encoder",))
     state = jax.eval_shape(functools.partial(initial_state, optimizer=optimizer), params)
     schedule = learning_rate_schedule(config.optimizer, config.stages)
