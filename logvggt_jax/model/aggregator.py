@@ -38,7 +38,7 @@ class Aggregator(nn.Module):
     tokens of the window see one another, and what a memory adds).
 
     Layers run one after the other, or as one loop, whose body is compiled once, where their parameters come stacked
-    (see `parameters.stacked`). With `remat` the loop keeps a layer's input alone for the backward pass.
+    (see `parameters.stack_layers`). With `remat` the loop keeps a layer's input alone for the backward pass.
     """
 
     config: ModelConfig
@@ -48,7 +48,7 @@ class Aggregator(nn.Module):
     def __call__(
         self,
         patch_tokens: jax.Array,
-        lengths: jax.Array,
+        lengths: jax.Array | None,
         starts_sequence: jax.Array,
         memory: Memory,
         *,
@@ -59,6 +59,7 @@ class Aggregator(nn.Module):
         Args:
           patch_tokens: [B, K, h * w, C].
           lengths: int32 [B], how many of the K frames are real, always the first ones; nothing attends to the others.
+            None for all.
           starts_sequence: bool [B], whether the window's first frame is the sequence's first, which has camera
             and register tokens of its own.
           memory: what the global blocks attend to besides the window: with cross-window attention the caches of the
@@ -75,6 +76,7 @@ class Aggregator(nn.Module):
         x = jnp.concatenate([special, patch_tokens.astype(jnp.float32)], axis=2)
         shape, tokens = x.shape, x.shape[2]
         rope = rope_table(grid, num_special, width // sizes.num_heads, sizes.rope_base)
+        valid = None if lengths is None else lengths * tokens
 
         def within_frames(block: BlockFunction, x: jax.Array) -> jax.Array:
             return block(x.reshape(batch * frames, tokens, width), rope=rope)[0].reshape(shape)
@@ -82,7 +84,7 @@ class Aggregator(nn.Module):
         def over_the_window(
             block: BlockFunction, x: jax.Array, read: LayerMemory | None
         ) -> tuple[jax.Array, LayerMemory | None]:
-            x, left = block(x.reshape(batch, frames * tokens, width), rope=rope, valid=lengths * tokens, memory=read)
+            x, left = block(x.reshape(batch, frames * tokens, width), rope=rope, valid=valid, memory=read)
             return x.reshape(shape), left
 
         def block(**options: Any) -> Block:
@@ -113,7 +115,7 @@ class Aggregator(nn.Module):
         memories = jax.tree.map(lambda *x: jnp.stack(x), *[memory.at(layer) for layer in readers]) if readers else None
         detached = block(parent=None)
 
-        def layer(x: jax.Array, inputs: tuple[Any, Any, jax.Array, jax.Array]) -> tuple[jax.Array, Any]:
+        def body(x: jax.Array, inputs: tuple[Any, Any, jax.Array, jax.Array]) -> tuple[jax.Array, Any]:
             frame_params, global_params, reads, place = inputs
             frame_out = within_frames(functools.partial(run, detached, frame_params), x)
             global_block = functools.partial(run, detached, global_params)
@@ -131,9 +133,10 @@ class Aggregator(nn.Module):
 
         reads = jnp.array([layer in readers for layer in range(sizes.depth)])
         places = jnp.array([readers.index(layer) if layer in readers else 0 for layer in range(sizes.depth)])
-        frame_blocks, global_blocks = (self.get_variable("params", f"{kind}_blocks") for kind in ("frame", "global"))
-        body = jax.checkpoint(layer, prevent_cse=False) if self.remat else layer
-        _, (of_layers, specials) = jax.lax.scan(body, x, (frame_blocks, global_blocks, reads, places))
+        frame_blocks: Any = self.get_variable("params", "frame_blocks")
+        global_blocks: Any = self.get_variable("params", "global_blocks")
+        one_layer: Any = jax.checkpoint(body, prevent_cse=False) if self.remat else body
+        _, (of_layers, specials) = jax.lax.scan(one_layer, x, (frame_blocks, global_blocks, reads, places))
         return WindowTokens(jnp.moveaxis(of_layers[jnp.array(sizes.key_layers)], 0, 1), specials[-1]), memory
 
     def _special_tokens(self, starts_sequence: jax.Array, batch: int, frames: int, width: int) -> jax.Array:
