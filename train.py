@@ -14,6 +14,7 @@ import sys
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 from absl import app, flags, logging
@@ -48,7 +49,7 @@ def main(arguments: Sequence[str]) -> None:
         raise app.UsageError(f"unknown argument {arguments[1]!r}; settings are given as --config.NAME=VALUE")
     enable_compilation_cache(_CACHE.value)
     try:
-        config = TrainConfig.from_dict(_CONFIG.value.to_dict())
+        config = TrainConfig.from_dict(_settings())
         use_cpu_cores(config, num_processes=_NUM_PROCESSES.value or 1)
         if _DISTRIBUTED.value:
             join_processes(
@@ -68,6 +69,15 @@ def main(arguments: Sequence[str]) -> None:
             print(f"process {jax.process_index()}: {message}", file=sys.stderr, flush=True)
             os._exit(1)
         sys.exit(message)
+
+
+def _settings() -> dict[str, Any]:
+    """The configuration file's mapping, with what the command line changed."""
+    try:
+        settings: dict[str, Any] = _CONFIG.value.to_dict()
+    except OSError as error:  # The library reads the file here.
+        raise InputError(str(error)) from error
+    return settings
 
 
 def parse_flags(arguments: list[str]) -> list[str]:

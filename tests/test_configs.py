@@ -17,6 +17,7 @@ import pytest
 from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.data.feeding.holdouts import PUBLISHED
 from logvggt_jax.data.rooms.rooms import Rooms
+from logvggt_jax.model.parameters import stack_layers
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.optimizer import learning_rate_schedule, make_optimizer
 from logvggt_jax.training.sharding import check_batch_size, data_mesh
@@ -84,7 +85,7 @@ def _abstract_run(config: TrainConfig, num_devices: int) -> tuple[TrainState, ja
     # Parameters do not depend on the form of attention, and tracing cuDNN's asks for a GPU.
     model = LogVGGT(dataclasses.replace(config.model, attention="xla"))
     images = jax.ShapeDtypeStruct((1, 1, 14, 14, 3), jnp.uint8)
-    params = jax.eval_shape(model.init, jax.random.key(0), images)["params"]
+    params = jax.eval_shape(lambda: stack_layers(model.init(jax.random.key(0), images))["params"])
     optimizer = make_optimizer(config.optimizer, params, frozen=("encoder",))
     state = jax.eval_shape(functools.partial(initial_state, optimizer=optimizer), params)
     schedule = learning_rate_schedule(config.optimizer, config.stages)
@@ -166,16 +167,10 @@ def _check_step(
     assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(lambda x: (x.shape, x.dtype), state)
     assert all(value.shape == () for value in metrics.values())
     program = traced.lower(lowering_platforms=(platform,)).as_text()
-    if attention == "cudnn":
-        # A frame and a global block in each pair of the aggregator, forward, once more where it is rematerialised,
-        # and backward; the frozen encoder forward alone. What is in the program once runs for every window.
-        blocks = 2 * config.model.aggregator.depth
-        assert program.count(backward) >= blocks
-        assert program.count(forward) >= 2 * blocks + config.model.encoder.depth
-    else:
-        # The kernel is a function of the program, one for each shape: of a frame and of a window with its cache.
-        assert program.count(backward) >= 2
-        assert program.count(forward) >= 2
+    # Layers and windows are loops, so that a kernel is in the program a few times and runs many: attention of a frame
+    # and of a window with its cache at least.
+    assert program.count(backward) >= 2
+    assert program.count(forward) >= 2
 
 
 @pytest.mark.parametrize(

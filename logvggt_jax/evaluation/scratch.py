@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from logvggt_jax.errors import DiskError
+
 _IN_MEMORY = 256 * 2**20  # bytes
 
 
@@ -19,7 +21,7 @@ def scratch_array(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
     system's to write out, so that clips of any length fit the memory.
 
     Raises:
-      OSError: the folder has too little space; names it.
+      DiskError: the folder has too little space; names it.
     """
     size = math.prod(shape) * np.dtype(dtype).itemsize
     if size <= _IN_MEMORY:
@@ -28,7 +30,7 @@ def scratch_array(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
     free = shutil.disk_usage(folder).free
     # A full disk would end the process without a word when a page is written.
     if size > free:
-        raise OSError(
+        raise DiskError(
             f"{folder}: a clip needs {size / 1e9:.1f} GB here, {free / 1e9:.1f} GB are free; "
             "make room or set TMPDIR to a folder on a larger disk"
         )

@@ -37,8 +37,9 @@ class Aggregator(nn.Module):
     """VGGT's trunk: in every layer a frame block (tokens of one frame see one another), then a global block (all
     tokens of the window see one another, and what a memory adds).
 
-    Layers run one after the other, or as one loop, whose body is compiled once, where their parameters come stacked
-    (see `parameters.stacked`). With `remat` the loop keeps a layer's input alone for the backward pass.
+    Layers run one after the other or, where their parameters come stacked (see `parameters.stack_layers`), as loops
+    between the key layers, whose bodies are compiled once each. With `remat` the stacked layers keep their input alone
+    for the backward pass.
     """
 
     config: ModelConfig
@@ -48,7 +49,7 @@ class Aggregator(nn.Module):
     def __call__(
         self,
         patch_tokens: jax.Array,
-        lengths: jax.Array,
+        lengths: jax.Array | None,
         starts_sequence: jax.Array,
         memory: Memory,
         *,
@@ -59,10 +60,11 @@ class Aggregator(nn.Module):
         Args:
           patch_tokens: [B, K, h * w, C].
           lengths: int32 [B], how many of the K frames are real, always the first ones; nothing attends to the others.
+            None for all.
           starts_sequence: bool [B], whether the window's first frame is the sequence's first, which has camera
             and register tokens of its own.
           memory: what the global blocks attend to besides the window: with cross-window attention the caches of the
-            key layers, see `cross_window.py`. A loop over the layers leaves it as it is.
+            key layers, see `cross_window.py`.
           grid: (h, w).
 
         Returns:
@@ -75,15 +77,8 @@ class Aggregator(nn.Module):
         x = jnp.concatenate([special, patch_tokens.astype(jnp.float32)], axis=2)
         shape, tokens = x.shape, x.shape[2]
         rope = rope_table(grid, num_special, width // sizes.num_heads, sizes.rope_base)
-
-        def within_frames(block: BlockFunction, x: jax.Array) -> jax.Array:
-            return block(x.reshape(batch * frames, tokens, width), rope=rope)[0].reshape(shape)
-
-        def over_the_window(
-            block: BlockFunction, x: jax.Array, read: LayerMemory | None
-        ) -> tuple[jax.Array, LayerMemory | None]:
-            x, left = block(x.reshape(batch, frames * tokens, width), rope=rope, valid=lengths * tokens, memory=read)
-            return x.reshape(shape), left
+        valid = None if lengths is None else lengths * tokens
+        outlets = {*sizes.key_layers, sizes.depth - 1}
 
         def block(**options: Any) -> Block:
             return Block(
@@ -97,44 +92,53 @@ class Aggregator(nn.Module):
                 **options,
             )
 
-        if not self.has_variable("params", "global_blocks"):
-            key_tokens = []
-            for layer in range(sizes.depth):
-                frame_out = within_frames(block(name=f"frame_block_{layer}"), x)
-                x, left = over_the_window(block(name=f"global_block_{layer}"), frame_out, memory.at(layer))
-                if left is not None:
-                    memory = memory.updated(layer, left)
-                if layer in sizes.key_layers:
-                    key_tokens.append(jnp.concatenate([frame_out, x], axis=-1).astype(config.dtype))
-            special = jnp.concatenate([frame_out, x], axis=-1)[:, :, :num_special]
-            return WindowTokens(jnp.stack(key_tokens, axis=1), special), memory
+        def one_layer(
+            frame_block: BlockFunction, global_block: BlockFunction, x: jax.Array, read: LayerMemory | None
+        ) -> tuple[jax.Array, jax.Array, LayerMemory | None]:
+            """Outputs of both blocks [B, K, P, C], and the memory that the global block leaves."""
+            frame_out, _ = frame_block(x.reshape(batch * frames, tokens, width), rope=rope)
+            x, left = global_block(
+                frame_out.reshape(batch, frames * tokens, width), rope=rope, valid=valid, memory=read
+            )
+            return frame_out.reshape(shape), x.reshape(shape), left
 
-        readers = [layer for layer in range(sizes.depth) if memory.at(layer) is not None]
-        memories = jax.tree.map(lambda *x: jnp.stack(x), *[memory.at(layer) for layer in readers]) if readers else None
-        detached = block(parent=None)
+        def by_parameters(
+            params: tuple[Any, Any], x: jax.Array, read: LayerMemory | None = None
+        ) -> tuple[jax.Array, jax.Array, LayerMemory | None]:
+            frame_block, global_block = (functools.partial(run, block(parent=None), each) for each in params)
+            return one_layer(frame_block, global_block, x, read)
 
-        def layer(x: jax.Array, inputs: tuple[Any, Any, jax.Array, jax.Array]) -> tuple[jax.Array, Any]:
-            frame_params, global_params, reads, place = inputs
-            frame_out = within_frames(functools.partial(run, detached, frame_params), x)
-            global_block = functools.partial(run, detached, global_params)
+        stacks: Any = None
+        if self.has_variable("params", "global_blocks"):
+            stacks = self.get_variable("params", "frame_blocks"), self.get_variable("params", "global_blocks")
+            if self.remat:
+                by_parameters = jax.checkpoint(by_parameters, prevent_cse=False)
 
-            def alone(x: jax.Array) -> jax.Array:
-                return over_the_window(global_block, x, None)[0]
-
-            def reading(x: jax.Array) -> jax.Array:
-                own = jax.tree.map(lambda m: jax.lax.dynamic_index_in_dim(m, place, keepdims=False), memories)
-                return over_the_window(global_block, x, own)[0]
-
-            x = jax.lax.cond(reads, reading, alone, frame_out) if readers else alone(frame_out)
-            both = jnp.concatenate([frame_out, x], axis=-1)
-            return x, (both.astype(config.dtype), both[:, :, :num_special])
-
-        reads = jnp.array([layer in readers for layer in range(sizes.depth)])
-        places = jnp.array([readers.index(layer) if layer in readers else 0 for layer in range(sizes.depth)])
-        frame_blocks, global_blocks = (self.get_variable("params", f"{kind}_blocks") for kind in ("frame", "global"))
-        body = jax.checkpoint(layer, prevent_cse=False) if self.remat else layer
-        _, (of_layers, specials) = jax.lax.scan(body, x, (frame_blocks, global_blocks, reads, places))
-        return WindowTokens(jnp.moveaxis(of_layers[jnp.array(sizes.key_layers)], 0, 1), specials[-1]), memory
+        key_tokens, layer = [], 0
+        while layer < sizes.depth:
+            # Layers whose output is handed out, or that read a memory, stand between the loops.
+            stop = next(n for n in range(layer, sizes.depth) if n in outlets or memory.at(n) is not None)
+            if stacks is not None and stop > layer:
+                x, _ = jax.lax.scan(
+                    lambda x, params: (by_parameters(params, x)[1], None),
+                    x,
+                    jax.tree.map(lambda stack, a=layer, b=stop: stack[a:b], stacks),
+                )
+                layer = stop
+            read = memory.at(layer)
+            if stacks is None:
+                blocks = block(name=f"frame_block_{layer}"), block(name=f"global_block_{layer}")
+                frame_out, x, left = one_layer(*blocks, x, read)
+            else:
+                frame_out, x, left = by_parameters(jax.tree.map(lambda stack, i=layer: stack[i], stacks), x, read)
+            if left is not None:
+                memory = memory.updated(layer, left)
+            if layer in outlets:
+                both = jnp.concatenate([frame_out, x], axis=-1)
+            if layer in sizes.key_layers:
+                key_tokens.append(both.astype(config.dtype))
+            layer += 1
+        return WindowTokens(jnp.stack(key_tokens, axis=1), both[:, :, :num_special]), memory
 
     def _special_tokens(self, starts_sequence: jax.Array, batch: int, frames: int, width: int) -> jax.Array:
         """Camera and register tokens [B, K, 5, C]: copy 0 for the sequence's first frame, copy 1 for others."""

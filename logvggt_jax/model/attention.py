@@ -209,9 +209,7 @@ def _tpu_flash(query: jax.Array, key: jax.Array, value: jax.Array, key_valid: ja
         return jnp.pad(x, ((0, 0), (0, -x.shape[1] % block)) + ((0, 0),) * (x.ndim - 2))
 
     query, key, value, valid = pad(query, q_block), *(pad(x, k_block) for x in (key, value, valid))
-    segments = pallas.SegmentIds(
-        q=jnp.ones(query.shape[:2], jnp.int32), kv=jnp.where(valid, 1, 0).astype(jnp.int32)
-    )
+    segments = pallas.SegmentIds(q=jnp.ones(query.shape[:2], jnp.int32), kv=jnp.where(valid, 1, 0).astype(jnp.int32))
     sizes = pallas.BlockSizes(
         block_q=q_block,
         block_k_major=k_block,

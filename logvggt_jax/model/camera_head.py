@@ -36,9 +36,9 @@ class CameraHead(nn.Module):
         plain = layer_norm(1e-6, "adaptive_norm", affine=False)(tokens)
 
         def one_round(
-            module: CameraHead, carry: tuple[jax.Array, jax.Array], _: None
+            module: CameraHead, carry: tuple[jax.Array, jax.Array], nothing: None
         ) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
-            del module  # the submodules below attach to this module's scope by themselves
+            del module, nothing  # the submodules below attach to this module's scope by themselves
             embedded, pose = carry
             features = jax.nn.silu(dense(width, "embed_pose")(embedded))
             shift, scale, gate = jnp.split(dense(3 * width, "modulation")(features), 3, axis=-1)

@@ -93,7 +93,7 @@ class DinoV2(nn.Module):
         else:
             for i in range(config.depth):
                 x, _ = block(name=f"block_{i}")(x)
-        return layer_norm(1e-6, "norm")(x[:, 1 + config.num_registers :])
+        return layer_norm(1e-6, "norm", self.dtype)(x[:, 1 + config.num_registers :])
 
 
 def _resize_positions(pos_embed: jax.Array, side: int, grid: tuple[int, int]) -> jax.Array:

@@ -29,7 +29,7 @@ class DPTHead(nn.Module):
     def __call__(self, levels: Sequence[jax.Array], *, grid: tuple[int, int], image_size: tuple[int, int]) -> jax.Array:
         """Patch tokens of the key layers, four times [N, h * w, 2C], to [N, H, W, out_channels] float32."""
         config, aspect = self.config, image_size[1] / image_size[0]
-        norm = layer_norm(1e-5, "norm")
+        norm = layer_norm(1e-5, "norm", self.dtype)
         maps = []
         for i, (tokens, channels) in enumerate(zip(levels, config.out_channels, strict=True)):
             x = norm(tokens).reshape(-1, *grid, tokens.shape[-1])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from typing import Any
 
 import flax.linen as nn
@@ -32,14 +33,18 @@ def dense(
     )
 
 
-def layer_norm(epsilon: float, name: str, *, affine: bool = True) -> nn.LayerNorm:
-    """LayerNorm over the last axis, in float32; PyTorch's variance (no E[x²] − E[x]² shortcut)."""
+def layer_norm(epsilon: float, name: str, dtype: str = "float32", *, affine: bool = True) -> nn.LayerNorm:
+    """LayerNorm over the last axis, in float32, of what products of `dtype` read.
+
+    For float32 products PyTorch's variance; for 16-bit ones the shortcut E[x²] − E[x]², whose error their rounding
+    hides and which reads the tokens once less.
+    """
     return nn.LayerNorm(
         epsilon=epsilon,
         dtype=jnp.float32,
         use_bias=affine,
         use_scale=affine,
-        use_fast_variance=False,
+        use_fast_variance=dtype != "float32",
         scale_init=constant(1.0),
         bias_init=constant(0.0),
         name=name,
@@ -57,6 +62,16 @@ class LayerScale(nn.Module):
         return gamma * branch.astype(jnp.float32)
 
 
+def _gelu(x: jax.Array, dtype: str) -> jax.Array:
+    """x Φ(x), exact, of float32 values that products of `dtype` read.
+
+    Φ by erfc keeps the relative accuracy of its tail, which 16-bit products round away: by erf it costs half.
+    """
+    if dtype == "float32":
+        return jax.nn.gelu(x, approximate=False)
+    return x * (0.5 + 0.5 * jax.lax.erf(x * math.sqrt(0.5)))
+
+
 class MLP(nn.Module):
     """fc2(GELU(fc1(x))) with the exact (erf) GELU."""
 
@@ -67,7 +82,7 @@ class MLP(nn.Module):
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         x = dense(self.hidden, "fc1", self.dtype, out=self.dtype)(x)
-        x = jax.nn.gelu(x.astype(jnp.float32), approximate=False).astype(self.dtype)
+        x = _gelu(x.astype(jnp.float32), self.dtype).astype(self.dtype)
         return dense(self.features, "fc2", self.dtype)(x)
 
 
@@ -84,12 +99,14 @@ class Attention(nn.Module):
     implementation: str
 
     def setup(self) -> None:
-        self.query = dense(self.width, "query", self.dtype, out=self.dtype)
-        self.key_value = dense(2 * self.width, "key_value", self.dtype, out=self.dtype)
+        # Norm and rotation want what the products would round off.
+        out = "float32" if self.qk_norm else self.dtype
+        self.query = dense(self.width, "query", self.dtype, out=out)
+        self.key_value = dense(2 * self.width, "key_value", self.dtype, out=out)
         self.output = dense(self.width, "output", self.dtype)
         if self.qk_norm:
-            self.query_norm = layer_norm(1e-5, "query_norm")
-            self.key_norm = layer_norm(1e-5, "key_norm")
+            self.query_norm = layer_norm(1e-5, "query_norm", self.dtype)
+            self.key_norm = layer_norm(1e-5, "key_norm", self.dtype)
 
     def queries(self, normed: jax.Array, rope: RopeTable | None) -> jax.Array:
         """[B, N, C] after the block's LayerNorm to queries [B, N, heads, head_dim] in the compute type."""
@@ -151,7 +168,7 @@ class Block(nn.Module):
           memory: what the block has seen before; None for its own tokens alone.
         """
         width = x.shape[-1]
-        norm1 = layer_norm(self.epsilon, "norm1")
+        norm1 = layer_norm(self.epsilon, "norm1", self.dtype)
         attention_ = Attention(self.num_heads, width, self.qk_norm, self.dtype, self.implementation, name="attention")
         normed = norm1(x)
         keys = attention_.keys(normed, rope, valid)
@@ -159,5 +176,7 @@ class Block(nn.Module):
             keys, memory = memory.extend(keys, lambda tokens: attention_.keys(norm1(tokens), rope))
         branch = attention_(attention_.queries(normed, rope), keys)
         x = x + LayerScale(self.layer_scale, name="scale1")(branch)
-        branch = MLP(self.mlp_ratio * width, width, self.dtype, name="mlp")(layer_norm(self.epsilon, "norm2")(x))
+        branch = MLP(self.mlp_ratio * width, width, self.dtype, name="mlp")(
+            layer_norm(self.epsilon, "norm2", self.dtype)(x)
+        )
         return x + LayerScale(self.layer_scale, name="scale2")(branch), memory

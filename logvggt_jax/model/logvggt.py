@@ -12,7 +12,7 @@ from logvggt_jax.config import ModelConfig
 from logvggt_jax.geometry.pose_encoding import decode_poses
 from logvggt_jax.model.checks import check_images, checked_mask
 from logvggt_jax.model.cross_window import CrossWindowMemory
-from logvggt_jax.model.parameters import Variables, stacked
+from logvggt_jax.model.parameters import Variables, stack_layers
 from logvggt_jax.model.refinement import Refinement
 from logvggt_jax.model.windows import Windows, WindowState
 from logvggt_jax.types import Predictions, WindowOutput
@@ -99,11 +99,11 @@ class LogVGGT:
             and recomputes the rest; a frozen encoder runs once a frame.
         """
         check_images(images, self.config.encoder.patch_size)
-        frame_mask = checked_mask(images, frame_mask)
         if remat:
-            out = Windows(self.config, remat=True).scan(stacked(variables), images, frame_mask)
+            out = Windows(self.config, remat=True).scan(stack_layers(variables), images, frame_mask)
         else:
             out = self.windows.scan(variables, images, frame_mask)
+        frame_mask = checked_mask(images, frame_mask)
         pose_encodings = self.refinement.refine_sequence(variables, out.camera_tokens, out.register_tokens, frame_mask)
         pose_encoding = pose_encodings[:, :, -1]
         extrinsics, intrinsics = decode_poses(pose_encoding, (images.shape[2], images.shape[3]))

@@ -7,6 +7,7 @@ training wants the layers of deep stacks stacked, so that one loop body is compi
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from typing import Any
 
 import flax.linen as nn
@@ -18,6 +19,7 @@ from logvggt_jax.config import ModelConfig
 Variables = dict[str, Any]
 
 _LAYER = re.compile(r"(.*_)?block_(\d+)")
+_STACK = re.compile(r"(.*_)?blocks")
 # The camera head computes in float32 whatever the compute type.
 _COMPUTE_TYPE_PARTS = ("encoder", "aggregator", "depth_head", "point_head", "gccr")
 
@@ -27,22 +29,54 @@ def run(module: nn.Module, params: Any, *inputs: Any, **options: Any) -> Any:
     return module.apply({"params": params}, *inputs, **options)
 
 
-def stacked(variables: Variables) -> Variables:
-    """The layers of encoder and aggregator as one: `frame_block_0` … `frame_block_23` become `frame_blocks` with a
-    leading axis of layers, likewise `global_blocks` and the encoder's `blocks`."""
-    params = dict(variables["params"])
-    for part in ("encoder", "aggregator"):
-        others: dict[str, Any] = {}
+def stack_layers(tree: Any) -> Any:
+    """A tree of parameters (or of an optimiser's moments) with the layers of deep stacks as one.
+
+    `frame_block_0` … `frame_block_23` become `frame_blocks` with a leading axis of layers, likewise `global_blocks` and
+    the encoder's `blocks`; what is stacked already stays.
+    """
+
+    def stack(node: Any) -> Any:
+        if not _has_layers(node):
+            return node
         families: dict[str, dict[int, Any]] = {}
-        for name, tree in params[part].items():
+        others: dict[str, Any] = {}
+        for name, inner in node.items():
             if match := _LAYER.fullmatch(name):
-                families.setdefault(f"{match[1] or ''}blocks", {})[int(match[2])] = tree
+                families.setdefault(f"{match[1] or ''}blocks", {})[int(match[2])] = inner
             else:
-                others[name] = tree
+                others[name] = inner
         for name, layers in families.items():
             others[name] = jax.tree.map(lambda *x: jnp.stack(x), *[layers[i] for i in range(len(layers))])
-        params[part] = others
-    return {**variables, "params": params}
+        return others
+
+    return jax.tree.map(stack, tree, is_leaf=_has_layers)
+
+
+def unstack_layers(tree: Any, take: Callable[[Any, int], Any] = lambda x, layer: x[layer]) -> Any:
+    """Inverse of `stack_layers`; `take` makes one layer's leaf of a stacked one."""
+
+    def unstack(node: Any) -> Any:
+        if not _is_stacked(node):
+            return node
+        layers: dict[str, Any] = {}
+        for name, inner in node.items():
+            if not _STACK.fullmatch(name):
+                layers[name] = inner
+                continue
+            for layer in range(jax.tree.leaves(inner)[0].shape[0]):
+                layers[f"{name.removesuffix('s')}_{layer}"] = jax.tree.map(lambda x, i=layer: take(x, i), inner)
+        return layers
+
+    return jax.tree.map(unstack, tree, is_leaf=_is_stacked)
+
+
+def _has_layers(node: Any) -> bool:
+    return isinstance(node, dict) and any(_LAYER.fullmatch(name) for name in node)
+
+
+def _is_stacked(node: Any) -> bool:
+    return isinstance(node, dict) and any(_STACK.fullmatch(name) for name in node)
 
 
 def in_compute_type(variables: Variables, config: ModelConfig) -> Variables:
@@ -52,7 +86,7 @@ def in_compute_type(variables: Variables, config: ModelConfig) -> Variables:
         if not isinstance(tree, dict):
             return tree
         if "kernel" in tree:
-            return {name: x.astype(config.dtype) for name, x in tree.items()}
+            return {name: x.astype(jnp.dtype(config.dtype)) for name, x in tree.items()}
         return {name: cast(inner) for name, inner in tree.items()}
 
     params = variables["params"]

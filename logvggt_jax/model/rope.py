@@ -10,12 +10,15 @@ import numpy as np
 
 
 class RopeTable(NamedTuple):
-    """Cosines and sines of one frame's tokens, float32 [P, head_dim / 4] for each of y and x."""
+    """Rotations of one frame's P tokens, float32; axes are (y, x), then (first, second) of the rotated pair.
 
-    cos_y: jax.Array
-    sin_y: jax.Array
-    cos_x: jax.Array
-    sin_x: jax.Array
+    Attributes:
+      cos: [P, 2, 1, head_dim / 4].
+      sin: [P, 2, 2, head_dim / 4], negative for the first of a pair.
+    """
+
+    cos: jax.Array
+    sin: jax.Array
 
 
 def rope_table(grid: tuple[int, int], num_special: int, head_dim: int, base: float) -> RopeTable:
@@ -32,7 +35,8 @@ def rope_table(grid: tuple[int, int], num_special: int, head_dim: int, base: flo
         special = jnp.full((num_special, len(frequencies)), wave(np.float32(0.0)))
         return jnp.concatenate([special, patches.reshape(-1, len(frequencies))])
 
-    return RopeTable(spread(0, np.cos), spread(0, np.sin), spread(1, np.cos), spread(1, np.sin))
+    cos, sin = (jnp.stack([spread(axis, wave) for axis in (0, 1)], axis=1) for wave in (np.cos, np.sin))
+    return RopeTable(cos[:, :, None], jnp.stack([-sin, sin], axis=2))
 
 
 def apply_rope(tokens: jax.Array, table: RopeTable) -> jax.Array:
@@ -41,11 +45,8 @@ def apply_rope(tokens: jax.Array, table: RopeTable) -> jax.Array:
     Positions know the inside of a frame only: every frame is rotated alike.
     """
     batch, length, heads, head_dim = tokens.shape
-    quarter = head_dim // 4
     # [B, n, P, heads, (y, x), (first, second), head_dim / 4]
-    pairs = tokens.astype(jnp.float32).reshape(batch, -1, len(table.cos_y), heads, 2, 2, quarter)
-    cos = jnp.stack([table.cos_y, table.cos_x], axis=1)[:, None, :, None]
-    sin = jnp.stack([table.sin_y, table.sin_x], axis=1)
+    pairs = tokens.astype(jnp.float32).reshape(batch, -1, len(table.cos), heads, 2, 2, head_dim // 4)
     # (a, b) becomes (a cos − b sin, b cos + a sin); a mirrored read, where a concatenation would be a copy.
-    rotated = pairs * cos + jnp.flip(pairs, axis=-2) * jnp.stack([-sin, sin], axis=2)[:, None]
+    rotated = pairs * table.cos[:, None] + jnp.flip(pairs, axis=-2) * table.sin[:, None]
     return rotated.reshape(batch, length, heads, head_dim).astype(tokens.dtype)

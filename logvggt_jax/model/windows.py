@@ -114,9 +114,10 @@ class Windows:
           state: from `start` or the step before; may be donated.
           frames: s new frames [B, s, H, W, 3]; a short tail is padded and masked.
           frame_mask: bool [B, s], False for padding. An item whose new frames are all padding has ended: it only
-            hands out what it still holds.
+            hands out what it still holds. None says that all frames are real, those that the state holds as well:
+            attention then knows no padding, which is the faster program.
         """
-        stride = self.config.windows.stride
+        stride, padded = self.config.windows.stride, frame_mask is not None
         frame_mask = self._checked_group(frames, frame_mask, stride, "step")
         image_size = _image_size(frames)
         if (len(state.step), *state.image_size) != (len(frames), *image_size):
@@ -126,12 +127,14 @@ class Windows:
             )
         patch_tokens = jnp.concatenate([state.patch_tokens, self.encode(variables, frames)], axis=1)
         window_mask = jnp.concatenate([state.frame_mask, frame_mask], axis=1)
-        window = self.attend(variables, state, patch_tokens, window_mask)
-        # An item that has ended shifts its held frames out instead.
-        active = (state.step == 0) | frame_mask.any(1)
-        key_tokens = _select(active, window.key, _shift_in(state.key_tokens, stride, axis=2))
-        special_tokens = _select(active, window.special, _shift_in(state.special_tokens, stride, axis=1))
-        window_mask = _select(active, window_mask, _shift_in(state.frame_mask, stride, axis=1))
+        window = self.attend(variables, state, patch_tokens, window_mask.sum(1) if padded else None)
+        key_tokens, special_tokens = window
+        if padded:
+            # An item that has ended shifts its held frames out instead.
+            active = (state.step == 0) | frame_mask.any(1)
+            key_tokens = _select(active, key_tokens, _shift_in(state.key_tokens, stride, axis=2))
+            special_tokens = _select(active, special_tokens, _shift_in(state.special_tokens, stride, axis=1))
+            window_mask = _select(active, window_mask, _shift_in(state.frame_mask, stride, axis=1))
         out = self.decode_dense(
             variables,
             WindowTokens(key_tokens[:, :, :stride], special_tokens[:, :stride]),
@@ -171,12 +174,17 @@ class Windows:
         check_images(images, self.config.encoder.patch_size)
         frame_mask = None if frame_mask is None else checked_mask(images, frame_mask)
         num_frames, stride, overlap = images.shape[1], self.config.windows.stride, self.overlap
+        windows = num_windows(num_frames, self.config.windows.size, stride)
+        padded = windows * stride + overlap
+        all_real = frame_mask is None and padded == num_frames
 
-        def frames_from(first: jax.Array | int, count: int) -> tuple[jax.Array, jax.Array]:
+        def frames_from(first: jax.Array | int, count: int) -> tuple[jax.Array, jax.Array | None]:
             # A short tail repeats the last frame, masked, instead of padding a copy of all images.
             index = first + jnp.arange(count)
             clipped = jnp.minimum(index, num_frames - 1)
             frames = jnp.take(images, clipped, axis=1)
+            if all_real:
+                return frames, None
             mask = jnp.broadcast_to(index < num_frames, frames.shape[:2])
             return frames, mask if frame_mask is None else mask & jnp.take(frame_mask, clipped, axis=1)
 
@@ -184,10 +192,8 @@ class Windows:
             frames, mask = frames_from(window * stride + overlap, stride)
             return self.step(variables, state, frames, mask)
 
-        windows = num_windows(num_frames, self.config.windows.size, stride)
         state = self.start(variables, *frames_from(0, overlap))
         # Outputs live in buffers that the scan updates in place: stacked ones would be copied to put B first.
-        padded = windows * stride + overlap
         one_step = jax.eval_shape(advance, state, jnp.int32(0))[1]
         buffers = jax.tree.map(lambda x: jnp.zeros((x.shape[0], padded, *x.shape[2:]), x.dtype), one_step)
 
@@ -220,7 +226,7 @@ class Windows:
         return tokens.reshape(*images.shape[:2], *tokens.shape[1:])
 
     def attend(
-        self, variables: Variables, state: WindowState, patch_tokens: jax.Array, window_mask: jax.Array
+        self, variables: Variables, state: WindowState, patch_tokens: jax.Array, lengths: jax.Array | None = None
     ) -> WindowTokens:
         """All attention blocks over one window.
 
@@ -228,19 +234,11 @@ class Windows:
           variables: {"params": …}.
           state: of the stream before the window, whose cache the key layers see.
           patch_tokens: [B, K, h * w, C] of the window's frames.
-          window_mask: bool [B, K], True … True False … False.
+          lengths: int32 [B], how many of the frames are real, always the first ones; None for all.
         """
-        is_first = state.step == 0
+        is_first, grid = state.step == 0, self.grid(state.image_size)
         params = variables["params"]["aggregator"]
-        tokens, _ = run(
-            self.aggregator,
-            params,
-            patch_tokens,
-            window_mask.sum(1),
-            is_first,
-            self._memory(state),
-            grid=self.grid(state.image_size),
-        )
+        tokens, _ = run(self.aggregator, params, patch_tokens, lengths, is_first, self._memory(state), grid=grid)
         return tokens
 
     def decode_dense(

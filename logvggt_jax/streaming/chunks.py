@@ -19,6 +19,7 @@ import numpy as np
 from logvggt_jax.errors import InputError
 from logvggt_jax.geometry import Similarity, robust_similarity, unproject_pixels
 from logvggt_jax.model.logvggt import LogVGGT, Variables
+from logvggt_jax.model.parameters import in_compute_type
 from logvggt_jax.streaming.offline import FinalFrames, PlainPrediction, predict_plain
 from logvggt_jax.streaming.results import Cameras, FrameResult, PredictionError, checked_frames, device_memory
 
@@ -128,8 +129,8 @@ class ChunkSession:
     """
 
     def __init__(self, model: LogVGGT, variables: Variables, plan: ChunkPlan) -> None:
-        # Once, not for every chunk, where they are numpy arrays.
-        predict = functools.partial(predict_plain, model, jax.device_put(variables))
+        # Once, not for every chunk: cast, and brought to the device where they are numpy arrays.
+        predict = functools.partial(predict_plain, model, jax.device_put(in_compute_type(variables, model.config)))
         self._patch_size, self._plan = model.config.encoder.patch_size, plan
         self._chain = ChunkChain(predict, plan)
         self._newest: np.ndarray | None = None
@@ -185,7 +186,7 @@ def align(source: PlainPrediction, target: PlainPrediction) -> Similarity:
     weights *= np.sqrt(target.depth_confidence.reshape(-1)[chosen].astype(np.float64))
     threshold = _HUBER_THRESHOLD * float(np.median(target.depth.reshape(-1)[chosen]))
     clouds = [unproject_pixels(each.depth, each.intrinsics, each.extrinsics, chosen) for each in (source, target)]
-    return robust_similarity(*clouds, weights, threshold=threshold)
+    return robust_similarity(clouds[0], clouds[1], weights, threshold=threshold)
 
 
 def move(prediction: PlainPrediction, similarity: Similarity) -> PlainPrediction:

@@ -14,6 +14,7 @@ from logvggt_jax.config import WindowConfig
 from logvggt_jax.errors import InputError
 from logvggt_jax.geometry import encode_poses
 from logvggt_jax.model.logvggt import LogVGGT, Variables
+from logvggt_jax.model.parameters import in_compute_type
 from logvggt_jax.streaming.results import Cameras, FrameResult, PredictionError, checked_frames, device_memory
 
 
@@ -135,7 +136,8 @@ class OfflineSession:
     """
 
     def __init__(self, model: LogVGGT, variables: Variables, settings: OfflineSettings) -> None:
-        self._model, self._variables, self._settings = model, jax.device_put(variables), settings
+        self._model, self._settings = model, settings
+        self._variables = jax.device_put(in_compute_type(variables, model.config))
         self._images: list[np.ndarray] = []
         self._final = FinalFrames()
         self._closed = False

@@ -16,6 +16,7 @@ import numpy as np
 from logvggt_jax.config import RefinementConfig
 from logvggt_jax.model.gccr import RegisterKeys
 from logvggt_jax.model.logvggt import LogVGGT, Variables
+from logvggt_jax.model.parameters import in_compute_type
 from logvggt_jax.model.windows import WindowState
 from logvggt_jax.streaming.results import Cameras, FrameResult, checked_frames, decoded_cameras, device_memory
 from logvggt_jax.streaming.token_store import TokenStore
@@ -25,13 +26,13 @@ from logvggt_jax.types import WindowOutput
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _start(model: LogVGGT, variables: Variables, frames: jax.Array, mask: jax.Array) -> WindowState:
+def _start(model: LogVGGT, variables: Variables, frames: jax.Array, mask: jax.Array | None) -> WindowState:
     return model.start(variables, frames, mask)
 
 
 @functools.partial(jax.jit, static_argnums=0, donate_argnums=2)
 def _step(
-    model: LogVGGT, variables: Variables, state: WindowState, frames: jax.Array, mask: jax.Array
+    model: LogVGGT, variables: Variables, state: WindowState, frames: jax.Array, mask: jax.Array | None
 ) -> tuple[WindowState, WindowOutput]:
     return model.step(variables, state, frames, mask)
 
@@ -139,8 +140,8 @@ class StreamSession:
         first_capacity: int = 256,
     ) -> None:
         self._model, self._settings = model, WindowSettings(provisional, ahead, first_capacity)
-        # Once, not at every call, where they are numpy arrays.
-        self._variables = jax.device_put(variables)
+        # Once, not at every call: cast, and brought to the device where they are numpy arrays.
+        self._variables = jax.device_put(in_compute_type(variables, model.config))
         # Windows know nothing of refinement: sessions that differ in its mode share their programs.
         plain = dataclasses.replace(model.config.refinement, enabled=True, period=None, context=None)
         self._windows = LogVGGT(dataclasses.replace(model.config, refinement=plain))
@@ -259,9 +260,11 @@ class StreamSession:
         self._one_step()
         return True
 
-    def _take(self, count: int) -> tuple[jax.Array, jax.Array]:
-        """The next `count` pending frames [1, count, H, W, 3] and their mask; a short rest repeats the last."""
+    def _take(self, count: int) -> tuple[jax.Array, jax.Array | None]:
+        """The next `count` pending frames [1, count, H, W, 3]; a short rest repeats the last and comes with a mask."""
         frames, self._pending = self._pending[:count], self._pending[count:]
+        if len(frames) == count:
+            return jnp.asarray(np.stack(frames)[None]), None
         assert self._newest is not None
         mask = np.arange(count) < len(frames)
         frames += [self._newest] * (count - len(frames))

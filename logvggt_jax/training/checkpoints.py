@@ -11,6 +11,7 @@ import jax
 import orbax.checkpoint as ocp
 
 from logvggt_jax.errors import InputError
+from logvggt_jax.model.parameters import stack_layers, unstack_layers
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.processes import any_process
 from logvggt_jax.training.state import TrainState
@@ -67,7 +68,8 @@ class RunCheckpoints:
         failure: Exception | None = None
         if jax.process_index() == 0:
             try:
-                save_model(self.model_folder, self.config.model, params, self._provenance())
+                layers = unstack_layers(jax.device_get(params))
+                save_model(self.model_folder, self.config.model, layers, self._provenance())
             except Exception as error:
                 failure = error
         # The others would wait for the first one in the checkpoint below.
@@ -76,6 +78,7 @@ class RunCheckpoints:
         meta = {
             "step": step,
             "stage": position.stage,
+            "layers": "stacked",
             "config": self.config.to_dict(),
             "digests": {"params": digests(params), "state": digests(rest)},
             "libraries": {name: importlib.metadata.version(name) for name in LIBRARIES},
@@ -114,7 +117,9 @@ class RunCheckpoints:
         mend = f"resume from another with --resume_step (there are {others})" if others else "start a new --workdir"
         meta = self._read(chosen, ocp.args.Composite(meta=ocp.args.JsonRestore()), where, mend)["meta"]
         self._check_configuration(meta["config"], where)
-        params, rest = _parts(like)
+        # Earlier versions kept every layer's parameters and moments by themselves.
+        layer_by_layer = meta.get("layers") != "stacked"
+        params, rest = _parts(unstack_layers(like, _one_layer) if layer_by_layer else like)
         restored = self._read(
             chosen,
             ocp.args.Composite(
@@ -133,7 +138,8 @@ class RunCheckpoints:
         for later in steps:
             if later > chosen:
                 self._manager.delete(later)
-        return TrainState(params=restored["params"], **restored["state"]), Position(meta["stage"], restored["data"])
+        state = TrainState(params=restored["params"], **restored["state"])
+        return stack_layers(state) if layer_by_layer else state, Position(meta["stage"], restored["data"])
 
     def _read(self, step: int, args: Any, where: str, mend: str) -> Mapping[str, Any]:
         try:
@@ -168,6 +174,11 @@ def _what_decides_clips(data: Mapping[str, Any]) -> dict[str, Any]:
 def _parts(state: TrainState) -> tuple[Any, dict[str, Any]]:
     rest = state._asdict()
     return rest.pop("params"), rest
+
+
+def _one_layer(stack: jax.ShapeDtypeStruct, layer: int) -> jax.ShapeDtypeStruct:
+    del layer
+    return jax.ShapeDtypeStruct(stack.shape[1:], stack.dtype, sharding=stack.sharding)
 
 
 def _abstract(tree: Any) -> Any:

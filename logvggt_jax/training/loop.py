@@ -15,6 +15,7 @@ from rich.console import Console
 from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.data.feeding.batches import BatchIterator
 from logvggt_jax.model.logvggt import LogVGGT
+from logvggt_jax.model.parameters import stack_layers
 from logvggt_jax.training.batches import open_sources, stage_batches
 from logvggt_jax.training.checkpoints import Position, RunCheckpoints
 from logvggt_jax.training.config import StageConfig, TrainConfig
@@ -82,7 +83,8 @@ class _Run:
         self.deadline = None if config.max_minutes is None else time.monotonic() + 60 * config.max_minutes
         model = LogVGGT(config.model)
         # Shapes alone: a run that goes on needs no initial weights.
-        self.shapes = jax.eval_shape(functools.partial(initial_parameters, config.model, seed=config.seed))
+        # Deep stacks are trained as one loop over stacked layers: their step compiles once and updates few arrays.
+        self.shapes = jax.eval_shape(lambda: stack_layers(initial_parameters(config.model, seed=config.seed)))
         self.optimizer = make_optimizer(config.optimizer, self.shapes, frozen=_frozen_modules(config))
         schedule = learning_rate_schedule(config.optimizer, config.stages)
         terms = make_loss_terms(model, config.loss)
@@ -100,7 +102,7 @@ class _Run:
         config, everywhere = self.config, replicated(self.mesh)
         if resume_step is None and not self.checkpoints.steps:
             params = initial_parameters(config.model, seed=config.seed, weights=config.initial_weights)
-            self.state = jax.device_put(initial_state(params, self.optimizer), everywhere)
+            self.state = jax.device_put(initial_state(stack_layers(params), self.optimizer), everywhere)
             return 0, None
         like = jax.eval_shape(functools.partial(initial_state, optimizer=self.optimizer), self.shapes)
         like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=everywhere), like)

@@ -14,7 +14,7 @@ class TrainState(NamedTuple):
 
     Attributes:
       step: int32 scalar, batches seen.
-      params: Parameter tree of the model, float32.
+      params: Parameter tree of the model, float32, the layers of deep stacks as one (`stack_layers`).
       opt_state: The optimiser's.
       skipped: int32 scalar, updates left out for a non-finite loss or gradient.
       skipped_in_a_row: int32 scalar.

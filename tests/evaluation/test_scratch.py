@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from logvggt_jax.errors import DiskError
 from logvggt_jax.evaluation import scratch
 from logvggt_jax.evaluation.scratch import scratch_array
 
@@ -25,5 +26,5 @@ def test_large_arrays_lie_in_a_file_without_a_name(monkeypatch: pytest.MonkeyPat
 
 def test_a_full_disk_is_named_before_it_is_written(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    with pytest.raises(OSError, match=rf"{tmp_path}: a clip needs .* set TMPDIR"):
+    with pytest.raises(DiskError, match=rf"{tmp_path}: a clip needs .* set TMPDIR"):
         scratch_array((2**50,), np.uint8)

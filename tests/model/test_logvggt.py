@@ -12,7 +12,7 @@ import pytest
 
 from logvggt_jax import DPTConfig, LogVGGT, ModelConfig
 from logvggt_jax.evaluation.costs.operations import count_flops
-from logvggt_jax.model.parameters import in_compute_type, stacked
+from logvggt_jax.model.parameters import in_compute_type, stack_layers, unstack_layers
 from logvggt_jax.model.windows import Windows
 
 FRAMES = 6
@@ -74,7 +74,7 @@ def test_training_runs_a_frozen_encoder_once_a_frame(small_config):
         variables = jax.eval_shape(model.init, jax.random.key(0), video())
 
         def loss(variables, images):
-            return jnp.log(Windows(model.config, remat=True).scan(stacked(variables), images).depth).sum()
+            return jnp.log(Windows(model.config, remat=True).scan(stack_layers(variables), images).depth).sum()
 
         function = jax.grad(loss) if differentiate else loss
         return count_flops(function, variables, video())
@@ -98,7 +98,10 @@ def test_layers_as_a_loop_are_the_layers_one_by_one(small_config, small_variable
     }
     variables = {"params": {**params, "aggregator": {**aggregator, **extra}}}
     one_by_one = jax.jit(model.windows.scan)(variables, video())
-    loop = jax.jit(model.windows.scan)(stacked(variables), video())
+    stacks = stack_layers(variables)
+    jax.tree.map(np.testing.assert_array_equal, unstack_layers(stacks), variables)
+    assert stack_layers(stacks)["params"].keys() == stacks["params"].keys()
+    loop = jax.jit(model.windows.scan)(stacks, video())
     jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=2e-5, atol=2e-5), loop, one_by_one)
 
 
@@ -117,7 +120,9 @@ def test_gradients_flow_through_the_cache(small_config, small_variables):
     model = LogVGGT(thawed(small_config))
 
     def loss(images):
-        return jnp.log(Windows(model.config, remat=True).scan(stacked(small_variables), images).depth)[:, -2:].sum()
+        return jnp.log(Windows(model.config, remat=True).scan(stack_layers(small_variables), images).depth)[
+            :, -2:
+        ].sum()
 
     images = jax.jit(jax.grad(loss))(video(8))
     assert np.linalg.norm(images[0, 1]) > 0

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from logvggt_jax import LogVGGT, ModelConfig
+from logvggt_jax import LogVGGT, ModelConfig, RefinementConfig
 from logvggt_jax.model.refinement import num_triggers, trigger_range
 
 WIDTH = 64
@@ -37,6 +37,13 @@ def sequence(model: LogVGGT):
 @functools.lru_cache
 def refine(model: LogVGGT):
     return jax.jit(model.refine)
+
+
+@functools.lru_cache
+def parts(config: ModelConfig):
+    """GCCR and the camera head by themselves: no mode is in them, so that all modes share what they compile."""
+    refinement = LogVGGT(config).refinement
+    return jax.jit(refinement.refine_tokens), jax.jit(refinement.decode_cameras)
 
 
 def full(num_frames: int = FRAMES, batch: int = 1) -> np.ndarray:
@@ -66,7 +73,7 @@ def test_disabled_is_the_camera_head_alone(small_config, small_variables):
     model = with_refinement(small_config, enabled=False)
     camera, register = tokens()
     poses = sequence(model)(small_variables, camera, register, full())
-    close(poses, model.refinement.decode_cameras(small_variables, camera, full()))
+    close(poses, parts(small_config)[1](small_variables, camera, full()))
     with pytest.raises(AssertionError):
         close(poses, sequence(LogVGGT(small_config))(small_variables, camera, register, full()))
 
@@ -125,23 +132,24 @@ def test_periodic_poses_know_the_past_only_and_stay(small_config, small_variable
         assert np.abs(np.asarray(after - before))[:, stop:].max() > 1e-5
 
 
-def by_hand(model: LogVGGT, variables, camera, register) -> np.ndarray:
+def by_hand(config: ModelConfig, settings: RefinementConfig, variables, camera, register) -> np.ndarray:
     """Design of the modes, trigger by trigger and group by group, without masks or fixed shapes."""
-    settings, group = model.config.refinement, model.config.windows.stride
+    refine_tokens, decode_cameras = parts(config)
+    group = config.windows.stride
     num_frames = camera.shape[1]
     refined = camera.copy()
     poses = []
     for trigger in range(num_triggers(num_frames, settings.period)):
         start, stop = trigger_range(trigger, num_frames, settings.period)
         past = register[:, :stop]
-        refined[:, start:stop] = model.refinement.refine_tokens(variables, camera[:, start:stop], past, full(stop))
+        refined[:, start:stop] = refine_tokens(variables, camera[:, start:stop], past, full(stop))
         if settings.context is None:
-            poses.append(model.refinement.decode_cameras(variables, refined[:, :stop], full(stop))[:, start:])
+            poses.append(decode_cameras(variables, refined[:, :stop], full(stop))[:, start:])
             continue
         for first in range(start, stop, group):
             last = min(first + group, stop)
             seen = sorted({0, *range(max(0, last - settings.context), last)})
-            decoded = model.refinement.decode_cameras(variables, refined[:, seen], full(len(seen)))
+            decoded = decode_cameras(variables, refined[:, seen], full(len(seen)))
             poses.append(decoded[:, [seen.index(f) for f in range(first, last)]])
     return np.concatenate(poses, axis=1)
 
@@ -152,7 +160,7 @@ def by_hand(model: LogVGGT, variables, camera, register) -> np.ndarray:
 def test_modes_equal_their_definition(small_config, small_variables, period, context):
     model = with_refinement(small_config, period=period, context=context)
     camera, register = tokens()
-    expected = by_hand(model, small_variables, camera, register)
+    expected = by_hand(small_config, model.config.refinement, small_variables, camera, register)
     close(sequence(model)(small_variables, camera, register, full()), expected)
 
 
@@ -165,7 +173,8 @@ def test_unequal_lengths_equal_items_one_by_one(small_config, small_variables, p
     batch = sequence(model)(small_variables, camera, register, mask)
     for item, length in enumerate(lengths):
         one = slice(item, item + 1)
-        close(batch[one, :length], by_hand(model, small_variables, camera[one, :length], register[one, :length]))
+        alone = small_variables, camera[one, :length], register[one, :length]
+        close(batch[one, :length], by_hand(small_config, model.config.refinement, *alone))
 
 
 def test_memory_grows_at_most_linearly(small_config, small_variables):

@@ -231,7 +231,7 @@ def test_donated_state_holds_no_buffer_twice(small_config, small_variables):
     state = jax.jit(model.start)(small_variables, video(2))
     pointers = [leaf.unsafe_buffer_pointer() for leaf in jax.tree.leaves(state)]
     assert len(set(pointers)) == len(pointers)
-    new_state, _ = jax.jit(model.step, donate_argnums=1)(small_variables, state, video(2))
+    new_state, _ = jax.jit(model.step, donate_argnums=1)(small_variables, state, video(2), np.ones((1, 2), bool))
     assert all(leaf.is_deleted() for leaf in jax.tree.leaves(state))
     assert not any(leaf.is_deleted() for leaf in jax.tree.leaves(new_state))
 

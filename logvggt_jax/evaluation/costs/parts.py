@@ -81,7 +81,7 @@ def sequence_parts(model: LogVGGT, num_frames: int, image_size: tuple[int, int])
 
     state = jax.eval_shape(model.start, variables, images(overlap))
     window = jax.eval_shape(model.windows.encode, variables, images(config.windows.size))
-    tokens = jax.eval_shape(model.windows.attend, variables, state, window, mask(config.windows.size))
+    tokens = jax.eval_shape(model.windows.attend, variables, state, window)
 
     def dense(count: int, calls: int) -> Part:
         key, special = tokens
@@ -93,7 +93,7 @@ def sequence_parts(model: LogVGGT, num_frames: int, image_size: tuple[int, int])
     parts = [
         Part("encoder", model.windows.encode, (images(overlap),), 1),
         Part("encoder", model.windows.encode, (images(stride),), windows),
-        Part("backbone", model.windows.attend, (state, window, mask(config.windows.size)), windows),
+        Part("backbone", model.windows.attend, (state, window), windows),
         dense(stride, windows),
         dense(overlap, 1),
     ]
