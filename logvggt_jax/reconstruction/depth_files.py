@@ -12,23 +12,25 @@ from PIL import Image
 from logvggt_jax.errors import InputError, MissingInput, disk_errors, one_line
 from logvggt_jax.files import atomic_file
 
+_JPEG = (
+    *(cv2.IMWRITE_JPEG_QUALITY, 95),
+    *(cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444),
+)
 
-def as_stored(depth: np.ndarray, confidence: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Depth and confidence [H, W], float32, rounded as `read_depth` will give them back.
 
-    Files keep float16: 11 bits (0.05 % of the depth, finer than the estimate); values beyond its range become
-    65504.
+def write_depth(path: str | Path, depth: np.ndarray, confidence: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Writes an .npz file with `depth` and `confidence`, [H, W] float16.
+
+    That is 11 bits (0.05 % of the depth, finer than the estimate); values beyond its range become 65504. Depth is
+    z-depth in the unit of the trajectory, confidence is at least 1.
+
+    Returns:
+      Depth and confidence as `read_depth` will give them back.
     """
-    return _half(depth).astype(np.float32), _half(confidence).astype(np.float32)
-
-
-def write_depth(path: str | Path, depth: np.ndarray, confidence: np.ndarray) -> None:
-    """Writes an .npz file with `depth` and `confidence`, [H, W] float16 (see `as_stored`).
-
-    Depth is z-depth in the unit of the trajectory, confidence is at least 1.
-    """
+    depth, confidence = _half(depth), _half(confidence)
     with atomic_file(path) as temporary:
-        np.savez(temporary, depth=_half(depth), confidence=_half(confidence))
+        np.savez(temporary, depth=depth, confidence=confidence)
+    return depth.astype(np.float32), confidence.astype(np.float32)
 
 
 def read_depth(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
@@ -56,8 +58,11 @@ def write_picture(path: str | Path, image: np.ndarray) -> None:
 
     JPEG has a quality that keeps nearly every pixel to a few grey levels.
     """
+    pixels = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    suffix = Path(path).suffix
+    _, encoded = cv2.imencode(suffix, pixels, _JPEG if suffix == ".jpg" else ())
     with atomic_file(path) as temporary:
-        Image.fromarray(image).save(temporary, quality=95, subsampling=0)
+        temporary.write_bytes(encoded.tobytes())
 
 
 def read_picture(path: str | Path) -> np.ndarray:

@@ -1,22 +1,25 @@
-"""Coloured point clouds from depth maps, chosen and written frame by frame at constant memory.
+"""Coloured point clouds from depth maps, chosen and written frame by frame.
 
-Two passes. The first sees depth and confidence of every frame and counts, in a histogram of confidences, the points
-that qualify; then the threshold and the exact number of points are known. The second unprojects and writes frame by
-frame.
+A first look at a frame, while depth and image are at hand, counts its candidates in a histogram of confidences and
+keeps a sample of them. When all frames have been seen, threshold and number of points are known, and most frames
+find their share in their sample; only where it is too small, or every point is wanted, the frame is read again.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import re
-from collections.abc import Iterable
+import threading
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from logvggt_jax.errors import InputError, MissingInput, disk_errors
 from logvggt_jax.files import atomic_file
-from logvggt_jax.geometry import unproject
+from logvggt_jax.geometry import unproject_pixels
 
 VERTEX = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")])
 
@@ -26,8 +29,12 @@ _HEADER = (
     + "end_header\n"
 )
 
-# Bins of log(confidence - 1): 0.5 % wide, from a pixel that the model is certain about to one it knows nothing of.
-_BIN_EDGES = np.linspace(-20.0, 20.0, 8001)
+# Confidences are counted as float16, as which they are stored: a bin a value, up to infinity.
+_NUM_BINS = int(np.float16(np.inf).view(np.uint16))
+# Of a sequence, and of a frame; 13 bytes each.
+_MOST_SAMPLES, _FEWEST_SAMPLES = 8_000_000, 64
+# Where a video does not say how long it is.
+_UNKNOWN_FRAMES = 10_000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,100 +74,167 @@ class PointFilter:
         return chosen
 
 
-class PointSelection:
-    """The candidates of a sequence, counted by confidence.
+class FramePoints(NamedTuple):
+    """Pixels of one frame and what lies there.
 
-    Call `count` for every frame, then `choose` for every frame in the same order.
+    Attributes:
+      indices: [n] flat pixel indices.
+      depth: [n] float32 z-depth.
+      colours: [n, 3] uint8 RGB.
     """
 
-    def __init__(self, point_filter: PointFilter) -> None:
+    indices: np.ndarray
+    depth: np.ndarray
+    colours: np.ndarray
+
+    def at(self, places: np.ndarray) -> FramePoints:
+        """The points at these places of the list."""
+        return FramePoints(self.indices[places], self.depth[places], self.colours[places])
+
+
+class _Sample(NamedTuple):
+    """The first candidates that a frame's random order meets, with their bins, and how many it has in all."""
+
+    points: FramePoints
+    bins: np.ndarray
+    candidates: int
+
+
+class PointSelection:
+    """Chooses a sequence's points.
+
+    Call `see` for every frame; then `choose` for every frame. Both may be called in any order and by several
+    threads, and what is chosen does not depend on that. What follows from all frames is worked out once, when it is
+    first asked for.
+
+    Args:
+      point_filter: which pixels become points.
+      expected_frames: length of the sequence if it is known; sets the size of samples.
+    """
+
+    def __init__(self, point_filter: PointFilter, expected_frames: int | None) -> None:
         self._filter = point_filter
-        self._histogram = np.zeros(len(_BIN_EDGES) + 1, np.int64)
-        self._passed = 0
-        self._frame = 0
+        # Twice what a mean frame will hand out, since frames differ.
+        wanted = 2 * (point_filter.max_points or 0) / (1 - point_filter.confidence_percentile / 100)
+        kept = min(wanted, _MOST_SAMPLES) / max(expected_frames or _UNKNOWN_FRAMES, 1)
+        self._sample_size = max(int(kept), _FEWEST_SAMPLES)
+        self._histogram = np.zeros(_NUM_BINS, np.int64)
+        self._samples: dict[int, _Sample] = {}
+        self._lock = threading.Lock()
 
-    def count(self, depth: np.ndarray, confidence: np.ndarray) -> None:
-        """First pass over a frame: depth and confidence [H, W]."""
-        bins = _confidence_bin(confidence[self._filter.candidates(depth, confidence)])
-        self._histogram += np.bincount(bins, minlength=len(self._histogram))
+    def see(self, frame: int, depth: np.ndarray, confidence: np.ndarray, image: np.ndarray) -> None:
+        """First look at a frame.
 
-    @property
+        Args:
+          frame: its number, which seeds what is left to chance.
+          depth: [H, W].
+          confidence: [H, W].
+          image: [H, W, 3] uint8 RGB.
+        """
+        candidates = self._filter.candidates(depth, confidence).reshape(-1)
+        counts = np.bincount(_bins(confidence, np.flatnonzero(candidates)), minlength=_NUM_BINS)
+        # Walking further than this costs more than reading the frame again, where that should be needed.
+        order = _random_order(frame, depth.size)[: 4 * self._sample_size]
+        indices = order[candidates[order]][: self._sample_size]
+        sample = _Sample(_points(depth, image, indices), _bins(confidence, indices), int(counts.sum()))
+        with self._lock:
+            self._histogram += counts
+            self._samples[frame] = sample
+
+    @functools.cached_property
     def threshold_bin(self) -> int:
         """Points of lower bins are left out; the largest bin that leaves out at most the percentile."""
         below = np.concatenate([[0], np.cumsum(self._histogram)[:-1]])
         allowed = self._histogram.sum() * self._filter.confidence_percentile / 100
         return int(np.flatnonzero(below <= allowed)[-1])
 
-    @property
+    @functools.cached_property
     def num_qualified(self) -> int:
         """Candidates at or above the threshold."""
         return int(self._histogram[self.threshold_bin :].sum())
 
-    @property
+    @functools.cached_property
     def num_points(self) -> int:
-        """Points that `choose` hands out over all frames."""
+        """The most points that `choose` hands out over all frames; a few less where frames are too poor for theirs."""
         limit = self._filter.max_points
         return self.num_qualified if limit is None else min(self.num_qualified, limit)
 
-    def choose(self, depth: np.ndarray, confidence: np.ndarray) -> np.ndarray:
-        """Second pass over a frame: flat indices of its points, increasing."""
-        chosen = self._filter.candidates(depth, confidence)
-        indices = np.flatnonzero(chosen)
-        indices = indices[_confidence_bin(confidence.reshape(-1)[indices]) >= self.threshold_bin]
-        before, self._passed = self._passed, self._passed + len(indices)
-        self._frame += 1
-        if self.num_points == self.num_qualified:
-            return indices
-        # Shares rounded on the running total add up to num_points exactly.
-        quota = self._share(self._passed) - self._share(before)
-        picked = np.random.default_rng(self._frame).choice(len(indices), quota, replace=False)
-        return indices[np.sort(picked)]
+    @functools.cached_property
+    def _quotas(self) -> dict[int, int]:
+        """Points of each frame, where there have to be less than qualify: by what its sample says of it."""
+        frames = sorted(self._samples)
+        samples = [self._samples[frame] for frame in frames]
+        qualified = [
+            np.mean(sample.bins >= self.threshold_bin) * sample.candidates if len(sample.bins) else 0.0
+            for sample in samples
+        ]
+        total = np.cumsum(qualified)
+        # Shares rounded on the running total add up exactly.
+        shares = np.floor(total / max(total[-1], 1e-9) * self.num_points).astype(int)
+        return dict(zip(frames, np.diff(shares, prepend=0).tolist(), strict=True))
 
-    def _share(self, passed: int) -> int:
-        return passed * self.num_points // self.num_qualified
+    def choose(self, frame: int, read: Callable[[], tuple[np.ndarray, np.ndarray, np.ndarray]]) -> FramePoints:
+        """The points of a frame, in the order of its pixels; `read` gives what `see` was given, if need be."""
+        if self.num_points < self.num_qualified:
+            quota, sample = self._quotas[frame], self._samples[frame]
+            places = np.flatnonzero(sample.bins >= self.threshold_bin)[:quota]
+            if len(places) == quota or len(sample.bins) == sample.candidates:
+                return sample.points.at(places[np.argsort(sample.points.indices[places])])
+        depth, confidence, image = read()
+        indices = np.flatnonzero(self._filter.candidates(depth, confidence))
+        indices = indices[_bins(confidence, indices) >= self.threshold_bin]
+        if self.num_points < self.num_qualified:
+            qualified = np.zeros(depth.size, bool)
+            qualified[indices] = True
+            order = _random_order(frame, depth.size)
+            indices = np.sort(order[qualified[order]][:quota])
+        return _points(depth, image, indices)
 
 
 def frame_vertices(
-    depth: np.ndarray, image: np.ndarray, intrinsics: np.ndarray, extrinsics: np.ndarray, indices: np.ndarray
+    points: FramePoints, size: tuple[int, int], intrinsics: np.ndarray, extrinsics: np.ndarray
 ) -> np.ndarray:
-    """Coloured points [n] of dtype `VERTEX` of the pixels `indices` of one frame.
+    """Coloured points [n] of dtype `VERTEX` in the world.
 
     Args:
-      depth: [H, W] z-depth.
-      image: [H, W, 3] uint8 RGB of the same pixels.
-      intrinsics: [3, 3] in these pixels.
-      extrinsics: [3|4, 4] world-to-camera; the points are in the world.
-      indices: [n] flat pixel indices.
+      points: [n] of one frame, in the order of its pixels.
+      size: (H, W) of the frame.
+      intrinsics: [3, 3] in its pixels.
+      extrinsics: [3|4, 4] world-to-camera.
     """
-    points = unproject(depth.astype(np.float64), intrinsics.astype(np.float64), extrinsics.astype(np.float64))
-    points, colours = points.reshape(-1, 3)[indices], image.reshape(-1, 3)[indices]
-    vertices = np.empty(len(indices), VERTEX)
+    depth = np.zeros(size, np.float32)
+    depth.reshape(-1)[points.indices] = points.depth
+    positions = unproject_pixels(depth[None], intrinsics[None], extrinsics[None], points.indices)
+    vertices = np.empty(len(positions), VERTEX)
     for axis, name in enumerate("xyz"):
-        vertices[name] = points[:, axis]
+        vertices[name] = positions[:, axis]
     for channel, name in enumerate(("red", "green", "blue")):
-        vertices[name] = colours[:, channel]
+        vertices[name] = points.colours[:, channel]
     return vertices
 
 
-def write_points(path: str | Path, count: int, frames: Iterable[np.ndarray]) -> None:
-    """Writes `count` vertices, frame by frame, as a binary PLY file.
+def write_points(path: str | Path, most: int, frames: Iterable[np.ndarray]) -> None:
+    """Writes vertices, frame by frame, as a binary PLY file.
 
     Args:
       path: the PLY file.
-      count: of all vertices.
+      most: number of vertices at most.
       frames: arrays [n] of dtype `VERTEX`; each is written before the next is asked for.
 
     Raises:
-      ValueError: `frames` hold another number of vertices.
+      ValueError: `frames` hold more vertices.
     """
     written = 0
     with atomic_file(path) as temporary, temporary.open("wb") as stream:
-        stream.write(_HEADER.format(count=count).encode())
+        stream.write(_HEADER.format(count=most).encode())
         for vertices in frames:
-            stream.write(vertices.astype(VERTEX, copy=False).tobytes())
+            stream.write(vertices.data)
             written += len(vertices)
-        if written != count:
-            raise ValueError(f"{path}: {count} vertices announced, {written} given")
+        if written > most:
+            raise ValueError(f"{path}: {most} vertices announced, {written} given")
+        stream.seek(0)
+        # As long as before: readers skip blanks.
+        stream.write(_HEADER.format(count=str(written).rjust(len(str(most)))).encode())
 
 
 def count_points(path: str | Path) -> int:
@@ -186,18 +260,33 @@ def _stored_points(path: Path) -> np.ndarray:
         raise MissingInput(f"{path} does not exist: expected the output of `logvggt reconstruct`")
     with disk_errors(path), path.open("rb") as stream:
         start = stream.read(2 * len(_HEADER))
-    match = re.search(rb"element vertex (\d+)\n", start)
+    match = re.search(rb"element vertex ( *\d+)\n", start)
     count = int(match[1]) if match else 0
-    header = _HEADER.format(count=count).encode()
+    header = _HEADER.format(count=match[1].decode() if match else "").encode()
     size = len(header) + count * VERTEX.itemsize
     if not start.startswith(header) or path.stat().st_size != size:
         raise InputError(f"{path} is not a point cloud of this program, or is cut off; reconstruct again")
     return np.memmap(path, VERTEX, "r", len(header), (count,)) if count else np.empty(0, VERTEX)
 
 
-def _confidence_bin(confidence: np.ndarray) -> np.ndarray:
-    excess = np.maximum(confidence.astype(np.float64) - 1.0, 1e-30)
-    return np.searchsorted(_BIN_EDGES, np.log(excess), side="right")
+def _points(depth: np.ndarray, image: np.ndarray, indices: np.ndarray) -> FramePoints:
+    return FramePoints(indices, depth.reshape(-1)[indices], image.reshape(-1, 3)[indices])
+
+
+def _bins(confidence: np.ndarray, indices: np.ndarray) -> np.ndarray:
+    """Bins [n] of the confidences of some pixels."""
+    values = np.clip(confidence.reshape(-1)[indices], 0.0, np.finfo(np.float16).max)
+    return values.astype(np.float16).view(np.uint16)
+
+
+@functools.lru_cache(4)
+def _permutation(count: int) -> np.ndarray:
+    return np.random.default_rng(0).permutation(count).astype(np.int32)
+
+
+def _random_order(frame: int, count: int) -> np.ndarray:
+    """All pixels [count] in an order of chance, another for each frame: one permutation, begun anywhere."""
+    return np.roll(_permutation(count), np.random.default_rng(frame).integers(count))
 
 
 def _edges(depth: np.ndarray, threshold: float) -> np.ndarray:

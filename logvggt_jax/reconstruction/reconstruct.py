@@ -5,11 +5,12 @@ from __future__ import annotations
 import dataclasses
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from rich.console import Console
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -21,15 +22,17 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from logvggt_jax.data.feeding.transforms import LONGER_EDGE, ResizeTransform, check_longer_edge, preprocess
+from logvggt_jax.data.feeding.transforms import LONGER_EDGE, ResizeTransform, check_longer_edge, resize
 from logvggt_jax.errors import InputError
 from logvggt_jax.files import atomic_folder, check_output
 from logvggt_jax.geometry import decode_poses
 from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE, write_cameras
 from logvggt_jax.reconstruction.depth_files import depth_picture, write_depth, write_picture
-from logvggt_jax.reconstruction.exporters import EXPORTERS
-from logvggt_jax.reconstruction.point_cloud import PointFilter
+from logvggt_jax.reconstruction.exporters.ply import write_cloud
+from logvggt_jax.reconstruction.exporters.tum import export_tum
+from logvggt_jax.reconstruction.frame_pool import FramePool
+from logvggt_jax.reconstruction.point_cloud import PointFilter, PointSelection
 from logvggt_jax.reconstruction.result import (
     DEPTH_FOLDER,
     IMAGE_FOLDER,
@@ -40,7 +43,7 @@ from logvggt_jax.reconstruction.result import (
     depth_file,
     image_file,
 )
-from logvggt_jax.reconstruction.sources import Source, open_source, read_ahead
+from logvggt_jax.reconstruction.sources import Source, SourceFrame, open_source
 from logvggt_jax.streaming import Cameras, FrameResult, Predictor, open_predictor
 
 _NARROWEST_FIELD_OF_VIEW = 0.01  # radians
@@ -83,11 +86,13 @@ def reconstruct(
     num_previews: int = 8,
     overwrite: bool = False,
     progress: bool = True,
+    workers: int | None = None,
 ) -> Reconstruction:
     """Reconstructs a sequence and writes cameras, trajectory, depth and points.
 
-    Frames are read once, as they are needed, and kept at the model's size; depth maps are written as they become
-    final. Memory on the host is constant but for the cameras, memory on the device is the method's.
+    Frames are read once, ahead of the model, and kept at its size; depth maps are written as they become final. All
+    that is not the model is done by worker threads, whose number changes no result. Memory on the host is constant
+    but for the cameras and at most 104 MB of candidates for the point cloud, memory on the device is the method's.
 
     Args:
       source_path: folder of images or video, see `open_source`.
@@ -103,31 +108,70 @@ def reconstruct(
       point_filter: which pixels become points.
       num_previews: pictures of frames beside their depth, evenly over the sequence.
       overwrite: replace an earlier reconstruction.
-      progress: show progress bars.
+      progress: show a progress bar on standard error.
+      workers: threads beside the one that feeds the device; None for one a core, at most eight.
 
     Raises:
       OutputExists: `output` exists.
       InputError: bad source or parameters, or a sequence that the method cannot predict; nothing is left behind.
     """
+    return reconstruct_with(
+        lambda: open_predictor(method, model, variables, settings),
+        source_path,
+        output,
+        longer_edge=longer_edge,
+        stride=stride,
+        max_frames=max_frames,
+        point_filter=point_filter,
+        num_previews=num_previews,
+        overwrite=overwrite,
+        progress=progress,
+        workers=workers,
+    )
+
+
+def reconstruct_with(
+    start: Callable[[], Predictor],
+    source_path: str | Path,
+    output: str | Path,
+    *,
+    longer_edge: int = LONGER_EDGE,
+    stride: int = 1,
+    max_frames: int | None = None,
+    point_filter: PointFilter | None = None,
+    num_previews: int = 8,
+    overwrite: bool = False,
+    progress: bool = True,
+    workers: int | None = None,
+) -> Reconstruction:
+    """As `reconstruct`, with the predictor that `start` opens."""
     if num_previews < 0:
         raise InputError(f"num_previews must not be negative, got {num_previews}")
     source = check_request(
         source_path, output, longer_edge=longer_edge, stride=stride, max_frames=max_frames, overwrite=overwrite
     )
     target = Path(output).expanduser().resolve()
-    with atomic_folder(target, replace=overwrite) as folder:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Rate(), TimeRemainingColumn())
+    bars = Progress(*columns, console=Console(stderr=True), disable=not progress)
+    with atomic_folder(target, replace=overwrite) as folder, FramePool(workers) as pool, bars:
         for name in (DEPTH_FOLDER, IMAGE_FOLDER, PREVIEW_FOLDER):
             (folder / name).mkdir()
+        task = bars.add_task("Depth and cameras", total=source.expected_frames)
         started = time.monotonic()
-        predictor = open_predictor(method, model, variables, settings)
-        sequence, cameras = _stream(source, folder, predictor, longer_edge, progress=progress)
+        selection = PointSelection(point_filter or PointFilter(), source.expected_frames)
+        predictor = start()
+        sequence = _stream(
+            source, folder, predictor, pool, selection, longer_edge=longer_edge, advance=lambda: bars.advance(task)
+        )
         seconds = time.monotonic() - started
-        _write_all_cameras(folder, sequence, cameras)
+        _write_all_cameras(folder, sequence, predictor.cameras())
         result = Reconstruction.with_cameras_of(folder)
         for index in set(np.linspace(0, result.num_frames - 1, num_previews).round().astype(int).tolist()):
-            _write_preview(result, index)
-        EXPORTERS["tum"](result, folder / TRAJECTORY_FILE)
-        EXPORTERS["ply"](result, folder / POINTS_FILE, point_filter=point_filter, progress=progress)
+            pool.submit(_write_preview, result, index)
+        export_tum(result, folder / TRAJECTORY_FILE)
+        bars.reset(task, description="Points", total=result.num_frames)
+        write_cloud(result, folder / POINTS_FILE, selection, pool, advance=lambda: bars.advance(task))
+        pool.finish()
     return dataclasses.replace(result, folder=target, seconds=seconds)
 
 
@@ -155,41 +199,50 @@ class _Rate(ProgressColumn):
         return Text(f"{speed:.2f} frames/s")
 
 
-def _pictures(source: Source, longer_edge: int) -> Iterator[_Picture]:
-    for frame in source:
-        images, transform = preprocess([frame.image], longer_edge=longer_edge)
-        # Resizing rounds to grey levels, so that bytes lose nothing and travel at a quarter of the size.
-        picture = np.rint(images[0] * 255.0).astype(np.uint8)
-        yield _Picture(frame.name, frame.timestamp, picture, transform)
-
-
 def _stream(
-    source: Source, folder: Path, predictor: Predictor, longer_edge: int, *, progress: bool
-) -> tuple[_Sequence, Cameras]:
-    """Depth and images to disk, as they become final and as they come; cameras at the end."""
+    source: Source,
+    folder: Path,
+    predictor: Predictor,
+    pool: FramePool,
+    selection: PointSelection,
+    *,
+    longer_edge: int,
+    advance: Callable[[], object],
+) -> _Sequence:
+    """The whole sequence through the predictor; images and depth go to disk, and the selection sees all."""
     names: list[str] = []
     timestamps: list[float] = []
     transform = None
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Rate(), TimeRemainingColumn())
-    with Progress(*columns, disable=not progress) as bars:
-        task = bars.add_task("Depth and cameras", total=source.expected_frames)
 
-        def save(results: list[FrameResult]) -> None:
-            for result in results:
-                write_depth(depth_file(folder, names[result.index]), result.depth, result.confidence)
-                bars.advance(task)
+    def prepare(load: Callable[[], SourceFrame]) -> _Picture:
+        frame = load()
+        image, transform = resize(frame.image, longer_edge=longer_edge)
+        write_picture(image_file(folder, frame.name), image)
+        return _Picture(frame.name, frame.timestamp, image, transform)
 
-        for picture in read_ahead(_pictures(source, longer_edge)):
-            names.append(picture.name)
-            timestamps.append(picture.timestamp)
-            transform = picture.transform
-            write_picture(image_file(folder, picture.name), picture.image)
-            save(predictor.push(picture.image))
-        save(predictor.close())
-        bars.update(task, total=len(names))
+    # Frames whose depth is not final yet.
+    images: dict[int, np.ndarray] = {}
+
+    def save(name: str, image: np.ndarray, result: FrameResult) -> None:
+        stored = write_depth(depth_file(folder, name), result.depth, result.confidence)
+        selection.see(result.index, *stored, image)
+
+    def hand_on(results: list[FrameResult]) -> None:
+        for result in results:
+            pool.submit(save, names[result.index], images.pop(result.index), result)
+            advance()
+
+    for picture in pool.map(prepare, source.loaders()):
+        images[len(names)] = picture.image
+        names.append(picture.name)
+        timestamps.append(picture.timestamp)
+        transform = picture.transform
+        hand_on(predictor.push(picture.image))
+    hand_on(predictor.close())
+    pool.finish()
     if transform is None:
         raise InputError(f"{source.path} gave no frame")
-    return _Sequence(names, timestamps, transform), predictor.cameras()
+    return _Sequence(names, timestamps, transform)
 
 
 def _write_all_cameras(folder: Path, sequence: _Sequence, cameras: Cameras) -> None:

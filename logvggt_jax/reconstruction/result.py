@@ -97,11 +97,15 @@ class Reconstruction:
 
     def depth(self, index: int) -> np.ndarray:
         """Depth of a frame, [h, w] float32: z-depth in the unit of the extrinsics."""
-        return read_depth(depth_file(self.folder, self.names[index]))[0]
+        return self.depth_and_confidence(index)[0]
 
     def confidence(self, index: int) -> np.ndarray:
         """Confidence of a frame's depth, [h, w] float32, at least 1."""
-        return read_depth(depth_file(self.folder, self.names[index]))[1]
+        return self.depth_and_confidence(index)[1]
+
+    def depth_and_confidence(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        """Both of one frame, in one reading."""
+        return read_depth(depth_file(self.folder, self.names[index]))
 
     def image(self, index: int) -> np.ndarray:
         """A frame as the model saw it, [h, w, 3] uint8 RGB, to the few grey levels that JPEG costs."""

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -17,8 +17,6 @@ from logvggt_jax.errors import InputError, MissingInput, disk_errors
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 SEVEN_SCENES_COLOUR = (".color.png", ".color.jpg")
-
-Item = TypeVar("Item")
 
 
 class SourceFrame(NamedTuple):
@@ -83,17 +81,28 @@ class FolderSource:
         return len(self)
 
     def __iter__(self) -> Iterator[SourceFrame]:
-        first: tuple[Path, tuple[int, ...]] | None = None
-        for timestamp, name, file in self._frames:
-            with disk_errors(file):
-                image = read_rgb(file)
-            first = first or (file, image.shape)
-            if image.shape != first[1]:
-                raise InputError(
-                    f"{file} is {_size(image.shape)} pixels but {first[0].name} is {_size(first[1])}: all frames "
-                    "of a sequence need one size; resize them or put them into folders of their own"
-                )
-            yield SourceFrame(name, timestamp, image)
+        return (load() for load in self.loaders())
+
+    def loaders(self) -> Iterator[Callable[[], SourceFrame]]:
+        """What reads each frame, in order. Loaders may be called in any thread and at the same time."""
+        first = self._load(self._frames[0])
+        shape = first.image.shape
+        yield partial(_itself, first)
+        del first
+        for entry in self._frames[1:]:
+            yield partial(self._load, entry, shape)
+
+    def _load(self, entry: tuple[float, str, Path], shape: tuple[int, ...] | None = None) -> SourceFrame:
+        """The frame of an entry; its image has the `shape` of the first."""
+        timestamp, name, file = entry
+        with disk_errors(file):
+            image = read_rgb(file)
+        if shape is not None and image.shape != shape:
+            raise InputError(
+                f"{file} is {_size(image.shape)} pixels but {self._frames[0][2].name} is {_size(shape)}: all frames "
+                "of a sequence need one size; resize them or put them into folders of their own"
+            )
+        return SourceFrame(name, timestamp, image)
 
 
 class VideoSource:
@@ -129,6 +138,10 @@ class VideoSource:
         return sampled if self._max_frames is None else min(sampled, self._max_frames)
 
     def __iter__(self) -> Iterator[SourceFrame]:
+        return (load() for load in self.loaders())
+
+    def loaders(self) -> Iterator[Callable[[], SourceFrame]]:
+        """What finishes each frame, in order; the iteration itself decodes, which a video allows one by one only."""
         capture = self._open()
         position = taken = 0
         try:
@@ -140,12 +153,15 @@ class VideoSource:
                     decoded, image = capture.retrieve()
                     if not decoded:
                         raise InputError(f"{self.path}: frame {position} cannot be decoded; re-encode the video")
-                    rgb = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-                    yield SourceFrame(f"frame-{position:06d}", position / self._rate, rgb)
+                    yield partial(self._frame, position, image)
                     taken += 1
                 position += 1
         finally:
             capture.release()
+
+    def _frame(self, position: int, image: np.ndarray) -> SourceFrame:
+        rgb = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+        return SourceFrame(f"frame-{position:06d}", position / self._rate, rgb)
 
     def _open(self) -> cv2.VideoCapture:
         capture = cv2.VideoCapture(str(self.path))
@@ -192,13 +208,8 @@ def open_source(path: str | Path, *, stride: int = 1, max_frames: int | None = N
     return VideoSource(path, stride=stride, max_frames=max_frames)
 
 
-def read_ahead(items: Iterator[Item]) -> Iterator[Item]:
-    """The same items, each read in a thread while the one before is in use; at most two are alive."""
-    with ThreadPoolExecutor(1, thread_name_prefix="frames") as pool:
-        pending = pool.submit(next, items, None)
-        while (item := pending.result()) is not None:
-            pending = pool.submit(next, items, None)
-            yield item
+def _itself(frame: SourceFrame) -> SourceFrame:
+    return frame
 
 
 def _check_sampling(stride: int, max_frames: int | None) -> None:

@@ -11,6 +11,7 @@ import trimesh
 from logvggt_jax.errors import InputError
 from logvggt_jax.reconstruction.point_cloud import (
     VERTEX,
+    FramePoints,
     PointFilter,
     PointSelection,
     count_points,
@@ -20,19 +21,28 @@ from logvggt_jax.reconstruction.point_cloud import (
 )
 
 
-def random_frames(count: int = 5) -> list[tuple[np.ndarray, np.ndarray]]:
+def random_frames(count: int = 5) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Depth, confidence and image of some frames."""
     generator = np.random.default_rng(0)
     shape = (count, 24, 32)
     depth = generator.uniform(1, 1.05, shape).astype(np.float32)
     confidence = (1 + np.exp(generator.normal(0, 2, shape))).astype(np.float32)
-    return list(zip(depth, confidence, strict=True))
+    return list(zip(depth, confidence, generator.integers(0, 256, (*shape, 3), np.uint8), strict=True))
 
 
-def select(point_filter: PointFilter, frames: list) -> tuple[PointSelection, list[np.ndarray]]:
-    selection = PointSelection(point_filter)
-    for depth, confidence in frames:
-        selection.count(depth, confidence)
-    return selection, [selection.choose(depth, confidence) for depth, confidence in frames]
+def select(
+    point_filter: PointFilter, frames: list, *, expected_frames: int | None = 5, seed: int = 0
+) -> tuple[PointSelection, list[FramePoints]]:
+    """The selection and each frame's points; frames are seen and asked for in some order, as threads do."""
+    selection = PointSelection(point_filter, expected_frames)
+    generator = np.random.default_rng(seed)
+    for index in generator.permutation(len(frames)).tolist():
+        selection.see(index, *frames[index])
+    chosen = {
+        index: selection.choose(index, lambda i=index: frames[i])
+        for index in generator.permutation(len(frames)).tolist()
+    }
+    return selection, [chosen[index] for index in range(len(frames))]
 
 
 def test_points_are_the_unprojected_pixels_with_their_colours() -> None:
@@ -43,7 +53,9 @@ def test_points_are_the_unprojected_pixels_with_their_colours() -> None:
     angle = 0.3
     rotation = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
     extrinsics = np.concatenate([rotation, [[0.5], [-1], [2]]], axis=1)
-    vertices = frame_vertices(depth, image, intrinsics, extrinsics, np.array([0, 9, 23]))
+    indices = np.array([0, 9, 23])
+    points = FramePoints(indices, depth.reshape(-1)[indices], image.reshape(-1, 3)[indices])
+    vertices = frame_vertices(points, depth.shape, intrinsics, extrinsics)
     for vertex, (row, column) in zip(vertices, [(0, 0), (1, 3), (3, 5)], strict=True):
         z = depth[row, column]
         camera = np.array([(column - 3) * z / 5, (row - 2) * z / 6, z])
@@ -89,10 +101,19 @@ def test_other_and_damaged_files_are_named(tmp_path: Path) -> None:
             count_points(path)
 
 
-@pytest.mark.parametrize("announced", [2, 4])
-def test_a_wrong_number_of_points_leaves_no_file(tmp_path: Path, announced: int) -> None:
-    with pytest.raises(ValueError, match=f"{announced} vertices announced, 3 given"):
-        write_points(tmp_path / "p.ply", announced, [np.zeros(3, VERTEX)])
+@pytest.mark.parametrize("most", [3, 4, 99, 100, 12345])
+def test_fewer_points_than_announced_are_a_file_of_that_many(tmp_path: Path, most: int) -> None:
+    vertices = np.zeros(3, VERTEX)
+    vertices["x"] = [1, 2, 3]
+    write_points(tmp_path / "p.ply", most, [vertices])
+    assert count_points(tmp_path / "p.ply") == 3
+    for points in (read_points(tmp_path / "p.ply")[0], trimesh.load(tmp_path / "p.ply").vertices):
+        np.testing.assert_array_equal(points[:, 0], [1, 2, 3])
+
+
+def test_more_points_than_announced_leave_no_file(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="2 vertices announced, 3 given"):
+        write_points(tmp_path / "p.ply", 2, [np.zeros(3, VERTEX)])
     assert list(tmp_path.iterdir()) == []
 
 
@@ -115,33 +136,80 @@ def test_each_frame_is_written_before_the_next_is_made(tmp_path: Path) -> None:
 
 def test_percentile_leaves_out_the_least_confident() -> None:
     frames = random_frames()
-    confidence = np.concatenate([c.reshape(-1) for _, c in frames])
+    confidence = np.concatenate([c.reshape(-1) for _, c, _ in frames])
     selection, chosen = select(PointFilter(40, edge_threshold=None, max_points=None), frames)
-    kept = np.concatenate([c.reshape(-1)[i] for (_, c), i in zip(frames, chosen, strict=True)])
+    kept = np.concatenate([c.reshape(-1)[p.indices] for (_, c, _), p in zip(frames, chosen, strict=True)])
     assert len(kept) == selection.num_points
     assert abs(len(kept) / len(confidence) - 0.6) < 0.01
-    assert kept.min() >= np.quantile(confidence, 0.4) * 0.99
+    # To the 11 bits that files keep.
+    assert kept.min() >= np.quantile(confidence, 0.4) * (1 - 2**-11)
 
 
 def test_equal_confidences_are_all_kept() -> None:
-    frames = [(np.ones((4, 5), np.float32), np.ones((4, 5), np.float32))] * 2
+    ones = np.ones((4, 5), np.float32)
+    frames = [(ones, ones, np.zeros((4, 5, 3), np.uint8))] * 2
     selection, chosen = select(PointFilter(50, max_points=None), frames)
-    assert selection.num_points == sum(map(len, chosen)) == 40
+    assert selection.num_points == sum(len(points.indices) for points in chosen) == 40
 
 
 @pytest.mark.parametrize("limit", [1, 100, 1234, 10**6])
-def test_thinning_gives_exactly_the_announced_number_evenly(limit: int) -> None:
+def test_thinning_gives_the_announced_number_evenly(limit: int) -> None:
     frames = random_frames()
     point_filter = PointFilter(10, max_points=limit)
     selection, chosen = select(point_filter, frames)
-    counts = [len(indices) for indices in chosen]
+    counts = [len(points.indices) for points in chosen]
     assert sum(counts) == selection.num_points == min(limit, selection.num_qualified)
     if limit == 1234:
         assert max(counts) - min(counts) < 0.1 * max(counts)
-    for indices in chosen:
-        assert (np.diff(indices) > 0).all()
-    for again, before in zip(select(point_filter, frames)[1], chosen, strict=True):
-        np.testing.assert_array_equal(again, before)
+    for (depth, confidence, image), points in zip(frames, chosen, strict=True):
+        assert (np.diff(points.indices) > 0).all()
+        np.testing.assert_array_equal(points.depth, depth.reshape(-1)[points.indices])
+        np.testing.assert_array_equal(points.colours, image.reshape(-1, 3)[points.indices])
+        assert confidence.reshape(-1)[points.indices].min(initial=9) >= np.quantile(confidence, 0.08)
+    for again, before in zip(select(point_filter, frames, seed=1)[1], chosen, strict=True):
+        np.testing.assert_array_equal(again.indices, before.indices)
+
+
+def test_frames_are_read_again_only_where_their_sample_is_too_small() -> None:
+    """A quarter of the frames holds every candidate: four times the points of a mean frame, twice its sample."""
+    frames = random_frames(40)
+    for depth, _, _ in frames[:30]:
+        depth[:] = 0
+    selection = PointSelection(PointFilter(0, edge_threshold=None, max_points=4000), 40)
+    read: list[int] = []
+    for index, frame in enumerate(frames):
+        selection.see(index, *frame)
+    chosen = [selection.choose(index, lambda i=index: read.append(i) or frames[i]) for index in range(40)]
+    assert [len(points.indices) for points in chosen] == [0] * 30 + [400] * 10
+    assert read == list(range(30, 40))
+
+
+def test_points_of_a_sample_are_those_of_the_whole_frame() -> None:
+    frames = random_frames(20)
+    point_filter = PointFilter(25, max_points=2000)
+
+    def refuse() -> tuple:
+        raise AssertionError("read again")
+
+    selection, _ = select(point_filter, frames, expected_frames=20)
+    sampled = [selection.choose(index, refuse) for index in range(20)]
+    # Samples of 64 hold no hundred points.
+    _, whole = select(point_filter, frames, expected_frames=None)
+    assert sum(len(points.indices) for points in sampled) == sum(len(points.indices) for points in whole) == 2000
+    for one, other in zip(sampled, whole, strict=True):
+        # Samples say a little else of how many points a frame should have, and nothing of which come first.
+        few, many = sorted((set(one.indices.tolist()), set(other.indices.tolist())), key=len)
+        assert few <= many and len(few) > 0.7 * len(many)
+
+
+def test_which_pixels_are_chosen_is_left_to_chance() -> None:
+    """Every pixel of the picture is as likely, and frames of the same depth give different pixels."""
+    ones, image = np.ones((24, 32), np.float32), np.zeros((24, 32, 3), np.uint8)
+    _, chosen = select(PointFilter(0, max_points=76 * 100), [(ones, ones, image)] * 100, expected_frames=100)
+    counts = np.bincount(np.concatenate([points.indices for points in chosen]), minlength=768)
+    assert counts.sum() == 7600 and counts.max() < 30
+    assert np.abs(counts.reshape(4, -1).sum(1) - 1900).max() < 200
+    assert len({points.indices.tobytes() for points in chosen}) > 90
 
 
 def test_stride_invalid_depth_and_edges() -> None:
@@ -159,10 +227,10 @@ def test_stride_invalid_depth_and_edges() -> None:
 
 
 def test_nothing_valid_gives_no_points() -> None:
-    frames = [(np.zeros((4, 5), np.float32), np.ones((4, 5), np.float32))]
+    frames = [(np.zeros((4, 5), np.float32), np.ones((4, 5), np.float32), np.zeros((4, 5, 3), np.uint8))]
     selection, chosen = select(PointFilter(), frames)
     assert selection.num_points == 0
-    assert chosen[0].size == 0
+    assert chosen[0].indices.size == 0
 
 
 @pytest.mark.parametrize(

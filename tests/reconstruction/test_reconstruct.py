@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import threading
 import weakref
 from pathlib import Path
 
@@ -11,18 +12,20 @@ import numpy as np
 import pytest
 
 from logvggt_jax import LogVGGT, ModelConfig
-from logvggt_jax.data.feeding.transforms import preprocess
+from logvggt_jax.data.feeding.transforms import preprocess, resize
+from logvggt_jax.errors import DiskError
 from logvggt_jax.geometry import decode_poses, unproject
 from logvggt_jax.reconstruction.cameras_file import read_cameras
-from logvggt_jax.reconstruction.depth_files import as_stored, read_depth
+from logvggt_jax.reconstruction.depth_files import read_depth
 from logvggt_jax.reconstruction.exporters.tum import read_trajectory
 from logvggt_jax.reconstruction.point_cloud import PointFilter, count_points
-from logvggt_jax.reconstruction.reconstruct import reconstruct
+from logvggt_jax.reconstruction.reconstruct import reconstruct, reconstruct_with
 from logvggt_jax.reconstruction.result import Reconstruction
 from logvggt_jax.reconstruction.room_sequence import write_room_sequence
 from logvggt_jax.reconstruction.sources import open_source
 from logvggt_jax.streaming.chunks import ChunkPlan
 from logvggt_jax.streaming.offline import predict_plain
+from logvggt_jax.streaming.results import Cameras, FrameResult, decoded_cameras
 from logvggt_jax.streaming.windows import StreamSession
 
 # The package exports a function of the module's name.
@@ -70,17 +73,21 @@ def result(model: LogVGGT, variables: dict, room: Path, tmp_path_factory: pytest
     )
 
 
+def as_stored(values: np.ndarray) -> np.ndarray:
+    """Values as files keep them: float16, within its range."""
+    return np.clip(values, -65504, 65504).astype(np.float16).astype(np.float32)
+
+
 @pytest.fixture(scope="module")
 def expected(model: LogVGGT, variables: dict, room: Path) -> dict[str, np.ndarray]:
     images, transform = preprocess([frame.image for frame in open_source(room)], longer_edge=LONGER_EDGE)
     session = StreamSession(model, variables)
     results = session.push(np.rint(images * 255).astype(np.uint8)) + session.close()
     extrinsics, intrinsics = decode_poses(session.cameras().pose_encoding, transform.size)
-    stored = [as_stored(r.depth, r.confidence) for r in results]
     return {
         "images": np.rint(images * 255).astype(np.uint8),
-        "depth": np.stack([depth for depth, _ in stored]),
-        "confidence": np.stack([confidence for _, confidence in stored]),
+        "depth": as_stored(np.stack([result.depth for result in results])),
+        "confidence": as_stored(np.stack([result.confidence for result in results])),
         "extrinsics": extrinsics,
         "intrinsics": intrinsics,
         "original": transform.intrinsics_to_original(intrinsics),
@@ -214,26 +221,115 @@ def test_a_broken_frame_leaves_nothing_behind(
     assert [entry.name for entry in tmp_path.iterdir()] == ["source"]
 
 
-def test_few_frames_are_alive_at_a_time(
-    model: LogVGGT, variables: dict, room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+class Recorder:
+    """A predictor of two frames at a time whose depth follows from the frames' numbers alone."""
+
+    def __init__(self) -> None:
+        self.frames: list[np.ndarray] = []
+        self.threads: set[int] = set()
+        self.num_frames = 0
+
+    def push(self, frame: np.ndarray) -> list[FrameResult]:
+        self.threads.add(threading.get_ident())
+        self.frames.append(frame)
+        return self.close() if len(self.frames) == 2 else []
+
+    def close(self) -> list[FrameResult]:
+        results = []
+        for frame in self.frames:
+            generator = np.random.default_rng(self.num_frames)
+            depth = generator.uniform(1, 1.2, frame.shape[:2]).astype(np.float32)
+            results.append(FrameResult(self.num_frames, depth, 1 + depth**9, None, False, None, None))
+            self.num_frames += 1
+        self.frames = []
+        return results
+
+    def cameras(self) -> Cameras:
+        encodings = np.tile(np.array([0, 0, 0, 0, 0, 0, 1, 1, 1.2], np.float32), (self.num_frames, 1))
+        encodings[:, 0] = np.arange(self.num_frames)
+        return decoded_cameras(encodings, (28, 42), final=self.num_frames)
+
+
+@pytest.fixture
+def walk(room: Path, tmp_path: Path) -> Path:
+    """Forty frames of a folder."""
+    folder = tmp_path / "walk"
+    folder.mkdir()
+    contents = [file.read_bytes() for file in sorted(room.glob("*.color.png"))]
+    for index in range(40):
+        (folder / f"{index:03d}.png").write_bytes(contents[index % COUNT])
+    return folder
+
+
+def test_the_number_of_workers_changes_no_byte(walk: Path, tmp_path: Path) -> None:
+    thinned = PointFilter(max_points=5000)
+    written = {}
+    for workers in (1, 4):
+        predictor = Recorder()
+        result = reconstruct_with(
+            lambda p=predictor: p,
+            walk,
+            tmp_path / f"{workers}",
+            longer_edge=LONGER_EDGE,
+            point_filter=thinned,
+            progress=False,
+            workers=workers,
+        )
+        assert predictor.threads == {threading.get_ident()}
+        files = sorted(path for path in result.folder.rglob("*") if path.is_file())
+        assert result.num_points == 5000 and len(files) == 40 + 40 + 8 + 3
+        written[workers] = {file.relative_to(result.folder): file for file in files}
+    assert written[1].keys() == written[4].keys()
+    for name, file in written[1].items():
+        assert file.read_bytes() == written[4][name].read_bytes(), name
+
+
+@pytest.mark.parametrize("written", ["write_depth", "write_picture"])
+def test_a_full_disk_stops_the_run_with_its_own_error(
+    walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, written: str
 ) -> None:
-    """However many frames pass through, no more than a window of them is held."""
+    """What a worker cannot write is raised where frames are fed, long before the end, and nothing is left."""
+    original = getattr(reconstruct_module, written)
+
+    def failing(path: Path, *arrays: np.ndarray) -> object:
+        if path.stem == "003":
+            raise DiskError(f"{path}: No space left on device")
+        return original(path, *arrays)
+
+    monkeypatch.setattr(reconstruct_module, written, failing)
+    predictor = Recorder()
+    with pytest.raises(DiskError, match=r"003\.\w+: No space left"):
+        reconstruct_with(lambda: predictor, walk, tmp_path / "out", longer_edge=LONGER_EDGE, progress=False, workers=1)
+    assert predictor.num_frames < 30
+    assert [entry.name for entry in tmp_path.iterdir()] == ["walk"]
+
+
+def test_one_bar_on_standard_error(walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    reconstruct_with(Recorder, walk, tmp_path / "out", longer_edge=LONGER_EDGE, workers=2)
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert shown.err.count("40/40") == 1
+
+
+def test_each_frame_is_resized_once_and_few_are_alive(
+    walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However many frames pass through, no more than those at hand and a few ahead are held."""
     made: list[weakref.ref] = []
     alive: list[int] = []
-    image, transform = preprocess([next(iter(open_source(room))).image], longer_edge=LONGER_EDGE)
 
-    def pictures(source: object, longer_edge: int):
-        for index in range(40):
-            frame = np.rint(image[0] * 255).astype(np.uint8)
-            made.append(weakref.ref(frame))
-            alive.append(sum(reference() is not None for reference in made))
-            yield reconstruct_module._Picture(f"frame-{index:06d}", index, frame, transform)
+    def watched(frame: np.ndarray, *, longer_edge: int):
+        image, transform = resize(frame, longer_edge=longer_edge)
+        image = image.copy()
+        made.append(weakref.ref(image))
+        alive.append(sum(reference() is not None for reference in made))
+        return image, transform
 
-    monkeypatch.setattr(reconstruct_module, "_pictures", pictures)
-    reconstruct(room, tmp_path / "out", model=model, variables=variables, longer_edge=LONGER_EDGE, progress=False)
-    assert len(made) == 40  # once each
-    # A window, the frame at hand and the one read ahead.
-    assert max(alive) <= 6
+    monkeypatch.setattr(reconstruct_module, "resize", watched)
+    reconstruct_with(Recorder, walk, tmp_path / "out", longer_edge=LONGER_EDGE, progress=False, workers=2)
+    assert len(made) == 40
+    # Six ahead, two in the predictor, one in either worker.
+    assert max(alive) <= 10
 
 
 def test_chunks_of_the_whole_sequence_are_plain_vggt(
@@ -254,7 +350,7 @@ def test_chunks_of_the_whole_sequence_are_plain_vggt(
     cameras = read_cameras(result.folder / "cameras.json")
     np.testing.assert_allclose([f["extrinsics"] for f in cameras["frames"]], plain.extrinsics, rtol=1e-5, atol=1e-5)
     depth, _ = read_depth(result.folder / "depth" / "frame-000006.npz")
-    np.testing.assert_allclose(depth, as_stored(plain.depth[6], plain.depth_confidence[6])[0], rtol=1e-3)
+    np.testing.assert_allclose(depth, as_stored(plain.depth[6]), rtol=1e-3)
 
 
 def test_bad_arguments_are_named(
@@ -278,6 +374,8 @@ def test_bad_arguments_are_named(
         run(output=room.parent, overwrite=True)
     with pytest.raises(ValueError, match="num_previews"):
         run(num_previews=-1)
+    with pytest.raises(ValueError, match="workers must be at least 1"):
+        run(workers=0)
     assert list(tmp_path.iterdir()) == []
     assert (result.folder / "cameras.json").is_file()
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from logvggt_jax.reconstruction import sources
-from logvggt_jax.reconstruction.sources import FolderSource, SourceFrame, VideoSource, open_source, read_ahead
+from logvggt_jax.reconstruction.sources import FolderSource, SourceFrame, VideoSource, open_source
 
 
 def write_image(path: Path, value: int, size: tuple[int, int] = (20, 30)) -> None:
@@ -85,31 +85,20 @@ def test_folder_reads_a_file_only_when_it_is_reached(tmp_path: Path, monkeypatch
     assert read == ["0.png", "1.png"]
 
 
-def test_reading_ahead_keeps_the_order_and_is_one_item_ahead() -> None:
-    produced: list[int] = []
-
-    def numbers():
-        for number in range(1, 8):
-            produced.append(number)
-            yield number
-
-    seen = []
-    for number in read_ahead(numbers()):
-        seen.append(number)
-        assert len(produced) <= number + 1
-    assert seen == list(range(1, 8))
-
-
-def test_reading_ahead_raises_the_readers_error_in_its_place() -> None:
-    def numbers():
-        yield 1
-        raise ValueError("broken frame 2")
-
-    seen = []
-    with pytest.raises(ValueError, match="broken frame 2"):
-        for number in read_ahead(numbers()):
-            seen.append(number)
-    assert seen == [1]
+@pytest.mark.parametrize("kind", ["folder", "video"])
+def test_loaders_give_the_frames_in_whatever_order_they_are_called(tmp_path: Path, kind: str) -> None:
+    if kind == "video":
+        write_video(tmp_path / "clip.mp4", 6)
+        source = open_source(tmp_path / "clip.mp4")
+    else:
+        for number in range(6):
+            write_image(tmp_path / f"{number}.png", 10 * number)
+        source = open_source(tmp_path)
+    loaders = list(source.loaders())
+    loaded = [load() for load in reversed(loaders)][::-1]
+    for frame, expected in zip(loaded, source, strict=True):
+        assert frame[:2] == expected[:2]
+        np.testing.assert_array_equal(frame.image, expected.image)
 
 
 def test_video_is_decoded_in_order_with_time(tmp_path: Path) -> None:

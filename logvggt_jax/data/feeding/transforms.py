@@ -84,37 +84,52 @@ def preprocess(
     Raises:
       ValueError: wrong shape, dtype or `longer_edge`, no frames, or frames of unequal size.
     """
-    check_longer_edge(longer_edge)
     frames = [np.asarray(frame) for frame in frames]
     if not frames:
         raise ValueError("no frames given: pass at least one uint8 picture [H, W, 3]")
-    for index, frame in enumerate(frames):
-        if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
+    resized, transforms = zip(
+        *(resize(frame, longer_edge=longer_edge, name=f"frame {index}") for index, frame in enumerate(frames)),
+        strict=True,
+    )
+    for index, transform in enumerate(transforms):
+        if transform != transforms[0]:
             raise ValueError(
-                f"frame {index} must be a uint8 RGB picture [H, W, 3], got {frame.dtype} with shape {frame.shape}"
-            )
-        if frame.shape != frames[0].shape:
-            raise ValueError(
-                f"frame {index} has size {frame.shape[:2]}, frame 0 has {frames[0].shape[:2]}: "
+                f"frame {index} has size {transform.original_size}, frame 0 has {transforms[0].original_size}: "
                 "preprocess frames of one size at a time"
             )
-    height, width = frames[0].shape[:2]
+    return np.stack(resized) / np.float32(255.0), transforms[0]
+
+
+def resize(
+    frame: np.ndarray, *, longer_edge: int = LONGER_EDGE, name: str = "the frame"
+) -> tuple[np.ndarray, ResizeTransform]:
+    """One frame [h, w, 3] uint8 as `preprocess` resizes it, and how to map results back.
+
+    Args:
+      frame: [H, W, 3] uint8 RGB.
+      longer_edge: pixels, a multiple of 14.
+      name: of the frame, for errors.
+
+    Raises:
+      ValueError: wrong shape, dtype or `longer_edge`.
+    """
+    check_longer_edge(longer_edge)
+    if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
+        raise ValueError(f"{name} must be a uint8 RGB picture [H, W, 3], got {frame.dtype} with shape {frame.shape}")
+    height, width = frame.shape[:2]
     if not height or not width:
-        raise ValueError(f"frames are empty: their size is {(height, width)}")
+        raise ValueError(f"{name} is empty: its size is {(height, width)}")
     longer = max(height, width)
-    size = tuple(
+    rows, columns = (
         longer_edge if edge == longer else max(PATCH, PATCH * round(edge * longer_edge / longer / PATCH))
         for edge in (height, width)
     )
-    images = np.empty((len(frames), *size, 3), np.float32)
-    for frame, image in zip(frames, images, strict=True):
-        resized = Image.fromarray(frame).resize((size[1], size[0]), Image.Resampling.BICUBIC)
-        np.divide(np.asarray(resized), np.float32(255.0), out=image)
-    return images, ResizeTransform(original_size=(height, width), size=(size[0], size[1]))
+    resized = Image.fromarray(frame).resize((columns, rows), Image.Resampling.BICUBIC)
+    return np.asarray(resized), ResizeTransform(original_size=(height, width), size=(rows, columns))
 
 
 def check_longer_edge(longer_edge: int) -> None:
-    """Raises InputError unless `longer_edge` is a size that `preprocess` can give pictures."""
+    """Raises InputError unless `longer_edge` is a size that `resize` can give pictures."""
     if longer_edge < PATCH or longer_edge % PATCH:
         raise InputError(f"longer_edge must be a positive multiple of {PATCH}, got {longer_edge}")
 

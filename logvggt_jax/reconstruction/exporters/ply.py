@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
+from rich.console import Console
 from rich.progress import track
 
+from logvggt_jax.reconstruction.frame_pool import FramePool
 from logvggt_jax.reconstruction.point_cloud import PointFilter, PointSelection, frame_vertices, write_points
 from logvggt_jax.reconstruction.result import Reconstruction
 
@@ -23,15 +25,36 @@ def export_ply(
       point_filter: which pixels become points; None takes `PointFilter`'s defaults.
       progress: show a progress bar.
     """
-    selection = PointSelection(point_filter or PointFilter())
-    for index in range(result.num_frames):
-        selection.count(result.depth(index), result.confidence(index))
+    selection = PointSelection(point_filter or PointFilter(), result.num_frames)
+    with FramePool() as pool:
+        frames = pool.map(lambda index: selection.see(index, *_read(result, index)), iter(range(result.num_frames)))
+        console = Console(stderr=True)
+        for _ in track(frames, "Points", result.num_frames, console=console, disable=not progress):
+            pass
+        write_cloud(result, path, selection, pool)
 
-    def vertices() -> Iterator[np.ndarray]:
-        for index in track(range(result.num_frames), description="Points", disable=not progress):
-            depth = result.depth(index)
-            chosen = selection.choose(depth, result.confidence(index))
-            intrinsics, extrinsics = result.depth_intrinsics[index], result.extrinsics[index]
-            yield frame_vertices(depth, result.image(index), intrinsics, extrinsics, chosen)
 
-    write_points(path, selection.num_points, vertices())
+def write_cloud(
+    result: Reconstruction,
+    path: Path,
+    selection: PointSelection,
+    pool: FramePool,
+    *,
+    advance: Callable[[], object] = lambda: None,
+) -> None:
+    """Writes the points that a selection, which has seen all frames, chooses of them; calls `advance` at each."""
+
+    def vertices(index: int) -> np.ndarray:
+        points = selection.choose(index, lambda: _read(result, index))
+        return frame_vertices(points, result.depth_size, result.depth_intrinsics[index], result.extrinsics[index])
+
+    def advancing() -> Iterator[np.ndarray]:
+        for found in pool.map(vertices, iter(range(result.num_frames))):
+            yield found
+            advance()
+
+    write_points(path, selection.num_points, advancing())
+
+
+def _read(result: Reconstruction, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return *result.depth_and_confidence(index), result.image(index)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from logvggt_jax.data.feeding.transforms import ResizeTransform, fit, nearest_size, preprocess
+from logvggt_jax.data.feeding.transforms import ResizeTransform, fit, nearest_size, preprocess, resize
 from logvggt_jax.data.rooms.rooms import Rooms
 from logvggt_jax.frames import Frames
 from logvggt_jax.geometry import project, unproject
@@ -48,6 +48,14 @@ def test_preprocessing_is_the_bicubic_filter_to_a_grey_level(size: tuple[int, in
     images, transform = preprocess([picture], longer_edge=112)
     difference = np.abs(images[0] * 255.0 - bicubic(picture, transform.size))
     assert images.dtype == np.float32 and difference.max() < 1.01 and difference.mean() < 0.05
+
+
+def test_bytes_in_bytes_out_gives_the_grey_levels_of_preprocessing():
+    picture = np.random.default_rng(0).integers(0, 256, (60, 45, 3), np.uint8)
+    resized, transform = resize(picture, longer_edge=112)
+    images, same = preprocess([picture], longer_edge=112)
+    assert resized.dtype == np.uint8 and transform == same
+    np.testing.assert_array_equal(images[0], resized / np.float32(255))
 
 
 def test_pictures_that_fit_are_not_changed():
