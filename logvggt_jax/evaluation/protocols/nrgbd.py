@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 from logvggt_jax.evaluation.protocols.frame_selection import Leading, Spread
 from logvggt_jax.evaluation.protocols.images import PrincipalPointCrop
 from logvggt_jax.evaluation.protocols.protocol import Protocol, ProtocolSettings
@@ -34,16 +36,10 @@ def reconstruction(settings: ProtocolSettings, num_frames: int) -> Protocol:
 
 def qualitative(settings: ProtocolSettings) -> Protocol:
     """The setting of the paper's figures: the first 100 frames."""
-    return Protocol(
+    return dataclasses.replace(
+        reconstruction(settings, 500),
         name="nrgbd-figures",
         title="NRGBD, first 100 frames",
-        dataset="nrgbd",
-        splits=("all",),
         frames=Leading(100),
-        images=PrincipalPointCrop(settings.longer_edge),
-        points=settings.points,
-        poses=True,
-        trajectory=True,
-        expected=_SCENES,
         decisions=(*settings.points_decisions, _DEPTH),
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 from logvggt_jax.evaluation.protocols.frame_selection import Leading, Spread
 from logvggt_jax.evaluation.protocols.images import PrincipalPointCrop
 from logvggt_jax.evaluation.protocols.protocol import Protocol, ProtocolSettings
@@ -38,16 +40,10 @@ def reconstruction(settings: ProtocolSettings, num_frames: int) -> Protocol:
 
 def qualitative(settings: ProtocolSettings) -> Protocol:
     """The setting of the paper's figures: every second frame, about 500 a sequence."""
-    return Protocol(
+    return dataclasses.replace(
+        reconstruction(settings, 500),
         name="seven_scenes-figures",
         title="7-Scenes, every second frame",
-        dataset="seven_scenes",
-        splits=("test", "all"),
         frames=Leading(None, stride=2),
-        images=PrincipalPointCrop(settings.longer_edge),
-        points=settings.points,
-        poses=True,
-        trajectory=True,
-        expected=_TEST_SEQUENCES,
         decisions=(*settings.points_decisions, _DEPTH),
     )
