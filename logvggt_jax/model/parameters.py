@@ -53,8 +53,16 @@ def stack_layers(tree: Any) -> Any:
     return jax.tree.map(stack, tree, is_leaf=_has_layers)
 
 
-def unstack_layers(tree: Any, take: Callable[[Any, int], Any] = lambda x, layer: x[layer]) -> Any:
-    """Inverse of `stack_layers`; `take` makes one layer's leaf of a stacked one."""
+def unstack_layers(
+    tree: Any, take: Callable[[Any, int], Any] = lambda x, layer: x[layer], *, masked_depth: int = 0
+) -> Any:
+    """Inverse of `stack_layers`.
+
+    Args:
+      tree: with stacks.
+      take: makes one layer's leaf of a stacked one.
+      masked_depth: layers of a stack without leaves, as an optimiser's state has them for what is frozen.
+    """
 
     def unstack(node: Any) -> Any:
         if not _is_stacked(node):
@@ -64,7 +72,8 @@ def unstack_layers(tree: Any, take: Callable[[Any, int], Any] = lambda x, layer:
             if not _STACK.fullmatch(name):
                 layers[name] = inner
                 continue
-            for layer in range(jax.tree.leaves(inner)[0].shape[0]):
+            leaves = jax.tree.leaves(inner)
+            for layer in range(leaves[0].shape[0] if leaves else masked_depth):
                 layers[f"{name.removesuffix('s')}_{layer}"] = jax.tree.map(lambda x, i=layer: take(x, i), inner)
         return layers
 

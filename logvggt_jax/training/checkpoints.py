@@ -119,7 +119,9 @@ class RunCheckpoints:
         self._check_configuration(meta["config"], where)
         # Earlier versions kept every layer's parameters and moments by themselves.
         layer_by_layer = meta.get("layers") != "stacked"
-        params, rest = _parts(unstack_layers(like, _one_layer) if layer_by_layer else like)
+        if layer_by_layer:
+            like = unstack_layers(like, _one_layer, masked_depth=self.config.model.encoder.depth)
+        params, rest = _parts(like)
         restored = self._read(
             chosen,
             ocp.args.Composite(
