@@ -53,15 +53,10 @@ def stack_layers(tree: Any) -> Any:
     return jax.tree.map(stack, tree, is_leaf=_has_layers)
 
 
-def unstack_layers(
-    tree: Any, take: Callable[[Any, int], Any] = lambda x, layer: x[layer], *, masked_depth: int = 0
-) -> Any:
-    """Inverse of `stack_layers`.
+def unstack_layers(tree: Any, config: ModelConfig, take: Callable[[Any, int], Any] = lambda x, layer: x[layer]) -> Any:
+    """Inverse of `stack_layers` for a model of these sizes; `take` makes one layer's leaf of a stacked one.
 
-    Args:
-      tree: with stacks.
-      take: makes one layer's leaf of a stacked one.
-      masked_depth: layers of a stack without leaves, as an optimiser's state has them for what is frozen.
+    Stacks without leaves, which an optimiser's state has for what is frozen, come apart as well.
     """
 
     def unstack(node: Any) -> Any:
@@ -72,8 +67,8 @@ def unstack_layers(
             if not _STACK.fullmatch(name):
                 layers[name] = inner
                 continue
-            leaves = jax.tree.leaves(inner)
-            for layer in range(leaves[0].shape[0] if leaves else masked_depth):
+            depth = config.encoder.depth if name == "blocks" else config.aggregator.depth
+            for layer in range(depth):
                 layers[f"{name.removesuffix('s')}_{layer}"] = jax.tree.map(lambda x, i=layer: take(x, i), inner)
         return layers
 

@@ -26,7 +26,7 @@ def test_a_checkpoint_layer_by_layer_is_taken_up_as_stacks(
 
     params = {
         "encoder": {"block_0": layer(), "norm": layer()},
-        "aggregator": {f"{kind}_block_{i}": layer() for kind in ("frame", "global") for i in range(12)},
+        "aggregator": {f"{kind}_block_{i}": layer() for kind in ("frame", "global") for i in range(4)},
         "camera_head": layer(),
     }
     optimizer = make_optimizer(optimizer_config, params, frozen=("encoder",))
@@ -56,5 +56,5 @@ def test_a_checkpoint_layer_by_layer_is_taken_up_as_stacks(
     with RunCheckpoints(tmp_path, run_config) as checkpoints:
         restored, position = checkpoints.restore(like)
     assert position == Position(1, {})
-    assert restored.params["aggregator"]["global_blocks"]["kernel"].shape == (12, 3, 4)
+    assert restored.params["aggregator"]["global_blocks"]["kernel"].shape == (4, 3, 4)
     jax.tree.map(np.testing.assert_array_equal, restored, wanted)
