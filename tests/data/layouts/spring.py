@@ -7,7 +7,7 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-from room_views import CENTRE, FOCAL, RoomView, write_image
+from room_views import FOCAL, RoomView, pinhole_row, write_image
 
 from layouts.layout import Layout
 from logvggt_jax.data.readers.spring import Spring
@@ -30,7 +30,7 @@ def write(root: Path, views: Sequence[RoomView]) -> None:
         disparity[::2, ::2] = np.divide(FOCAL * BASELINE, each.depth, out=0 * each.depth, where=each.depth > 0)
         write_disparity(folder / f"disp1_left/disp1_left_{number:04d}.dsp5", disparity)
     (folder / "cam_data").mkdir()
-    np.savetxt(folder / "cam_data/intrinsics.txt", [[FOCAL, FOCAL, *CENTRE]] * len(views))
+    np.savetxt(folder / "cam_data/intrinsics.txt", [pinhole_row(each) for each in views])
     np.savetxt(folder / "cam_data/extrinsics.txt", [each.extrinsics.ravel() for each in views])
     np.savetxt(folder / "cam_data/focaldistance.txt", [[1.0]] * len(views))
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from room_views import CENTRE, FOCAL, RoomView, room_views, write_image
+from room_views import RoomView, pinhole_row, room_views, write_image
 
 from layouts.layout import VIEWS, Layout
 from logvggt_jax.data.readers.virtual_kitti import VirtualKITTI
@@ -23,7 +23,7 @@ def write_variation(folder: Path, left: Sequence[RoomView] = VIEWS, right: Seque
             write_image(folder / f"frames/rgb/Camera_{camera}/rgb_{frame:05d}.jpg", each.picture)
             depth = np.rint(100 * each.depth).astype(np.uint16)
             write_image(folder / f"frames/depth/Camera_{camera}/depth_{frame:05d}.png", depth)
-            intrinsic.append(f"{frame} {camera} {FOCAL} {FOCAL} {CENTRE[0]} {CENTRE[1]}")
+            intrinsic.append(f"{frame} {camera} " + " ".join(map(str, pinhole_row(each))))
             extrinsic.append(f"{frame} {camera} " + " ".join(map(str, each.extrinsics.ravel())))
     (folder / "intrinsic.txt").write_text("\n".join(intrinsic) + "\n")
     (folder / "extrinsic.txt").write_text("\n".join(extrinsic) + "\n")

@@ -35,11 +35,6 @@ def test_sky_and_other_invalid_depth_become_zero_and_half_floats_are_read(root: 
     assert not frames.depth[0, 0, :4].any() and not frames.depth[0, 1].any() and (frames.depth[0, 2:] == 7.5).all()
 
 
-def test_frames_without_finite_intrinsics_are_dropped_and_counted(root: Path):
-    write_pose(root / "GTAV_720/0000/poses/0001.json", SWAP, f_x=float("inf"))
-    assert MVSSynth(root).dropped_frames("0000") == {"no intrinsics": 1}
-
-
 def test_only_the_size_720_is_read(root: Path):
     (root / "GTAV_720").rename(root / "GTAV_540")
     with pytest.raises(FileNotFoundError, match="GTAV_720"):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from layouts.layout import VIEWS
 from layouts.pointodyssey import STEP, write_cameras, write_sequence
-from room_views import INTRINSICS, SIZE, check_views, write_image
+from room_views import SIZE, check_views, write_image
 
 from logvggt_jax.data.readers.pointodyssey import PointOdyssey
 
@@ -65,13 +65,6 @@ def test_older_releases_are_refused(root: Path):
     (folder / "anno.npz").rename(folder / "annotations.npz")
     with pytest.raises(FileNotFoundError, match=r"anno\.npz.*annotations\.npz is of an older release.*fetch v1\.2"):
         PointOdyssey(root).num_frames("train/dancing")
-
-
-def test_frames_without_finite_intrinsics_are_dropped_and_counted(root: Path):
-    intrinsics = np.stack([INTRINSICS] * 4)
-    intrinsics[2, 0, 0] = np.nan
-    write_cameras(root / "train/dancing", intrinsics=intrinsics)
-    assert PointOdyssey(root).dropped_frames("train/dancing") == {"no intrinsics": 1}
 
 
 def test_unequal_counts_are_named(root: Path):

@@ -32,11 +32,6 @@ def test_sky_and_other_invalid_depth_become_zero(training: Path):
     np.testing.assert_array_equal(read[0, :8], np.float32([0, 0, 0, 0, 0, 0, 1000, 500]))
 
 
-def test_frames_without_finite_intrinsics_are_dropped_and_counted(training: Path):
-    write_camera(training / "camdata_left/alley_2/frame_0003.cam", np.eye(4), np.full((3, 3), np.nan))
-    assert Sintel(training.parent).dropped_frames("alley_2") == {"no intrinsics": 1}
-
-
 def test_archives_that_are_not_there_are_named(training: Path):
     (training / "final").rename(training / "albedo")
     with pytest.raises(FileNotFoundError, match="training/final: no such folder"):

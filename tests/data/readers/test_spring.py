@@ -64,11 +64,6 @@ def test_rows_belong_to_numbers_that_start_at_one(sequence: Path):
         opened(sequence).num_frames("0001")
 
 
-def test_frames_without_finite_intrinsics_are_dropped_and_counted(sequence: Path):
-    np.savetxt(sequence / "cam_data/intrinsics.txt", [[FOCAL, FOCAL, *CENTRE]] * 3 + [[np.inf] * 4])
-    assert opened(sequence).dropped_frames("0001") == {"no intrinsics": 1}
-
-
 def test_the_test_half_is_not_offered(sequence: Path):
     sequence.parents[1].joinpath("test/0003").mkdir(parents=True)
     assert opened(sequence).sequences == opened(sequence, "train").sequences == ("0001",)

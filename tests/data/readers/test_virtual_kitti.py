@@ -60,13 +60,6 @@ def test_splits_hold_the_last_scene_out(root: Path):
     assert VirtualKITTI(root, "test").sequences == last
 
 
-def test_frames_without_finite_intrinsics_are_dropped_and_counted(root: Path):
-    edit(root / "Scene01/clone/intrinsic.txt", f"2 0 {FOCAL}", "2 0 inf")
-    drives = VirtualKITTI(root)
-    assert drives.dropped_frames("Scene01/clone/Camera_0") == {"no intrinsics": 1}
-    assert drives.num_frames("Scene01/clone/Camera_1") == 4
-
-
 def test_a_variation_without_pictures_is_named(root: Path):
     (root / "Scene01/fog").mkdir()
     with pytest.raises(FileNotFoundError, match="Scene01/fog/frames/rgb"):
