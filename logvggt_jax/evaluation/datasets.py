@@ -48,12 +48,7 @@ def open_run(
 
 
 def open_evaluation_set(
-    name: str,
-    root: str | None,
-    *,
-    split: str,
-    image_size: tuple[int, int],
-    rooms: Mapping[str, Any] | None = None,
+    name: str, root: str | None, *, split: str, image_size: tuple[int, int], rooms: Mapping[str, Any] | None = None
 ) -> tuple[Dataset, Dataset, str]:
     """The data set to evaluate, and the one whose mean depth the baselines know, with its name for the table.
 

@@ -40,10 +40,7 @@ def trajectory_errors(predicted_poses: np.ndarray, true_poses: np.ndarray) -> di
     absolute = metrics.APE(relation.translation_part)
     absolute.process_data(paths)
     errors = {"ate": absolute}
-    for name, part in (
-        ("rpe_translation", relation.translation_part),
-        ("rpe_rotation", relation.rotation_angle_deg),
-    ):
+    for name, part in (("rpe_translation", relation.translation_part), ("rpe_rotation", relation.rotation_angle_deg)):
         relative = metrics.RPE(part, delta=1, all_pairs=True)
         relative.process_data(paths)
         errors[name] = relative

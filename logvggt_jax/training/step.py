@@ -75,11 +75,7 @@ def loss_and_gradients(
 
 
 def make_train_step(
-    terms: LossTerms,
-    config: LossConfig,
-    optimizer: optax.GradientTransformation,
-    schedule: optax.Schedule,
-    mesh: Mesh,
+    terms: LossTerms, config: LossConfig, optimizer: optax.GradientTransformation, schedule: optax.Schedule, mesh: Mesh
 ) -> jax.stages.Wrapped:
     """A jitted step (state, batch) -> (state, metrics); the state is donated, the batch split over `mesh`.
 

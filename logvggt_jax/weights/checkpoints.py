@@ -32,13 +32,7 @@ from logvggt_jax.weights.files import open_state_dict
 from logvggt_jax.weights.hub import licence, resolve
 from logvggt_jax.weights.lazy import LazyTensors
 from logvggt_jax.weights.provenance import Provenance
-from logvggt_jax.weights.vggt import (
-    ConversionReport,
-    config_from_vggt,
-    parameter_shapes,
-    params_from_vggt,
-    vggt_rules,
-)
+from logvggt_jax.weights.vggt import ConversionReport, config_from_vggt, parameter_shapes, params_from_vggt, vggt_rules
 
 FORMAT = "logvggt-jax model"
 VERSION = 1

@@ -26,13 +26,7 @@ KEYS = {
     "chamfer_sum": "derived_chamfer_sum",
     "chamfer_mean": "derived_chamfer_half_sum",
 }
-GIVEN_NORMALS = (
-    "sphere_given_normals",
-    "box_given_normals",
-    "plane_given_normals",
-    "half_coverage",
-    "identical",
-)
+GIVEN_NORMALS = ("sphere_given_normals", "box_given_normals", "plane_given_normals", "half_coverage", "identical")
 # `far_offset_icp` is informational: an ICP that does not converge depends on its implementation.
 ICP = ("box_icp", "sphere_icp", "two_planes_icp", "fewer_than_knn")
 

@@ -97,11 +97,7 @@ class BlendedMVS(FolderDataset):
         return sequences_present(listed, scenes, path)
 
     def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
-        kinds = (
-            ("blended_images", "{:08d}.jpg"),
-            ("rendered_depth_maps", "{:08d}.pfm"),
-            ("cams", "{:08d}_cam.txt"),
-        )
+        kinds = (("blended_images", "{:08d}.jpg"), ("rendered_depth_maps", "{:08d}.pfm"), ("cams", "{:08d}_cam.txt"))
         paths = numbered_frames(files, *((folder / place, template) for place, template in kinds))
         for image, depth, camera in paths.values():
             intrinsics, stored = _camera(files.text(camera, "the frame's camera"), camera)

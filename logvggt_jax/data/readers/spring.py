@@ -56,9 +56,7 @@ class Spring(FolderDataset):
 
     def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
         paths = numbered_frames(
-            files,
-            (folder / "frame_left", "frame_left_{:04d}.png"),
-            (folder / "disp1_left", "disp1_left_{:04d}.dsp5"),
+            files, (folder / "frame_left", "frame_left_{:04d}.png"), (folder / "disp1_left", "disp1_left_{:04d}.dsp5")
         )
         calibration, poses = folder / "cam_data" / "intrinsics.txt", folder / "cam_data" / "extrinsics.txt"
         pinholes = _rows(files, calibration, 4, "fx fy cx cy of each frame")

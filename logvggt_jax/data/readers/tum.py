@@ -38,10 +38,7 @@ class TUM(TimedRGBD):
     container = None
     prepared_for = "poses"
     about = About(
-        source="the set's site: an archive a sequence",
-        licence=LICENCE_NOT_READ,
-        size="unknown",
-        roles=(EVALUATION,),
+        source="the set's site: an archive a sequence", licence=LICENCE_NOT_READ, size="unknown", roles=(EVALUATION,)
     )
 
     def _intrinsics(self, folder: Path) -> np.ndarray:

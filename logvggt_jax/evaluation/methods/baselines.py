@@ -33,12 +33,7 @@ class DepthStatistics:
 
 
 def depth_statistics(
-    dataset: Dataset,
-    image_size: tuple[int, int],
-    *,
-    source: str,
-    max_sequences: int = 64,
-    max_frames: int = 256,
+    dataset: Dataset, image_size: tuple[int, int], *, source: str, max_sequences: int = 64, max_frames: int = 256
 ) -> DepthStatistics:
     """Mean depth, mean depth map and mean intrinsics of evenly spaced frames.
 

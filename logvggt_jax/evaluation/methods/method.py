@@ -104,12 +104,7 @@ def predicted(predictor: Predictor, images: np.ndarray) -> ClipPrediction:
 
 
 def model_row(
-    method: str,
-    checkpoint: Checkpoint,
-    settings: Any = None,
-    *,
-    name: str = "LoG-VGGT",
-    knows: str = "its training",
+    method: str, checkpoint: Checkpoint, settings: Any = None, *, name: str = "LoG-VGGT", knows: str = "its training"
 ) -> Method:
     """A row of the model, run by one of the methods of `logvggt_jax.streaming`.
 

@@ -50,11 +50,7 @@ def test_holes_of_the_mesh_are_invalid(root: Path):
 def test_covisibility_is_in_frame_indices_with_the_best_first(root: Path):
     dataset = BlendedMVS(root)
     # Image 3 is not there, image 7 is frame 3 and has no neighbours.
-    assert dataset.covisibility(SCENE) == {
-        0: [(1, 900.5), (2, 30.25)],
-        1: [(0, 900.5)],
-        2: [(0, 30.25), (1, 10.0)],
-    }
+    assert dataset.covisibility(SCENE) == {0: [(1, 900.5), (2, 30.25)], 1: [(0, 900.5)], 2: [(0, 30.25), (1, 10.0)]}
     assert [dataset.neighbours(SCENE, index) for index in range(4)] == [[1, 2], [0], [0, 1], []]
     (root / SCENE / "cams" / "pair.txt").write_text("1\n7\n1 2 5.5\n")
     assert dataset.covisibility(SCENE) == {3: [(2, 5.5)]}

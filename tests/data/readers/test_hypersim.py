@@ -11,15 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from analytic_room import camera_to_world, disagreement, view
-from layouts.hypersim import (
-    AXES,
-    camera_from_uv_of,
-    tone_mapped,
-    uv_from_pixels,
-    write_array,
-    write_frame,
-    write_table,
-)
+from layouts.hypersim import AXES, camera_from_uv_of, tone_mapped, uv_from_pixels, write_array, write_frame, write_table
 from layouts.hypersim import write_keyframes as write_poses
 from room_views import SIZE
 
