@@ -1,7 +1,5 @@
 """Compiled programs kept between runs, so that only the first run of a shape waits for the compiler."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

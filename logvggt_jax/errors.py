@@ -1,7 +1,5 @@
 """Errors of what a user gave, which entry points shorten to one line; any other exception keeps its traceback."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path

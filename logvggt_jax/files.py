@@ -1,7 +1,5 @@
 """Results appear whole or not at all: files and folders written under another name and renamed at the end."""
 
-from __future__ import annotations
-
 import os
 import secrets
 import shutil

@@ -1,7 +1,5 @@
 """One clip read for evaluation: images for the network and the truth, on disk where they are large."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Data sets as evaluation opens them: rooms at the model's size, everything else from disk, missing ones named."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """What a result was computed with: versions, commit, code, device."""
 
-from __future__ import annotations
-
 import ast
 import functools
 import hashlib

@@ -1,7 +1,5 @@
 """Runs methods over the clips of benchmarks, one clip at a time, and writes results as they come."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import json

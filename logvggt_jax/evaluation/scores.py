@@ -1,7 +1,5 @@
 """What is measured on one clip, and how a benchmark's score is made of clips."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence

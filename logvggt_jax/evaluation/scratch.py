@@ -1,7 +1,5 @@
 """Arrays of a clip: in memory while they are small, else in an unnamed temporary file."""
 
-from __future__ import annotations
-
 import math
 import shutil
 import tempfile

@@ -1,7 +1,5 @@
 """What a file of `configs/eval` says: a run over clips of one data set, or over the paper's benchmarks."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """Pinhole cameras: world-to-camera extrinsics (OpenCV axes), intrinsics in pixels, centres at integers."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

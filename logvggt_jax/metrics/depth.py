@@ -3,8 +3,6 @@
 Source: the evaluation code of CUT3R and its descendants (`eval/video_depth/tools.py`), in float64.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np

@@ -4,8 +4,6 @@ Source: the evaluation code of CUT3R and its descendants (`eval/mv_recon`); ICP 
 neighbours by SciPy.
 """
 
-from __future__ import annotations
-
 import ctypes
 import importlib
 from typing import Any

@@ -3,8 +3,6 @@
 Source: the evaluation code of CUT3R (`eval/relpose/evo_utils.py`); errors by evo.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

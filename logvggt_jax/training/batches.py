@@ -1,7 +1,5 @@
 """The data of a run: data sets opened once, one stream of batches for each stage."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Mapping, Sequence

@@ -3,8 +3,6 @@
 The values tell progress from a plateau, and can be compared with validation and evaluation.
 """
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 

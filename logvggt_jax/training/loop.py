@@ -1,7 +1,5 @@
 """The training loop: stages, logging, validation, checkpoints, and a clean end whatever ends it."""
 
-from __future__ import annotations
-
 import functools
 import time
 from collections import deque

@@ -1,7 +1,5 @@
 """The paper's training objective as sums and counts, so that devices can add theirs before dividing."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import jax

@@ -1,7 +1,5 @@
 """One normalisation a clip: the first camera is the origin, the mean distance of the points is one."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import jax

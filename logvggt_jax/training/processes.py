@@ -1,7 +1,5 @@
 """Several processes that train together, one or more for each machine."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from typing import Any

@@ -1,7 +1,5 @@
 """One training step over all devices."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -4,8 +4,6 @@ They average over whatever one device holds (the depth terms drop that batch's l
 averaged over devices as they are, which is what the trainer's data parallelism does.
 """
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 

@@ -6,8 +6,6 @@
 Orbax restores flipped bytes without complaint; the digests find them.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import hashlib

@@ -1,7 +1,5 @@
 """VGGT checkpoint files: which file a path means, and its tensors read one by one."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path

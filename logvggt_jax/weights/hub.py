@@ -1,7 +1,5 @@
 """Checkpoint files from the Hugging Face hub (extra `hub`)."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """State dicts that read one tensor at a time."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A model in a few lines: sizes, parameters by part, memory."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import jax

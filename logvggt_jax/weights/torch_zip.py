@@ -5,8 +5,6 @@ member a storage (`<name>/data/<key>`). A pickle can call any function it names,
 the names that tensors need and nothing else.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import io
 import math

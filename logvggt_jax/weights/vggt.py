@@ -4,8 +4,6 @@
 made from it. Source: the VGGT-1B checkpoint (1797 tensors).
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator, Mapping

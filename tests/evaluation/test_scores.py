@@ -1,7 +1,5 @@
 """What is measured on one clip, and means over clips."""
 
-from __future__ import annotations
-
 import dataclasses
 import tracemalloc
 

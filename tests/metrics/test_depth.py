@@ -1,7 +1,5 @@
 """Depth errors against stored values of the public reference code, and their invariances."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """No stored case of the reference metrics is left out of the tests."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

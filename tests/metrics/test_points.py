@@ -1,7 +1,5 @@
 """Point-cloud metrics against stored values of the public reference pipeline."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Relative pose errors and accuracies against stored values of the public reference code."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

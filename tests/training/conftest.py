@@ -1,7 +1,5 @@
 """A model that compiles at once, clips with uneven masks, and the settings of a short run."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

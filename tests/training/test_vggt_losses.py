@@ -1,7 +1,5 @@
 """The losses of VGGT's released trainer against its own values."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -4,8 +4,6 @@ Depth of frame i is unprojected, moved into the camera of frame j and compared w
 nearest pixel. Where all three are right the two agree but for noise, rounding to pixels, occlusions and what moves.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A picture of a data set's copy: frames, their depth, and the cameras seen from above (matplotlib, no display)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Single clips, read and made ready for training; where one cannot be read, the next takes its place."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -4,8 +4,6 @@ ScanNet, Co3Dv2 and Virtual KITTI are trained on and evaluated on; they are divi
 sets are not trained on at all.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase

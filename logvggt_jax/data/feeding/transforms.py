@@ -5,8 +5,6 @@ antialiased bicubic filter (a = -0.5) of Pillow, which VGGT's weights were train
 pixel, since a mean across an edge is on neither surface.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

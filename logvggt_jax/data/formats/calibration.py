@@ -1,7 +1,5 @@
 """Numbers from calibration and pose files, checked: intrinsics in pixels, world-to-camera OpenCV extrinsics."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Single-channel OpenEXR pictures, through the OpenEXR package: OpenCV's wheels come without that codec."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Arrays from HDF5 files that hold one array each, with damage reported by file."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 

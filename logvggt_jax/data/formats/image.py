@@ -4,8 +4,6 @@ OpenCV decodes truncated JPEG and PNG files without complaint and fills the miss
 therefore walked to their end marker first.
 """
 
-from __future__ import annotations
-
 import re
 import zlib
 from pathlib import Path

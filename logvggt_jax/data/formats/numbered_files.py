@@ -1,7 +1,5 @@
 """Files whose names carry a frame's number: listed in numeric order, with the gaps between kinds reported."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from pathlib import Path

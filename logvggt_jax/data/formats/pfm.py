@@ -1,7 +1,5 @@
 """Portable float maps: depth as 32-bit floats behind three lines of text."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

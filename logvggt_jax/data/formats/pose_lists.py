@@ -1,7 +1,5 @@
 """Text files that hold the poses of all frames of a sequence as 4x4 matrices."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The folders and text files that a listing is made from, read with their state remembered."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from logvggt_jax.data.errors import MissingFiles

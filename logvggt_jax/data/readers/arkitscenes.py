@@ -12,8 +12,6 @@ Times are seconds with three decimals. The set does not say where a pixel's cent
 are. `confidence` tells how much the sensor trusts depth that it nevertheless gives: nothing is masked by it.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path

@@ -11,8 +11,6 @@ a pixel's centre is; the principal point is taken as it is. Depth is 0 where the
 empty.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What readers of data sets on disk share: sequences and frames listed once, pictures opened when asked for."""
 
-from __future__ import annotations
-
 import abc
 import contextlib
 import io

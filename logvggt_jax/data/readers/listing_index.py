@@ -5,8 +5,6 @@ are unchanged it is taken from the index, else made anew. The index is a cache: 
 work without it.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import sqlite3

@@ -6,8 +6,6 @@ in pixels. Depth is z in units of about 0.1 m, infinite in the sky. Of the three
 intrinsics stored with GTAV_540 do not fit its pictures.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator, Mapping

@@ -7,8 +7,6 @@ holds four lines a frame, camera-to-world in metres with OpenGL camera axes (x r
 without a pose. `focal.txt` is the focal length for 640 x 480; the principal point is (320, 240) there.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 

@@ -5,8 +5,6 @@ the latter's arrays `intrinsics` [T, 3, 3] (pixels) and `extrinsics` [T, 4, 4] (
 read; the point tracks beside them, a hundred times larger, are not. Depth is 16-bit, 65535 for 1000 m.
 """
 
-from __future__ import annotations
-
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping

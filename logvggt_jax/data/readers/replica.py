@@ -6,8 +6,6 @@ centres are at integers. A line of `traj.txt` is one frame's camera-to-world mat
 OpenCV axes. Depth is uint16, `scale` a metre, 0 where invalid. Other renderings of Replica are not read.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path

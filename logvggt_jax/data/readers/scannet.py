@@ -11,8 +11,6 @@ Also read, where a scene has no `color`, is the form that published evaluations 
 numbers than 90. These are frames already chosen, every third from the first.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path

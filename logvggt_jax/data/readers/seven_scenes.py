@@ -6,8 +6,6 @@ camera-to-world in metres, OpenCV axes, of the depth camera. Colour and raw dept
 set does not register: depth has focal length 585, colour 525, and lies 25 mm to the side.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path

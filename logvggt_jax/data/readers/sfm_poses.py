@@ -4,8 +4,6 @@ Source: `pgt/sfm/7scenes/<scene>_{train,test}.txt` of the repository `visloc_pse
 `seq-01/frame-000591.color.png qw qx qy qz tx ty tz focal`: world-to-camera of the colour camera, metres, OpenCV axes.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -7,8 +7,6 @@ float32 z-depth row by row. A `.cam` file is the same tag, nine float64 of the i
 world-to-camera matrix, OpenCV axes, rows first.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 

@@ -6,8 +6,6 @@ picture's width and height, in pixels of the picture. The text files have a row 
 pixels, and sixteen numbers of the world-to-camera matrix of the left camera, rows first, OpenCV axes, metres.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path

@@ -4,8 +4,6 @@
 metres and seconds; `#` starts a comment.
 """
 
-from __future__ import annotations
-
 import abc
 import re
 from collections.abc import Iterator, Mapping

@@ -6,8 +6,6 @@ are those of the colour camera, camera-to-world, OpenCV axes. Intrinsics are the
 Lens distortion is left in the pictures of freiburg1 and freiburg2; freiburg3's are undistorted.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

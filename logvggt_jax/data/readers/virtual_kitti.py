@@ -7,8 +7,6 @@ camera` and sixteen numbers of the world-to-camera matrix, rows first, OpenCV ax
 interleaved. Depth is 16-bit z in centimetres, 65535 in the sky and beyond 655.35 m.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path

@@ -7,8 +7,6 @@ category the lists `nvs_list.json` and `camera_eval_list.json`. (The set's READM
 `scene_<id>`.) Depth is z in millimetres, 0 invalid. `masks` show the object and are not needed.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator, Mapping

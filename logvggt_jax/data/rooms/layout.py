@@ -1,7 +1,5 @@
 """Random furnished rooms: geometry, and textures as small tables that the ray caster looks up."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

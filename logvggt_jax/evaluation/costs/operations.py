@@ -1,7 +1,5 @@
 """Floating point operations of a program as XLA counts them, every loop times its trips."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from typing import Any
 

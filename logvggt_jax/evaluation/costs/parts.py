@@ -1,7 +1,5 @@
 """What a stream costs: the parts of the model, their operations, time, compilation and memory."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import resource

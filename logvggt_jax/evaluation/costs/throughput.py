@@ -1,7 +1,5 @@
 """Frames a second of whole sequences, and their time by part: what the paper's tables of cost measure."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import time

@@ -1,7 +1,5 @@
 """Answers that need no learning, to be printed beside every result."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import jax

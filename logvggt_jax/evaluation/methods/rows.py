@@ -1,7 +1,5 @@
 """The rows of the model: LoG-VGGT, and on the same weights VGGT offline and on chunks."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """Ablations: one checkpoint run with parts switched off, other windows, or refinement at other times."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Mapping, Sequence

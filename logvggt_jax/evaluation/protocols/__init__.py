@@ -1,7 +1,5 @@
 """The benchmarks of the paper, one file each, in the order of its tables."""
 
-from __future__ import annotations
-
 import fnmatch
 from collections.abc import Sequence
 

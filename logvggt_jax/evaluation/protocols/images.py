@@ -5,8 +5,6 @@ VGGT family's; other lengths (a small model's) scale them. Sources: the evaluati
 reconstruction: crop about the principal point; video depth: whole picture; poses: VGGT's own loader).
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import ClassVar, Protocol
 

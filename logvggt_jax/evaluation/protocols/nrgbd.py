@@ -1,7 +1,5 @@
 """3D reconstruction on Neural RGB-D: every synthetic scene, 200, 500 and 1,000 frames at a fixed stride."""
 
-from __future__ import annotations
-
 from logvggt_jax.evaluation.protocols.frame_selection import Leading, Spread
 from logvggt_jax.evaluation.protocols.images import PrincipalPointCrop
 from logvggt_jax.evaluation.protocols.protocol import Protocol, ProtocolSettings

@@ -1,7 +1,5 @@
 """3D reconstruction on 7-Scenes: every test sequence, 200, 500 and 1,000 frames at a fixed stride."""
 
-from __future__ import annotations
-
 from logvggt_jax.evaluation.protocols.frame_selection import Leading, Spread
 from logvggt_jax.evaluation.protocols.images import PrincipalPointCrop
 from logvggt_jax.evaluation.protocols.protocol import Protocol, ProtocolSettings

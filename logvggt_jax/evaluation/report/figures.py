@@ -1,7 +1,5 @@
 """Pictures of results: trajectories, depth and point clouds beside their truth (matplotlib, no display needed)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """An evaluation's results for readers: on the terminal, as Markdown, CSV and one HTML page."""
 
-from __future__ import annotations
-
 import csv
 import io
 import re

@@ -1,7 +1,5 @@
 """ARKitScenes: coarse depth, a calibration file a picture, a trajectory of axis-angle vectors with the world's z up."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

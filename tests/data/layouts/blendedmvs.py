@@ -1,7 +1,5 @@
 """BlendedMVS: float maps, a text file a camera, pairs of photographs that see the same."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

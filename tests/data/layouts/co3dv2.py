@@ -1,7 +1,5 @@
 """Co3Dv2: annotations in gzip JSON, PyTorch3D's cameras, depth as the bits of 16-bit floats."""
 
-from __future__ import annotations
-
 import gzip
 import json
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """HyperSim: HDF5 of linear colour and ray distance, cameras as a matrix from the picture's borders to rays."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

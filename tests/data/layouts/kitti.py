@@ -1,7 +1,5 @@
 """KITTI depth: sparse depth of a part of the pictures, a calibration a day, no poses."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What the contract test needs to know of a data set's files."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path

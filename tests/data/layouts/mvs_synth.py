@@ -1,7 +1,5 @@
 """MVS-Synth: EXR depth, JSON cameras, a left-handed world, ten units a metre."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path

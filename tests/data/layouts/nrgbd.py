@@ -1,7 +1,5 @@
 """Neural RGB-D: unpadded names, millimetres, OpenGL cameras in four lines a frame, one focal length for 640 x 480."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """PointOdyssey v1.2: 16-bit depth up to 1000 m, cameras in an npz file beside large point tracks."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Replica as NICE-SLAM renders it: JPEG, 16-bit depth, one line a pose, one camera for all scenes."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path

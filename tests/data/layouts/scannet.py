@@ -1,7 +1,5 @@
 """ScanNet: the export of its SensReader, and the form that published evaluations prepare from it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

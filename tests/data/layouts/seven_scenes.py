@@ -1,7 +1,5 @@
 """7-Scenes with depth that is projected into the colour camera, one text file a pose."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

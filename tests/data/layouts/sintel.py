@@ -1,7 +1,5 @@
 """MPI Sintel: binary depth and cameras byte by byte, numbered from 1."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Sequence
 from pathlib import Path

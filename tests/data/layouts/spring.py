@@ -1,7 +1,5 @@
 """Spring: stereo disparity of twice the picture's size in HDF5, rows of numbers for the cameras."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """TUM RGB-D and Bonn: pictures, depth and poses with clocks of their own."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Virtual KITTI 2: two cameras whose rows are interleaved in text files, depth in centimetres."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """WildRGB-D: portrait pictures, millimetres, intrinsics column by column, numbered lines of poses."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path

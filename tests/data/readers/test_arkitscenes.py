@@ -1,7 +1,5 @@
 """ARKitScenes: the room comes back whichever way up the tablet was held; times, splits and damage."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

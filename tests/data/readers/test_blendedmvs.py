@@ -1,7 +1,5 @@
 """BlendedMVS: float maps, holes, pairs, lists and damage."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

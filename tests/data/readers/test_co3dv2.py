@@ -1,7 +1,5 @@
 """Co3Dv2: cameras, float bits, masks, set lists and damage."""
 
-from __future__ import annotations
-
 import gzip
 import pickle
 from pathlib import Path

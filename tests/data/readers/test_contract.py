@@ -1,7 +1,5 @@
 """What every reader promises, on the analytic room written in each set's own files."""
 
-from __future__ import annotations
-
 import importlib
 import pickle
 from dataclasses import replace

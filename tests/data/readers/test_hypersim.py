@@ -3,8 +3,6 @@
 Truth is what the set's camera matrix itself says: a pixel's ray, and where it meets the room.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """KITTI depth: no poses, both layouts, frames start where depth does; points lie on the room's walls."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """MVS-Synth: the left-handed world, half floats and sky, the one size that is read."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Neural RGB-D: later poses stay with their pictures, far depth, one focal length."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

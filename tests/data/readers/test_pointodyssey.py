@@ -1,7 +1,5 @@
 """PointOdyssey: saturated depth is sky; only two arrays are read; older releases; damage."""
 
-from __future__ import annotations
-
 import zipfile
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Replica: the camera file decides, or the rendering's own camera; poses belong to pictures by their line."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """ScanNet: colour and depth of two sizes, both layouts, lost poses, splits, damage."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """7-Scenes: raw depth is carried into the colour camera, lists, real frames agree with each other."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """MPI Sintel: sky becomes 0; sizes and tags of the binary files are checked."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

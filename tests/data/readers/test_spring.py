@@ -1,7 +1,5 @@
 """Spring: disparity's finer grid, the sky, the numbering from one, rows of the cameras."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """TUM RGB-D: three clocks, quaternions x y z w, three cameras, the prepared form."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

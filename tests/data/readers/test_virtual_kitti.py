@@ -1,7 +1,5 @@
 """Virtual KITTI 2: both cameras come back from interleaved rows; the split; damaged tables."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

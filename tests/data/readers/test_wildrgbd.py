@@ -1,7 +1,5 @@
 """WildRGB-D: numbers of frames, lists, resized copies and damage."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
