@@ -21,7 +21,7 @@ from absl import app, flags, logging
 from ml_collections import config_flags
 
 from logvggt_jax.compile import enable_compilation_cache
-from logvggt_jax.errors import InputError
+from logvggt_jax.errors import InputError, one_line
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.loop import NonFiniteTraining, train
 from logvggt_jax.training.processes import join_processes
@@ -59,7 +59,7 @@ def main(arguments: Sequence[str]) -> None:
     except Exception as error:
         # What a user can mend is one line (-v 1 shows where it arose); anything else is a fault of ours.
         if isinstance(error, InputError | NonFiniteTraining) and flags.FLAGS.verbosity <= 0:
-            message = f"train.py: {' '.join(str(error).split())}"
+            message = f"train.py: {one_line(error)}"
         elif jax.process_count() > 1:
             message = traceback.format_exc()
         else:
@@ -90,7 +90,7 @@ def parse_flags(arguments: list[str]) -> list[str]:
         reason = reason.args[0] if isinstance(reason, KeyError) else reason
         sys.exit(f"train.py: the configuration has no such field: {' '.join(str(reason).split())}")
     except (flags.Error, OSError) as error:
-        sys.exit(f"train.py: {' '.join(str(error).split())}")
+        sys.exit(f"train.py: {one_line(error)}")
     if flags.FLAGS["verbosity"].using_default_value:
         # Orbax reports every file at the level that absl's app would choose.
         flags.FLAGS.verbosity = logging.WARNING

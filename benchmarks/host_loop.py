@@ -105,8 +105,8 @@ class ClockPredictor:
 def write_sequence(folder: Path, frames: int) -> float:
     """JPEG files of 640 x 480 whose detail falls with its frequency, as in photographs; their mean size in kB."""
     rng = np.random.default_rng(0)
-    channels = np.stack([_surface(rng, (480, 640), 1.5) for _ in range(3)], axis=-1)
-    noise = rng.normal(0, 3, (480, 640, 3))
+    channels = np.stack([_surface(rng, (480, 640), 1.8) for _ in range(3)], axis=-1)
+    noise = rng.normal(0, 1.5, (480, 640, 3))
     picture = (128 + 50 * channels + noise).clip(0, 255).astype(np.uint8)
     for index in range(frames):
         moved = np.roll(picture, 4 * index, axis=1)

@@ -34,12 +34,16 @@ class WindowTokens(NamedTuple):
 
 
 class Aggregator(nn.Module):
-    """VGGT's trunk: in every layer a frame block (tokens of one frame see one another), then a global block (all
-    tokens of the window see one another, and what a memory adds).
+    """VGGT's trunk, alternating attention. With H^(l) the window's tokens [B, K, P, C] before layer l:
 
-    Layers run one after the other or, where their parameters come stacked (see `parameters.stack_layers`), as loops
-    between the key layers, whose bodies are compiled once each. With `remat` the stacked layers keep their input alone
-    for the backward pass.
+        F^(l)   = frame block l of H^(l)     tokens of one frame see one another
+        H^(l+1) = global block l of F^(l)    all tokens of the window see one another, and what a memory adds
+
+    What the memory adds at the key layers is the equation of cross-window attention, see `cross_window.py`.
+
+    Layers run one after the other. Where their parameters come stacked (see `parameters.stack_layers`) they run as
+    loops between the key layers, and each loop's body is compiled once. With `remat` a stacked layer keeps nothing but
+    its input for the backward pass.
     """
 
     config: ModelConfig

@@ -12,22 +12,25 @@ from logvggt_jax.model.layers import MLP, Block, dense, layer_norm
 
 
 class CameraHead(nn.Module):
-    """Float32 throughout: rotations lose orthogonality in bfloat16."""
+    """The camera tokens of a sequence to its poses, in rounds: each embeds the pose of the round before, lets it shift,
+    scale and gate the tokens (adaptive LayerNorm), runs the trunk, and adds a correction to the pose.
+
+    Float32 throughout, since rotations lose orthogonality in bfloat16.
+    """
 
     config: CameraHeadConfig
     implementation: str
 
     @nn.compact
     def __call__(self, camera_tokens: jax.Array, camera_mask: jax.Array) -> jax.Array:
-        """Pose encodings [B, N, R, 9] of all rounds, the last one best.
+        """Pose encodings [B, N, R, 9] after each of the R rounds; the last one is the best.
+
+        In the trunk every frame sees all frames that count. No gradient flows from a round into the pose of the round
+        before. Negative fields of view become 0 in the result, and stay negative in what the next round is given.
 
         Args:
           camera_tokens: [B, N, 2C].
-          camera_mask: which of them count, bool [B, N] or the first so many, int32 [B].
-
-        Frames see one another in the trunk; those that do not count are seen by none. Raw encodings accumulate
-        over rounds without gradient through the feedback; the field of view is clipped at zero on the way out
-        only.
+          camera_mask: which frames count: bool [B, N], or int32 [B] for the first so many.
         """
         config = self.config
         width = camera_tokens.shape[-1]

@@ -157,14 +157,17 @@ class Block(nn.Module):
     ) -> tuple[jax.Array, LayerMemory | None]:
         """Tokens after the block, and the memory that it leaves.
 
-        Every token of `x` is a query. Keys and values are those of the tokens of `x` that count, and what `memory`
-        adds to them; stored tokens pass through this block's own LayerNorm and projections.
+        Every token of `x` is a query. It attends to the tokens of `x` that count and to those that `memory` has stored;
+        all of them pass through this block's own LayerNorm and projections:
+
+            x ← x + γ₁ · Attn(Q(LN(x)), [K(LN(x)), K(LN(stored))], [V(LN(x)), V(LN(stored))])
+            x ← x + γ₂ · MLP(LN(x))
 
         Args:
           x: [B, n · P, C] float32, the tokens of n frames, frame after frame.
           rope: rotary table of one frame's P tokens; None for tokens without a position.
-          valid: which tokens of `x` count, see `Keys.valid`. The others are attended to by none, and what becomes of
-            them means nothing. With a memory a number of tokens or None.
+          valid: which tokens of `x` count, see `Keys.valid`; with a memory a number of tokens or None. No token
+            attends to the others, and what becomes of them means nothing.
           memory: what the block has seen before; None for its own tokens alone.
         """
         width = x.shape[-1]

@@ -164,11 +164,9 @@ class PointSelection:
         """Points of each frame, where there have to be less than qualify: by what its sample says of it."""
         frames = sorted(self._samples)
         samples = [self._samples[frame] for frame in frames]
-        qualified = [
-            np.mean(sample.bins >= self.threshold_bin) * sample.candidates if len(sample.bins) else 0.0
-            for sample in samples
-        ]
-        total = np.cumsum(qualified)
+        total = np.cumsum(
+            [np.sum(s.bins >= self.threshold_bin) * s.candidates / max(len(s.bins), 1) for s in samples], dtype=float
+        )
         # Shares rounded on the running total add up exactly.
         shares = np.floor(total / max(total[-1], 1e-9) * self.num_points).astype(int)
         return dict(zip(frames, np.diff(shares, prepend=0).tolist(), strict=True))

@@ -108,7 +108,7 @@ def reconstruct(
       point_filter: which pixels become points.
       num_previews: pictures of frames beside their depth, evenly over the sequence.
       overwrite: replace an earlier reconstruction.
-      progress: show a progress bar on standard error.
+      progress: show a progress bar where standard error is a terminal.
       workers: threads beside the one that feeds the device; None for one a core, at most eight.
 
     Raises:
@@ -152,7 +152,8 @@ def reconstruct_with(
     )
     target = Path(output).expanduser().resolve()
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Rate(), TimeRemainingColumn())
-    bars = Progress(*columns, console=Console(stderr=True), disable=not progress)
+    console = Console(stderr=True)
+    bars = Progress(*columns, console=console, disable=not (progress and console.is_terminal))
     with atomic_folder(target, replace=overwrite) as folder, FramePool(workers) as pool, bars:
         for name in (DEPTH_FOLDER, IMAGE_FOLDER, PREVIEW_FOLDER):
             (folder / name).mkdir()

@@ -262,9 +262,10 @@ def params_from_vggt(
 def config_from_vggt(state_dict: Mapping[str, np.ndarray], *, point_head: bool = False) -> ModelConfig:
     """Sizes of the VGGT that a state dict holds, with the paper's windows and refinement.
 
-    All sizes come from shapes but these, which leave no trace there: the encoder and the camera head have as many
-    attention heads as the aggregator, whose head size is that of its query norm (16 in VGGT-1B); the key layers
-    are VGGT's (4, 11, 17, 23) and need its depth of 24; the camera head runs 4 rounds.
+    Widths, depths, registers and the patch size are read off shapes. What shapes do not tell is taken from VGGT:
+    encoder, aggregator and camera head have equally many attention heads (the aggregator's query norm has the size of
+    one head: 1024 / 64 = 16 heads in VGGT-1B); the key layers are (4, 11, 17, 23), for which the aggregator must have
+    24 layers; the camera head runs 4 rounds.
 
     Args:
       state_dict: PyTorch names to arrays; a dozen small ones are read.

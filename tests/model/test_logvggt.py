@@ -12,7 +12,7 @@ import pytest
 
 from logvggt_jax import DPTConfig, LogVGGT, ModelConfig
 from logvggt_jax.evaluation.costs.operations import count_flops
-from logvggt_jax.model.parameters import in_compute_type, stack_layers, unstack_layers
+from logvggt_jax.model.parameters import in_compute_type, run, stack_layers, unstack_layers
 from logvggt_jax.model.windows import Windows
 
 FRAMES = 6
@@ -23,16 +23,25 @@ def video(num_frames: int = FRAMES, batch: int = 1) -> np.ndarray:
 
 
 @functools.lru_cache
+def applied(config: ModelConfig):
+    """Compiled once for all tests of one model."""
+    return jax.jit(LogVGGT(config).apply)
+
+
+@functools.lru_cache
 def gradient(config: ModelConfig, remat: bool):
-    """Gradient of a loss that weighs every output, of the last window's frames only if asked by the weights."""
+    """Gradient by parameters and images of a loss that weighs poses and depths of each frame."""
     model = LogVGGT(config)
 
-    def loss(variables, images, frame_weights):
+    def loss(variables, images, pose_weights, depth_weights):
         out = model.apply(variables, images, remat=remat)
-        terms = (jnp.sin(out.pose_encodings), jnp.log(out.depth), jnp.log(out.depth_confidence))
-        return sum((term * frame_weights.reshape(1, -1, *(1,) * (term.ndim - 2))).sum() for term in terms)
+        depth = (jnp.log(out.depth) + jnp.log(out.depth_confidence)).sum((2, 3))
+        return (pose_weights * jnp.sin(out.pose_encodings).sum((2, 3)) + depth_weights * depth).sum()
 
-    return jax.jit(jax.grad(loss))
+    return jax.jit(jax.grad(loss, argnums=(0, 1)))
+
+
+ALL = np.ones(FRAMES, np.float32)
 
 
 def norms(tree) -> dict[str, float]:
@@ -41,7 +50,7 @@ def norms(tree) -> dict[str, float]:
 
 
 def test_gradients_reach_what_is_trained_and_nothing_else(small_config, small_variables):
-    grads = gradient(small_config, False)(small_variables, video(), np.ones(FRAMES, np.float32))
+    grads, _ = gradient(small_config, False)(small_variables, video(), ALL, ALL)
     for name, norm in norms(grads["params"]).items():
         assert np.isfinite(norm)
         assert (norm == 0) == name.startswith("['encoder']"), name
@@ -52,9 +61,9 @@ def thawed(config: ModelConfig) -> ModelConfig:
 
 
 def test_a_thawed_encoder_is_trained_and_rematerialisation_changes_no_gradient(small_config, small_variables):
-    arguments = small_variables, video(), np.ones(FRAMES, np.float32)
-    plain = gradient(small_config, False)(*arguments)["params"]
-    again = gradient(thawed(small_config), True)(*arguments)["params"]
+    arguments = small_variables, video(), ALL, ALL
+    plain = gradient(small_config, False)(*arguments)[0]["params"]
+    again = gradient(thawed(small_config), True)(*arguments)[0]["params"]
     silent = {name for name, norm in norms(again).items() if norm == 0}
     assert silent == {"['encoder']['mask_token']"}
     for part in set(plain) - {"encoder"}:
@@ -68,18 +77,21 @@ def test_a_thawed_encoder_is_trained_and_rematerialisation_changes_no_gradient(s
 def test_training_runs_a_frozen_encoder_once_a_frame(small_config):
     """A deeper encoder makes the gradient dearer by its forward pass alone, rematerialisation or not."""
 
-    def operations(depth: int, differentiate: bool) -> float:
+    def operations(depth: int) -> tuple[float, float]:
         encoder = dataclasses.replace(small_config.encoder, depth=depth)
-        model = LogVGGT(dataclasses.replace(small_config, encoder=encoder))
-        variables = jax.eval_shape(model.init, jax.random.key(0), video())
+        windows = Windows(dataclasses.replace(small_config, encoder=encoder), remat=True)
+        variables = jax.eval_shape(LogVGGT(windows.config).init, jax.random.key(0), video())
+
+        def encode(params, images):
+            return run(windows.encoder, params, images)
 
         def loss(variables, images):
-            return jnp.log(Windows(model.config, remat=True).scan(stack_layers(variables), images).depth).sum()
+            return jnp.log(windows.scan(stack_layers(variables), images).depth).sum()
 
-        function = jax.grad(loss) if differentiate else loss
-        return count_flops(function, variables, video())
+        forward = count_flops(encode, variables["params"]["encoder"], video()[0])
+        return forward, count_flops(jax.grad(loss), variables, video())
 
-    forward, gradient = (operations(2, each) - operations(1, each) for each in (False, True))
+    forward, gradient = (deeper - shallow for deeper, shallow in zip(operations(2), operations(1), strict=True))
     assert forward > 0
     assert gradient == pytest.approx(forward, rel=1e-3)
 
@@ -111,20 +123,14 @@ def test_parameters_in_the_compute_type_give_the_same_bits(small_config, small_v
     assert half["params"]["aggregator"]["global_block_0"]["mlp"]["fc1"]["kernel"].dtype == jnp.bfloat16
     assert half["params"]["aggregator"]["global_block_0"]["norm1"]["bias"].dtype == jnp.float32
     assert half["params"]["camera_head"]["trunk_0"]["mlp"]["fc1"]["kernel"].dtype == jnp.float32
-    apply = jax.jit(model.apply)
+    apply = applied(model.config)
     jax.tree.map(np.testing.assert_array_equal, apply(half, video()), apply(small_variables, video()))
 
 
 def test_gradients_flow_through_the_cache(small_config, small_variables):
-    """A loss on the depth of the last frames depends on frame 1, which only the cache connects with them."""
-    model = LogVGGT(thawed(small_config))
-
-    def loss(images):
-        return jnp.log(Windows(model.config, remat=True).scan(stack_layers(small_variables), images).depth)[
-            :, -2:
-        ].sum()
-
-    images = jax.jit(jax.grad(loss))(video(8))
+    """A loss on the depth of the last window's frames depends on frame 1, which only the cache connects with them."""
+    last = (np.arange(FRAMES) >= FRAMES - 2).astype(np.float32)
+    _, images = gradient(thawed(small_config), True)(small_variables, video(), 0 * ALL, last)
     assert np.linalg.norm(images[0, 1]) > 0
 
 
@@ -136,8 +142,8 @@ def test_bfloat16_stays_close_to_float32(small_config, small_variables):
     variables = jax.tree.map(np.asarray, small_variables)
     output = variables["params"]["depth_head"]["output_2"]
     variables["params"]["depth_head"]["output_2"] = jax.tree.map(lambda x: 0.1 * x, output)
-    expected = jax.jit(model.apply)(variables, video())
-    actual = jax.jit(half.apply)(variables, video())
+    expected = applied(model.config)(variables, video())
+    actual = applied(half.config)(variables, video())
     assert 1.5 < np.asarray(expected.depth).max() < 100
     for name in ("camera_tokens", "register_tokens", "depth", "depth_confidence", "pose_encodings"):
         a, b = np.asarray(getattr(actual, name)), np.asarray(getattr(expected, name))
@@ -154,7 +160,7 @@ def test_parameters_are_float32_whatever_the_compute_type(small_config):
 
 def test_uint8_and_float_images_agree(small_config, small_variables):
     pixels = (video() * 255).astype(np.uint8)
-    apply = jax.jit(LogVGGT(small_config).apply)
+    apply = applied(small_config)
     a, b = apply(small_variables, pixels), apply(small_variables, pixels.astype(np.float32) / 255)
     np.testing.assert_allclose(a.depth, b.depth, rtol=1e-5)
 
@@ -163,11 +169,11 @@ def test_point_head_is_optional(small_config):
     head = DPTConfig(features=8, out_channels=(8, 8, 8, 8))
     model = LogVGGT(dataclasses.replace(small_config, point_head=head))
     variables = model.init(jax.random.key(0), video())
-    out = jax.jit(model.apply)(variables, video())
+    out = applied(model.config)(variables, video())
     assert out.points.shape == (1, FRAMES, 28, 42, 3)
     assert (np.asarray(out.points_confidence) >= 1).all()
     del variables["params"]["point_head"]
-    assert jax.jit(LogVGGT(small_config).apply)(variables, video()).points is None
+    assert applied(small_config)(variables, video()).points is None
 
 
 def test_every_prediction_starts_with_the_batch(small_config, small_variables):

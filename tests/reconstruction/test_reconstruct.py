@@ -304,11 +304,19 @@ def test_a_full_disk_stops_the_run_with_its_own_error(
     assert [entry.name for entry in tmp_path.iterdir()] == ["walk"]
 
 
-def test_one_bar_on_standard_error(walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+@pytest.mark.parametrize("terminal", ["0", "1"])
+def test_one_bar_on_standard_error_if_that_is_a_terminal(
+    walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, terminal: str
+) -> None:
+    monkeypatch.setenv("TTY_COMPATIBLE", terminal)
     reconstruct_with(Recorder, walk, tmp_path / "out", longer_edge=LONGER_EDGE, workers=2)
     shown = capsys.readouterr()
     assert shown.out == ""
-    assert shown.err.count("40/40") == 1
+    if terminal == "0":
+        assert shown.err == ""
+    else:
+        assert "Points" in shown.err and "40/40" in shown.err
+        assert shown.err.count("\n") == 1  # drawn over and over on one line
 
 
 def test_each_frame_is_resized_once_and_few_are_alive(

@@ -1,5 +1,7 @@
 """3D reconstruction on Neural RGB-D: every synthetic scene, 200, 500 and 1,000 frames at a fixed stride."""
 
+import dataclasses
+
 from logvggt_jax.evaluation.protocols.frame_selection import Leading, Spread
 from logvggt_jax.evaluation.protocols.images import PrincipalPointCrop
 from logvggt_jax.evaluation.protocols.protocol import Protocol, ProtocolSettings
@@ -32,16 +34,10 @@ def reconstruction(settings: ProtocolSettings, num_frames: int) -> Protocol:
 
 def qualitative(settings: ProtocolSettings) -> Protocol:
     """The setting of the paper's figures: the first 100 frames."""
-    return Protocol(
+    return dataclasses.replace(
+        reconstruction(settings, 500),
         name="nrgbd-figures",
         title="NRGBD, first 100 frames",
-        dataset="nrgbd",
-        splits=("all",),
         frames=Leading(100),
-        images=PrincipalPointCrop(settings.longer_edge),
-        points=settings.points,
-        poses=True,
-        trajectory=True,
-        expected=_SCENES,
         decisions=(*settings.points_decisions, _DEPTH),
     )

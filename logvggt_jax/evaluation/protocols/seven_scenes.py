@@ -1,5 +1,7 @@
 """3D reconstruction on 7-Scenes: every test sequence, 200, 500 and 1,000 frames at a fixed stride."""
 
+import dataclasses
+
 from logvggt_jax.evaluation.protocols.frame_selection import Leading, Spread
 from logvggt_jax.evaluation.protocols.images import PrincipalPointCrop
 from logvggt_jax.evaluation.protocols.protocol import Protocol, ProtocolSettings
@@ -36,16 +38,10 @@ def reconstruction(settings: ProtocolSettings, num_frames: int) -> Protocol:
 
 def qualitative(settings: ProtocolSettings) -> Protocol:
     """The setting of the paper's figures: every second frame, about 500 a sequence."""
-    return Protocol(
+    return dataclasses.replace(
+        reconstruction(settings, 500),
         name="seven_scenes-figures",
         title="7-Scenes, every second frame",
-        dataset="seven_scenes",
-        splits=("test", "all"),
         frames=Leading(None, stride=2),
-        images=PrincipalPointCrop(settings.longer_edge),
-        points=settings.points,
-        poses=True,
-        trajectory=True,
-        expected=_TEST_SEQUENCES,
         decisions=(*settings.points_decisions, _DEPTH),
     )

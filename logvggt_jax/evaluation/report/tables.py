@@ -3,6 +3,8 @@
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+from logvggt_jax.evaluation.scores import SFM
+
 MARK = "†"
 
 
@@ -32,6 +34,15 @@ class Section(NamedTuple):
     columns: tuple[Column, ...]
 
 
+_POSE = (
+    Column("ATE (m)", "ate", 4, False, "trajectory"),
+    Column("ATE / radius", "ate_ratio", 3, False, "trajectory"),
+    Column("RRA@5", "rra@5", 3, True, "pose"),
+    Column("RRA@30", "rra@30", 3, True, "pose"),
+    Column("RTA@30", "rta@30", 3, True, "pose"),
+    Column("AUC@30", "auc@30", 3, True, "pose"),
+    Column("rotation (°)", "rotation_error", 2, False, "pose"),
+)
 SECTIONS = (
     Section(
         "Depth",
@@ -42,30 +53,10 @@ SECTIONS = (
             Column("δ<1.25 (median)", "median/delta_1.25", 4, True, "depth"),
         ),
     ),
-    Section(
-        "Pose",
-        (
-            Column("ATE (m)", "ate", 4, False, "trajectory"),
-            Column("ATE / radius", "ate_ratio", 3, False, "trajectory"),
-            Column("RRA@5", "rra@5", 3, True, "pose"),
-            Column("RRA@30", "rra@30", 3, True, "pose"),
-            Column("RTA@30", "rta@30", 3, True, "pose"),
-            Column("AUC@30", "auc@30", 3, True, "pose"),
-            Column("rotation (°)", "rotation_error", 2, False, "pose"),
-            Column("rotation / identity", "rotation_ratio", 3, False, "pose"),
-        ),
-    ),
+    Section("Pose", (*_POSE, Column("rotation / identity", "rotation_ratio", 3, False, "pose"))),
     Section(
         "Pose against structure from motion",
-        (
-            Column("ATE (m)", "sfm/ate", 4, False, "sfm/trajectory"),
-            Column("ATE / radius", "sfm/ate_ratio", 3, False, "sfm/trajectory"),
-            Column("RRA@5", "sfm/rra@5", 3, True, "sfm/pose"),
-            Column("RRA@30", "sfm/rra@30", 3, True, "sfm/pose"),
-            Column("RTA@30", "sfm/rta@30", 3, True, "sfm/pose"),
-            Column("AUC@30", "sfm/auc@30", 3, True, "sfm/pose"),
-            Column("rotation (°)", "sfm/rotation_error", 2, False, "sfm/pose"),
-        ),
+        tuple(column._replace(key=SFM + column.key, group=SFM + column.group) for column in _POSE),
     ),
     Section(
         "Points (m)",

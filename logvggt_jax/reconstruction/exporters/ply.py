@@ -23,13 +23,14 @@ def export_ply(
       result: the reconstruction.
       path: the PLY file to write.
       point_filter: which pixels become points; None takes `PointFilter`'s defaults.
-      progress: show a progress bar.
+      progress: show a progress bar where standard error is a terminal.
     """
     selection = PointSelection(point_filter or PointFilter(), result.num_frames)
     with FramePool() as pool:
         frames = pool.map(lambda index: selection.see(index, *_read(result, index)), iter(range(result.num_frames)))
         console = Console(stderr=True)
-        for _ in track(frames, "Points", result.num_frames, console=console, disable=not progress):
+        hidden = not (progress and console.is_terminal)
+        for _ in track(frames, "Points", result.num_frames, console=console, disable=hidden):
             pass
         write_cloud(result, path, selection, pool)
 
