@@ -77,13 +77,9 @@ class BlendedMVS(FolderDataset):
         return [other for other, _ in self.covisibility(sequence).get(index, [])]
 
     def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
-        names = files.names(self.root, self.expects)
-        scenes = [name for name in names if _SCENE.fullmatch(name) and (self.root / name).is_dir()]
-        if self.split != "all":
-            scenes = self._listed(scenes, files)
-        return {name: self.root / name for name in scenes}
-
-    def _listed(self, scenes: list[str], files: SourceFiles) -> list[str]:
+        scenes = files.folders(self.root, self.expects, _SCENE)
+        if self.split == "all":
+            return scenes
         path = self.root / _LIST_FILES[self.split]
         if not files.exists(path):
             path = self.root / "project_lists" / path.name
@@ -92,7 +88,7 @@ class BlendedMVS(FolderDataset):
         for name in listed:
             if not _SCENE.fullmatch(name):
                 raise InputError(f"{path}: expected lines of 24 hexadecimal digits, got {name!r}: restore the file")
-        return sequences_present(listed, scenes, path)
+        return {name: scenes[name] for name in sequences_present(listed, scenes, path)}
 
     def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
         kinds = (("blended_images", "{:08d}.jpg"), ("rendered_depth_maps", "{:08d}.pfm"), ("cams", "{:08d}_cam.txt"))

@@ -48,16 +48,11 @@ class PointOdyssey(FolderDataset):
     )
 
     def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
-        folders = [self.root / split for split in _SPLITS]
-        if self.split == "all":
-            folders = [folder for folder in folders if files.exists(folder)]
-        else:
-            folders = [self.root / self.split]
+        chosen = [self.split] if self.split != "all" else [s for s in _SPLITS if files.exists(self.root / s)]
         return {
-            f"{folder.name}/{name}": folder / name
-            for folder in folders
-            for name in files.names(folder, f"the sequences of this split of {self.title}")
-            if (folder / name).is_dir()
+            f"{split}/{name}": folder
+            for split in chosen
+            for name, folder in files.folders(self.root / split, f"the sequences of this split of {self.title}").items()
         }
 
     def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:

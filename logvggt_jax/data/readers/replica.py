@@ -47,11 +47,8 @@ class Replica(FolderDataset):
 
     def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
         folders = {name: self.root / name for name in files.names(self.root, "scenes")}
-        return {
-            name: folder
-            for name, folder in folders.items()
-            if files.exists(folder / "results") or files.exists(folder / "traj.txt")
-        }
+        signs = ("results", "traj.txt")
+        return {name: each for name, each in folders.items() if any(files.exists(each / sign) for sign in signs)}
 
     def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
         camera = _camera(self.root / "cam_params.json", files)

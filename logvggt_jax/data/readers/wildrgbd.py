@@ -59,8 +59,7 @@ class WildRGBD(FolderDataset):
             scenes = self.root / category / "scenes"
             if not files.exists(scenes):
                 continue
-            names = [name for name in files.names(scenes, "scenes") if _SCENE.fullmatch(name)]
-            present = {f"{category}/{name}" for name in names if (scenes / name).is_dir()} - _EXCLUDED
+            present = {f"{category}/{name}" for name in files.folders(scenes, "scenes", _SCENE)} - _EXCLUDED
             if self.split != "all":
                 training = _training_scenes(self.root / category, files)
                 if self.split == "train":
