@@ -37,9 +37,7 @@ def load_clip(
 ) -> ClipData:
     """Reads the frames `indices` of `sequence` one by one.
 
-    Raises:
-      InputError, OSError: as the data set's `read`, and where images of one clip differ in size.
-      ValueError: no frames are asked for.
+    Raises as the data set's `read`, InputError where images of one clip differ in size, ValueError without frames.
     """
     count = len(indices)
     clip: ClipData | None = None

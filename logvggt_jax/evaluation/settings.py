@@ -85,8 +85,7 @@ class PaperRun(Run):
 def read_run(values: Mapping[str, Any]) -> ClipRun | PaperRun:
     """The run that a configuration file's mapping describes: the paper's where it names `benchmarks`.
 
-    Raises:
-      InputError: an unknown, missing or impossible field; named.
+    Raises InputError naming an unknown, missing or impossible field.
     """
     if "benchmarks" in values:
         return from_mapping(PaperRun, values, "config")

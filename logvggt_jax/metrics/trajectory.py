@@ -48,9 +48,8 @@ def trajectory_errors(predicted_poses: np.ndarray, true_poses: np.ndarray) -> di
 def align_trajectory(predicted_poses: np.ndarray, true_poses: np.ndarray) -> np.ndarray:
     """Camera-to-world poses [N, 4, 4] carried into the world and the unit of the true ones.
 
-    Raises:
-      NotMeasurable: positions admit no unique similarity, or a pose is not finite.
-      ValueError: lengths or shapes differ.
+    Raises NotMeasurable where positions admit no unique similarity or a pose is not finite, ValueError where lengths or
+    shapes differ.
     """
     predicted = checked_poses(predicted_poses, "predicted_poses")
     true = checked_poses(true_poses, "true_poses")

@@ -25,13 +25,8 @@ def camera_losses(
 ) -> dict[str, Mean]:
     """Translation, rotation and field-of-view terms, each (1/S) sum_s gamma^(S-s) of a mean absolute difference.
 
-    A clip counts if its first frame has more than 100 valid pixels.
-
-    Args:
-      pose_encodings: [B, T, S, 9].
-      target: [B, T, 9].
-      frame_valid: [B, T] bool.
-      depth_valid: [B, T, H, W] bool.
+    The rounds [B, T, S, 9] are compared with the target [B, T, 9] where `frame_valid` bool [B, T], in clips whose first
+    frame has more than 100 pixels that are `depth_valid` bool [B, T, H, W].
     """
     rounds = pose_encodings.shape[-2]
     decay = jnp.asarray([gamma ** (rounds - 1 - s) / rounds for s in range(rounds)], jnp.float32)
@@ -59,13 +54,8 @@ def depth_losses(
 ) -> dict[str, Mean]:
     """Confidence, regression and multi-scale gradient terms of the depth loss; 0 below 100 valid pixels.
 
-    `quantile` drops the largest errors of the first two terms (None: keeps all).
-
-    Args:
-      depth: [B, T, H, W], predicted.
-      confidence: [B, T, H, W], at least 1.
-      target: [B, T, H, W].
-      valid: [B, T, H, W] bool.
+    Predicted depth, its confidence (at least 1), target and `valid` (bool) are [B, T, H, W]. `quantile` drops the
+    largest errors of the first two terms (None: keeps all).
     """
     target = _bounded(target)
     enough = valid.sum() >= MIN_PIXELS

@@ -51,11 +51,7 @@ def check_held_out(
 ) -> None:
     """Raises InputError naming the training `sequences` of data set `name` that `rule` holds out.
 
-    Args:
-      name: of the data set.
-      sequences: those to be trained on.
-      rule: what is held out.
-      split_sequences: the sequences of a split of the same data set.
+    `split_sequences` gives the sequences of a split of the same data set.
     """
     of_split = set() if rule.split is None else set(split_sequences(rule.split))
     shared = [sequence for sequence in sequences if sequence in of_split or rule.matches(sequence)]

@@ -57,11 +57,7 @@ class BlendedMVS(FolderDataset):
 
         The scores are those of `cams/pair.txt`: larger where two photographs share more of the scene's points seen
         under a good angle; they have no unit. At most ten neighbours a frame, and not always both ways. Photographs
-        that do not count as frames are left out.
-
-        Raises:
-          MissingFiles: no `pair.txt`.
-          InputError: it is damaged.
+        that do not count as frames are left out. Raises MissingFiles without that file, InputError where it is damaged.
         """
         index = {int(name): i for i, name in enumerate(self.frame_names(sequence))}
         path = self._places[sequence] / "cams" / "pair.txt"

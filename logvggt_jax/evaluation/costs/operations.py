@@ -8,18 +8,12 @@ from jax.extend import core
 
 
 def count_flops(function: Callable[..., Any], *arguments: Any) -> float:
-    """Operations of one call, a multiply-add counted as two.
+    """Operations of one call, a multiply-add counted as two, on arrays or `jax.ShapeDtypeStruct`, or pytrees of them.
 
-    XLA's cost analysis counts the body of a loop once. Here every `lax.scan` (`lax.map`, `fori_loop` with fixed
-    bounds) counts as often as it runs, whatever the depth of nesting. Nothing is compiled and nothing is run.
-
-    Args:
-      function: what `jax.jit` takes. Kernels that XLA does not know inside of (cuDNN, Pallas) count nothing: give a
-        model with `attention="xla"`.
-      *arguments: arrays or `jax.ShapeDtypeStruct`, or pytrees of them.
-
-    Raises:
-      ValueError: a loop whose number of trips is not fixed.
+    XLA's cost analysis counts the body of a loop once. Here every `lax.scan` (`lax.map`, `fori_loop` with fixed bounds)
+    counts as often as it runs, whatever the depth of nesting. Nothing is compiled and nothing is run. Kernels that XLA
+    does not know inside of (cuDNN, Pallas) count nothing: give a model with `attention="xla"`. Raises ValueError for a
+    loop whose number of trips is not fixed.
     """
     return _costs(jax.make_jaxpr(function)(*arguments), {})[0]
 
