@@ -53,8 +53,11 @@ def stack_layers(tree: Any) -> Any:
     return jax.tree.map(stack, tree, is_leaf=_has_layers)
 
 
-def unstack_layers(tree: Any, take: Callable[[Any, int], Any] = lambda x, layer: x[layer]) -> Any:
-    """Inverse of `stack_layers`; `take` makes one layer's leaf of a stacked one."""
+def unstack_layers(tree: Any, config: ModelConfig, take: Callable[[Any, int], Any] = lambda x, layer: x[layer]) -> Any:
+    """Inverse of `stack_layers` for a model of these sizes; `take` makes one layer's leaf of a stacked one.
+
+    Stacks without leaves, which an optimiser's state has for what is frozen, come apart as well.
+    """
 
     def unstack(node: Any) -> Any:
         if not _is_stacked(node):
@@ -64,7 +67,8 @@ def unstack_layers(tree: Any, take: Callable[[Any, int], Any] = lambda x, layer:
             if not _STACK.fullmatch(name):
                 layers[name] = inner
                 continue
-            for layer in range(jax.tree.leaves(inner)[0].shape[0]):
+            depth = config.encoder.depth if name == "blocks" else config.aggregator.depth
+            for layer in range(depth):
                 layers[f"{name.removesuffix('s')}_{layer}"] = jax.tree.map(lambda x, i=layer: take(x, i), inner)
         return layers
 

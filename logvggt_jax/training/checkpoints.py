@@ -68,7 +68,7 @@ class RunCheckpoints:
         failure: Exception | None = None
         if jax.process_index() == 0:
             try:
-                layers = unstack_layers(jax.device_get(params))
+                layers = unstack_layers(jax.device_get(params), self.config.model)
                 save_model(self.model_folder, self.config.model, layers, self._provenance())
             except Exception as error:
                 failure = error
@@ -117,7 +117,9 @@ class RunCheckpoints:
         self._check_configuration(meta["config"], where)
         # Earlier versions kept every layer's parameters and moments by themselves.
         layer_by_layer = meta.get("layers") != "stacked"
-        params, rest = _parts(unstack_layers(like, _one_layer) if layer_by_layer else like)
+        if layer_by_layer:
+            like = unstack_layers(like, self.config.model, _one_layer)
+        params, rest = _parts(like)
         restored = self._read(
             chosen,
             ocp.args.Composite(
