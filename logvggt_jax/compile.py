@@ -1,7 +1,5 @@
 """Before anything compiles: the devices that were asked for, and a cache of compiled programs."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import warnings
@@ -48,14 +46,9 @@ def default_cache_folder() -> Path:
 
 
 def enable_compilation_cache(folder: str | None = None) -> Path | None:
-    """Turns JAX's persistent compilation cache on.
+    """Turns JAX's persistent compilation cache on in `folder`, which it returns; `none` leaves it off and gives None.
 
-    Args:
-      folder: where; `none` leaves the cache off. Default: JAX's own `JAX_COMPILATION_CACHE_DIR` if set, else
-        `default_cache_folder`.
-
-    Returns:
-      The folder, or None for `none`.
+    The default is JAX's own `JAX_COMPILATION_CACHE_DIR` if set, else `default_cache_folder`.
     """
     if folder == "none":
         jax.config.update("jax_enable_compilation_cache", False)

@@ -1,7 +1,5 @@
 """The package's layering: who may import whom, read from the source (CONTRIBUTING states the same rule)."""
 
-from __future__ import annotations
-
 import ast
 from pathlib import Path
 
