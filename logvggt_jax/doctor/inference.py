@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Iterator
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,10 +13,10 @@ import numpy as np
 
 from logvggt_jax.doctor.finding import Finding
 from logvggt_jax.doctor.subject import Subject, random_variables
-from logvggt_jax.evaluation.costs.operations import count_flops
 from logvggt_jax.evaluation.costs.parts import abstract_variables, matmul_flops_per_second
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.model.parameters import in_compute_type
+from logvggt_jax.operations import count_flops
 
 _ATTENTION_CALLS = {"gpu": "__cudnn$fmha", "tpu": "tpu_custom_call"}
 
@@ -32,9 +33,9 @@ def examine(subject: Subject) -> Iterator[Finding]:
     step = jax.jit(model.step, donate_argnums=1).lower(variables, state, frames).compile()
     yield Finding("inference", "compilation", time.perf_counter() - started, "s")
     if platform in _ATTENTION_CALLS:
-        calls, wanted = step.as_text().count(_ATTENTION_CALLS[platform]), _num_attentions(model)
+        calls, wanted = (step.as_text() or "").count(_ATTENTION_CALLS[platform]), _num_attentions(model)
         yield Finding("inference", "fast attention calls", float(calls), ok=calls == wanted, note=f"of {wanted}")
-    memory = step.memory_analysis()
+    memory: Any = step.memory_analysis()
     for what, size in (("arguments", memory.argument_size_in_bytes), ("temporaries", memory.temp_size_in_bytes)):
         yield Finding("inference", what, size / 2**30, "GiB")
 
