@@ -90,20 +90,24 @@ def depth_losses(
 
 
 def _bounded(values: jax.Array) -> jax.Array:
+    """Values of any shape within ±`LIMIT`, 0 where they are not finite."""
     return jnp.clip(jnp.where(jnp.isfinite(values), values, 0.0), -LIMIT, LIMIT)
 
 
 def _norm(values: jax.Array) -> jax.Array:
+    """l2 norm over the last axis, [..., C] -> [..., 1], whose gradient at zero is zero."""
     squared = (values * values).sum(-1, keepdims=True)
     positive = squared > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0)
 
 
 def _shard_value(value: jax.Array) -> Mean:
+    """A scalar of one device as a term that is averaged over devices."""
     return Mean(value, jnp.ones_like(value))
 
 
 def _mean_below_quantile(values: jax.Array, valid: jax.Array, quantile: float | None) -> jax.Array:
+    """Scalar mean of the valid of `values` [B, T, H, W] below their quantile, as the released trainer filters."""
     values, valid = values.reshape(-1), valid.reshape(-1)
     count = valid.sum()
     if quantile is None:
@@ -127,6 +131,7 @@ def _mean_below_quantile(values: jax.Array, valid: jax.Array, quantile: float | 
 def _gradient_loss(
     error: jax.Array, confidence: jax.Array, valid: jax.Array, *, alpha: float, confident: bool
 ) -> jax.Array:
+    """Scalar: differences between neighbouring pixels of `error` [B, T, H, W], averaged over scales."""
     total = jnp.zeros_like(error[0, 0, 0, 0])
     for stride in GRADIENT_SCALES:
         d, c, m = (array[..., ::stride, ::stride] for array in (error, confidence, valid))
