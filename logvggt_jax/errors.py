@@ -1,7 +1,5 @@
 """Errors of what a user gave, which entry points shorten to one line; any other exception keeps its traceback."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -35,9 +33,7 @@ class DiskError(InputError, OSError):
 def disk_errors(path: str | Path) -> Iterator[None]:
     """Turns the operating system's errors in the block, which reads or writes `path`, into one line that names it.
 
-    Raises:
-      MissingInput: the file is not there.
-      DiskError: any other OSError. An InputError passes through unchanged.
+    MissingInput where the file is not there, DiskError for any other OSError; an InputError passes through unchanged.
     """
     try:
         yield

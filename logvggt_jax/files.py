@@ -1,7 +1,5 @@
 """Results appear whole or not at all: files and folders written under another name and renamed at the end."""
 
-from __future__ import annotations
-
 import os
 import secrets
 import shutil
@@ -16,10 +14,8 @@ from logvggt_jax.errors import OutputExists, disk_errors
 def atomic_file(path: str | Path) -> Iterator[Path]:
     """A temporary name beside `path` that becomes `path` when the block ends, and vanishes if it fails.
 
-    The name is this run's own and keeps the suffix of `path`, from which libraries take the format.
-
-    Raises:
-      DiskError, MissingInput: the file cannot be written, whatever the operating system's reason.
+    The name is this run's own and keeps the suffix of `path`, from which libraries take the format. Raises DiskError or
+    MissingInput where the file cannot be written, whatever the operating system's reason.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.stem}.{_unique()}{path.suffix}")
@@ -39,19 +35,12 @@ def write_text(path: str | Path, text: str) -> None:
 
 @contextmanager
 def atomic_folder(path: str | Path, *, replace: bool = False) -> Iterator[Path]:
-    """A folder to fill that becomes `path` when the block ends, and vanishes if it fails.
+    """A folder to fill, `<path>.<unique>.partial`, that becomes `path` when the block ends, and vanishes if it fails.
 
-    Args:
-      path: the folder to make; its parents are made too.
-      replace: replace what is at `path`, which then goes once the new folder stands in its place. Callers make sure
-        that it is worth no more than the new one (`check_output`).
-
-    Yields:
-      `<path>.<unique>.partial`, which exists and is empty.
-
-    Raises:
-      OutputExists: something is at `path` and `replace` is not set; or came to be there in the meantime.
-      DiskError: the folder cannot be made or renamed.
+    Its parents are made too. With `replace` what is at `path` goes once the new folder stands in its place; callers
+    make sure that it is worth no more than the new one (`check_output`). Raises OutputExists where something is at
+    `path` and `replace` is not set, or came to be there in the meantime; DiskError where the folder cannot be made or
+    renamed.
     """
     path = Path(path)
     if not replace and path.exists():
@@ -68,16 +57,10 @@ def atomic_folder(path: str | Path, *, replace: bool = False) -> Iterator[Path]:
 
 
 def check_output(output: str | Path, *, overwrite: bool, marker: str) -> Path:
-    """The absolute path of `output`, provided that a result may be written there.
+    """The absolute path of `output`, provided that a result may be written there; OutputExists otherwise.
 
-    Args:
-      output: the folder to make.
-      overwrite: an existing `output` may be replaced, provided it is empty or holds `marker`, so that a slip of the
-        keyboard deletes no other folder.
-      marker: a file that every finished folder of this kind has.
-
-    Raises:
-      OutputExists: it exists and may not be replaced.
+    With `overwrite` an existing folder may be replaced, provided it is empty or holds `marker`, a file that every
+    finished folder of this kind has, so that a slip of the keyboard deletes no other folder.
     """
     output = Path(output).expanduser().resolve()
     if not output.exists():

@@ -1,7 +1,5 @@
 """Frames of a data set, the one value that crosses package borders without JAX."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

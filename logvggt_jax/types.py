@@ -7,8 +7,6 @@ head, N camera tokens, M frames with register tokens.
 Frames of reference are OpenCV's throughout: x right, y down, z forward, pixel centres at integers.
 """
 
-from __future__ import annotations
-
 import jax
 from flax import struct
 

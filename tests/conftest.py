@@ -1,7 +1,5 @@
 """Shared fixtures: a small model, and the reference data that lie beside the repository where they exist."""
 
-from __future__ import annotations
-
 import ctypes
 import gc
 import os

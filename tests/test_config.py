@@ -1,7 +1,5 @@
 """Mappings to settings and back, and the model's: one line names the field of what does not fit."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

@@ -1,7 +1,5 @@
 """The files under `configs/`: each builds its run, and the largest one's whole step is checked on shapes."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import importlib

@@ -1,7 +1,5 @@
 """Files and folders appear whole or not at all, whatever happens while they are written."""
 
-from __future__ import annotations
-
 import errno
 from pathlib import Path
 

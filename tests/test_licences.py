@@ -3,8 +3,6 @@
 The LGPL is allowed, since its libraries may be used by programs under other licences. evo (GPL) is in the extra `eval`.
 """
 
-from __future__ import annotations
-
 import re
 import tomllib
 from collections.abc import Iterator

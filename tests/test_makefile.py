@@ -1,7 +1,5 @@
 """The commands that `make demo` runs exist, as do the settings that they name."""
 
-from __future__ import annotations
-
 import functools
 import importlib.util
 import operator

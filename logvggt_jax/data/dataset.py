@@ -1,7 +1,5 @@
 """What every reader offers, and the checks that its frames pass before they reach a model."""
 
-from __future__ import annotations
-
 import abc
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass

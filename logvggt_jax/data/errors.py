@@ -3,8 +3,6 @@
 All are `InputError`; their message names the file and the mend.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType

@@ -8,10 +8,4 @@ from logvggt_jax.metrics import (
     trajectory_errors,
 )
 
-__all__ = [
-    "depth_metrics",
-    "point_cloud_metrics",
-    "pose_accuracy",
-    "relative_pose_errors",
-    "trajectory_errors",
-]
+__all__ = ["depth_metrics", "point_cloud_metrics", "pose_accuracy", "relative_pose_errors", "trajectory_errors"]

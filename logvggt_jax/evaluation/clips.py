@@ -1,7 +1,5 @@
 """One clip read for evaluation: images for the network and the truth, on disk where they are large."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -39,9 +37,7 @@ def load_clip(
 ) -> ClipData:
     """Reads the frames `indices` of `sequence` one by one.
 
-    Raises:
-      InputError, OSError: as the data set's `read`, and where images of one clip differ in size.
-      ValueError: no frames are asked for.
+    Raises as the data set's `read`, InputError where images of one clip differ in size, ValueError without frames.
     """
     count = len(indices)
     clip: ClipData | None = None

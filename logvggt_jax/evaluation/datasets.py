@@ -1,7 +1,5 @@
 """Data sets as evaluation opens them: rooms at the model's size, everything else from disk, missing ones named."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -24,8 +22,7 @@ def open_run(
 ) -> tuple[list[Benchmark], Callable[[LogVGGT], list[Method]]]:
     """The benchmarks of a run, and what makes its baselines once the model is known (nothing where it wants none).
 
-    Raises:
-      InputError, OSError: as `open_benchmarks` and `open_evaluation_set`.
+    Raises as `open_benchmarks` and `open_evaluation_set`.
     """
     if isinstance(run, PaperRun):
         protocols = chosen_protocols(run.protocol, run.benchmarks)
@@ -48,27 +45,14 @@ def open_run(
 
 
 def open_evaluation_set(
-    name: str,
-    root: str | None,
-    *,
-    split: str,
-    image_size: tuple[int, int],
-    rooms: Mapping[str, Any] | None = None,
+    name: str, root: str | None, *, split: str, image_size: tuple[int, int], rooms: Mapping[str, Any] | None = None
 ) -> tuple[Dataset, Dataset, str]:
     """The data set to evaluate, and the one whose mean depth the baselines know, with its name for the table.
 
-    Args:
-      name: one of `logvggt_jax.data.DATASETS`.
-      root: its folder; None for `rooms`.
-      split: `train`, `val`, `test` or `all`.
-      image_size: (H, W); rooms are rendered at this size, as they are for training.
-      rooms: further options of `logvggt_jax.data.rooms.rooms.Rooms`, for `rooms` alone.
-
-    Returns:
-      Rooms are paired with their training split. Any other set has to lend its own mean, and the name says so.
-
-    Raises:
-      InputError: `root` is missing, does not hold the data set, or is given for `rooms`; an unknown option of rooms.
+    Rooms, whose `root` is None and whose further options are `rooms`, are rendered at `image_size` (H, W), as they are
+    for training, and paired with their training split. Any other set has to lend its own mean, and the name says so.
+    Raises InputError where `root` is missing, does not hold the data set, or is given for rooms, and for an unknown
+    option of rooms.
     """
     if name != "rooms":
         if root is None:
@@ -87,14 +71,8 @@ def open_benchmarks(
 ) -> list[Benchmark]:
     """Each protocol with its data, from the folder `data_root`/<data set's name>, or with the reason why it has none.
 
-    Args:
-      protocols: the benchmarks asked for.
-      data_root: folder of one folder a data set (`seven_scenes`, `nrgbd`, `sintel`, …); None where there is none.
-      settings: `longer_edge` and `rooms` are used, for rooms, which are rendered.
-
-    Raises:
-      InputError: `data_root` is not a folder, or has none of the data sets that were asked for; an unknown option of
-        rooms.
+    Of the settings `longer_edge` and `rooms` are used, for rooms, which are rendered. Raises InputError where
+    `data_root` is not a folder, or has none of the data sets that were asked for, and for an unknown option of rooms.
     """
     root = None if data_root is None else Path(data_root)
     if root is not None and not root.is_dir():

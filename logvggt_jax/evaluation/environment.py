@@ -1,7 +1,5 @@
 """What a result was computed with: versions, commit, code, device."""
 
-from __future__ import annotations
-
 import ast
 import functools
 import hashlib
@@ -52,9 +50,7 @@ def environment() -> dict[str, Any]:
 def code_version(*more: str, package: Path = _PACKAGE) -> str:
     """Digest of the code that decides numbers; comments, docstrings and layout are not in it.
 
-    Args:
-      *more: files and folders of the package besides those that decide what is measured on a clip.
-      package: folder of the package.
+    `more` are files and folders of the `package` besides those that decide what is measured on a clip.
     """
     digest = hashlib.blake2b(digest_size=12)
     for part in (*_DECIDING, *more):

@@ -1,7 +1,5 @@
 """Progress of the long steps inside one clip, shown where an evaluation has opened a display."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterable, Iterator
 from contextvars import ContextVar

@@ -1,7 +1,5 @@
 """Results of single clips, one JSON line each, written as they come and found again by a later run."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json

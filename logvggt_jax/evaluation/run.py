@@ -1,7 +1,5 @@
 """A whole evaluation, from a configuration's values to the tables on disk."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Runs methods over the clips of benchmarks, one clip at a time, and writes results as they come."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import json
@@ -284,7 +282,7 @@ def _collected(
         for method in methods:
             asked = [keys[clip, method.name] for clip in clips if (clip, method.name) in keys]
             done = [records[key] for key in asked if key in records]
-            scores = [(record["sequence"], _score(record)) for record in done]
+            scores = [(each["sequence"], ClipScore(each["metrics"], each["failures"])) for each in done]
             if done:
                 score = benchmark_score(protocol, method, scores, planned)
                 summary.append(
@@ -301,10 +299,6 @@ def _all_failed(records: ClipRecords, keys: Iterable[str]) -> str:
     """The first method's reason where nothing was predicted at all, else nothing."""
     reasons = [records[key]["failures"].get(PREDICTION, "") for key in keys if key in records]
     return reasons[0] if all(reasons) else ""
-
-
-def _score(record: Mapping[str, Any]) -> ClipScore:
-    return ClipScore(dict(record["metrics"]), dict(record["failures"]))
 
 
 def _where(clip: Clip) -> dict[str, Any]:

@@ -1,7 +1,5 @@
 """What is measured on one clip, and how a benchmark's score is made of clips."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
@@ -116,22 +114,14 @@ def clip_score(method: Method, prediction: ClipPrediction, truth: ClipTruth, pro
 def benchmark_score(
     protocol: Protocol, method: Method, scores: Sequence[tuple[str, ClipScore]], planned: int
 ) -> dict[str, float]:
-    """Means over clips; metrics without any clip are absent.
+    """Means over the clips that were predicted (sequence and score); metrics without any clip are absent.
 
-    Depth is weighted by valid pixels, all else plain, but relative poses of a `pooled` protocol: their pairs are
-    pooled within a category, and the mean is over categories. `rotation_ratio` is the mean rotation error over the
-    mean that no motion at all would have.
-
-    Args:
-      protocol: the benchmark.
-      method: the method.
-      scores: sequence and score of every clip that was predicted.
-      planned: clips that the benchmark asked for, among them those that could not be read or predicted.
-
-    Returns:
-      The means; `clips`, the planned number, and `clips_measured`, of how many anything is known; and `clips_depth`,
-      `clips_pose`, `clips_trajectory`, `clips_points` (and with `sfm/`), how many of them are in each mean, for the
-      groups that method and protocol measure.
+    Depth is weighted by valid pixels, all else plain, but relative poses of a `pooled` protocol: their pairs are pooled
+    within a category, and the mean is over categories. `rotation_ratio` is the mean rotation error over the mean that
+    no motion at all would have. Besides: `clips`, the number `planned`, those included that could not be read or
+    predicted; `clips_measured`, of how many anything is known; and `clips_depth`, `clips_pose`, `clips_trajectory`,
+    `clips_points` (and with `sfm/`), how many of them are in each mean, for the groups that method and protocol
+    measure.
     """
     result: dict[str, float] = {"clips": planned, "clips_measured": sum(bool(score.metrics) for _, score in scores)}
     if protocol.depth is not None and method.depth:
@@ -168,10 +158,9 @@ def valid_indices(depth: np.ndarray, points: PointsMeasure) -> np.ndarray:
 def valid_pixels(prediction: np.ndarray, target: np.ndarray, max_depth: float | None) -> tuple[np.ndarray, np.ndarray]:
     """Predicted and true depth [N] of a clip's valid pixels, in order, on disk where they are many.
 
-    Args:
-      prediction: [T, h, w], resized frame by frame as `resize_depth` does where its size is not the target's.
-      target: [T, H, W]. Both may be memory maps: one frame is in memory at a time.
-      max_depth: metres; exclusive bound of valid depth, None for none.
+    The prediction [T, h, w] is resized frame by frame, as `resize_depth` does, where its size is not that of the target
+    [T, H, W]; both may be memory maps, of which one frame is in memory at a time. Depth from `max_depth` metres on is
+    not valid; None for no bound.
     """
     count = sum(int(valid_depth(frame, max_depth).sum()) for frame in target)
     predicted, true = scratch_array((count,), prediction.dtype), scratch_array((count,), target.dtype)
@@ -189,9 +178,8 @@ def valid_pixels(prediction: np.ndarray, target: np.ndarray, max_depth: float | 
 def aligned_points(prediction: ClipPrediction, truth: ClipTruth) -> np.ndarray:
     """Predicted points [N, 3] of the compared pixels, moved by the similarity that fits the true ones best.
 
-    Raises:
-      NotMeasurable: no true points, a prediction that is not finite, no similarity.
-      ValueError: the method predicts no depth or intrinsics, or depth of another size.
+    Raises NotMeasurable without true points, a finite prediction or a similarity; ValueError where the method predicts
+    no depth or intrinsics, or depth of another size.
     """
     if truth.indices is None or truth.points is None or truth.clip.depth is None:
         raise NotMeasurable("the clip has no true points (no valid depth or no true poses)")

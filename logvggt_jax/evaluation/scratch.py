@@ -1,7 +1,5 @@
 """Arrays of a clip: in memory while they are small, else in an unnamed temporary file."""
 
-from __future__ import annotations
-
 import math
 import shutil
 import tempfile
@@ -17,11 +15,8 @@ _IN_MEMORY = 256 * 2**20  # bytes
 def scratch_array(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
     """Zeros of this shape; beyond 256 MiB in a file that vanishes with the array, however the process ends.
 
-    The file lies in the system's temporary folder (environment variable TMPDIR). Its pages are the operating
-    system's to write out, so that clips of any length fit the memory.
-
-    Raises:
-      DiskError: the folder has too little space; names it.
+    The file lies in the system's temporary folder (environment variable TMPDIR). Its pages are the operating system's
+    to write out, so that clips of any length fit the memory. Raises DiskError naming a folder with too little space.
     """
     size = math.prod(shape) * np.dtype(dtype).itemsize
     if size <= _IN_MEMORY:

@@ -1,7 +1,5 @@
 """What a file of `configs/eval` says: a run over clips of one data set, or over the paper's benchmarks."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from typing import Any
@@ -87,8 +85,7 @@ class PaperRun(Run):
 def read_run(values: Mapping[str, Any]) -> ClipRun | PaperRun:
     """The run that a configuration file's mapping describes: the paper's where it names `benchmarks`.
 
-    Raises:
-      InputError: an unknown, missing or impossible field; named.
+    Raises InputError naming an unknown, missing or impossible field.
     """
     if "benchmarks" in values:
         return from_mapping(PaperRun, values, "config")

@@ -16,12 +16,7 @@ from logvggt_jax.geometry.cameras import (
     unproject_pixels,
 )
 from logvggt_jax.geometry.pose_encoding import decode_poses, encode_poses
-from logvggt_jax.geometry.rotations import (
-    matrix_to_quaternion,
-    nearest_rotation,
-    quaternion_to_matrix,
-    rotation_angle,
-)
+from logvggt_jax.geometry.rotations import matrix_to_quaternion, nearest_rotation, quaternion_to_matrix, rotation_angle
 from logvggt_jax.geometry.similarity import Similarity, robust_similarity, umeyama
 
 __all__ = [

@@ -1,7 +1,5 @@
 """Pinhole cameras: world-to-camera extrinsics (OpenCV axes), intrinsics in pixels, centres at integers."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -77,11 +75,8 @@ def unproject_pixels(
 ) -> np.ndarray:
     """World points [N, 3] float64 of some pixels of a clip (numpy), as `unproject` gives them for all.
 
-    Args:
-      depth: [T, H, W] z-depth; may be a memory map, of which one frame at a time is read.
-      intrinsics: [T, 3, 3] in pixels.
-      extrinsics: [T, 3|4, 4], world-to-camera.
-      indices: [N], sorted and flat in [T, H, W].
+    Z-depth is [T, H, W] and may be a memory map, of which one frame at a time is read; intrinsics [T, 3, 3] are in
+    pixels, extrinsics [T, 3|4, 4] world-to-camera; `indices` [N] are sorted and flat in [T, H, W].
     """
     height, width = depth.shape[1:]
     borders = np.searchsorted(indices, np.arange(len(depth) + 1) * height * width)

@@ -1,7 +1,5 @@
 """VGGT's pose encoding: translation (3), quaternion x y z w (4), vertical and horizontal field of view (2)."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from logvggt_jax.geometry.rotations import matrix_to_quaternion, namespace, quaternion_to_matrix

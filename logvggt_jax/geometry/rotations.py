@@ -1,7 +1,5 @@
 """Rotations: quaternions (x, y, z, w), matrices, angles."""
 
-from __future__ import annotations
-
 from typing import Any
 
 

@@ -1,7 +1,5 @@
 """Similarity transforms between corresponding points (numpy, float64): Umeyama and a robust variant."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -3,8 +3,6 @@
 Source: the evaluation code of CUT3R and its descendants (`eval/video_depth/tools.py`), in float64.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
@@ -75,12 +73,9 @@ def pixel_errors(
 ) -> dict[str, float]:
     """The errors of `depth_metrics` from the valid pixels of a clip.
 
-    Args:
-      prediction: [N] depth of the valid pixels; may be a memory map, of which a block at a time is read.
-      target: [N] true depth of the same pixels, all above 0; likewise.
-      alignment: as in `depth_metrics`; measured on all N pixels.
-      clip: as in `depth_metrics`.
-      scored: bool [N], the pixels whose errors count; None for all.
+    Predicted and true depth are [N], the true above 0; both may be memory maps, of which a block at a time is read.
+    `alignment` and `clip` are those of `depth_metrics`, measured on all N pixels; `scored` bool [N] are the pixels
+    whose errors count, None for all.
     """
     if alignment not in ALIGNMENTS:
         raise ValueError(f"depth_metrics: alignment must be one of {ALIGNMENTS}, got {alignment!r}")

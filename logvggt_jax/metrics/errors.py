@@ -1,7 +1,5 @@
 """What a clip or a prediction does not admit."""
 
-from __future__ import annotations
-
 
 class NotMeasurable(ValueError):
     """A metric has no value here: nothing valid, a value that is not finite, no similarity. The message says why.

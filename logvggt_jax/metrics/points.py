@@ -4,8 +4,6 @@ Source: the evaluation code of CUT3R and its descendants (`eval/mv_recon`); ICP 
 neighbours by SciPy.
 """
 
-from __future__ import annotations
-
 import ctypes
 import importlib
 from typing import Any
@@ -13,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from logvggt_jax.errors import MissingPackage
-from logvggt_jax.metrics.depth import lower_median
 from logvggt_jax.metrics.errors import NotMeasurable
 
 
@@ -97,32 +94,6 @@ def estimate_normals(points: np.ndarray) -> np.ndarray:
     cloud = _open3d_cloud(points)
     cloud.estimate_normals()
     return np.array(cloud.normals)
-
-
-def align_median(prediction: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The alignment of pointmap evaluations: both clouds are centred in depth, then the prediction takes the size.
-
-    Each cloud, in the first camera's frame, is shifted along z so that its lower median of z is 0. Its size is the
-    lower median of the distances to its per-axis lower median. The prediction is multiplied by the ratio of sizes, its
-    own held within [1e-3, 1e3]. Nothing is rotated, and x and y are not shifted. Our tables align by a similarity over
-    corresponding points instead; numbers made with one cannot be compared with those of the other.
-
-    Args:
-      prediction: [N, 3].
-      target: [M, 3].
-
-    Returns:
-      The aligned prediction [N, 3] and the centred target [M, 3], which are to be compared.
-    """
-    (predicted, predicted_size), (true, true_size) = _centred(prediction), _centred(target)
-    return predicted * (true_size / float(np.clip(predicted_size, 1e-3, 1e3))), true
-
-
-def _centred(points: np.ndarray) -> tuple[np.ndarray, float]:
-    """Points [N, 3] with median z at 0, and their size."""
-    points = points - [0.0, 0.0, lower_median(points[:, 2])]
-    centre = [lower_median(points[:, axis]) for axis in range(3)]
-    return points, lower_median(np.linalg.norm(points - centre, axis=-1))
 
 
 def sample_indices(count: int, max_points: int | None, seed: int) -> np.ndarray:

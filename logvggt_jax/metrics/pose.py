@@ -3,8 +3,6 @@
 Source: the CO3D protocol of VGGT (`evaluation/test_co3d.py`).
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from logvggt_jax.geometry import as_matrix, rotation_angle

@@ -3,8 +3,6 @@
 Source: the evaluation code of CUT3R (`eval/relpose/evo_utils.py`); errors by evo.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -40,10 +38,7 @@ def trajectory_errors(predicted_poses: np.ndarray, true_poses: np.ndarray) -> di
     absolute = metrics.APE(relation.translation_part)
     absolute.process_data(paths)
     errors = {"ate": absolute}
-    for name, part in (
-        ("rpe_translation", relation.translation_part),
-        ("rpe_rotation", relation.rotation_angle_deg),
-    ):
+    for name, part in (("rpe_translation", relation.translation_part), ("rpe_rotation", relation.rotation_angle_deg)):
         relative = metrics.RPE(part, delta=1, all_pairs=True)
         relative.process_data(paths)
         errors[name] = relative
@@ -53,9 +48,8 @@ def trajectory_errors(predicted_poses: np.ndarray, true_poses: np.ndarray) -> di
 def align_trajectory(predicted_poses: np.ndarray, true_poses: np.ndarray) -> np.ndarray:
     """Camera-to-world poses [N, 4, 4] carried into the world and the unit of the true ones.
 
-    Raises:
-      NotMeasurable: positions admit no unique similarity, or a pose is not finite.
-      ValueError: lengths or shapes differ.
+    Raises NotMeasurable where positions admit no unique similarity or a pose is not finite, ValueError where lengths or
+    shapes differ.
     """
     predicted = checked_poses(predicted_poses, "predicted_poses")
     true = checked_poses(true_poses, "true_poses")

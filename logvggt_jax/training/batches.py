@@ -1,7 +1,5 @@
 """The data of a run: data sets opened once, one stream of batches for each stage."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Mapping, Sequence
@@ -29,9 +27,8 @@ def open_source(source: SourceConfig) -> Dataset:
 def open_sources(config: DataConfig, validation: SourceConfig | None = None) -> dict[str, Dataset]:
     """The mixture's data sets by name; rooms are rendered here, once, since rendering costs more than training.
 
-    Raises:
-      InputError: folders of data sets do not exist and `config.allow_missing` is off, or none exists; named. A data
-        set would train on sequences that `config.hold_out` or the `validation` source keeps.
+    Raises InputError: folders of data sets do not exist and `config.allow_missing` is off, or none exists; a data set
+    would train on sequences that `config.hold_out` or the `validation` source keeps.
     """
     rules = dict(config.hold_out)
     if unknown := sorted(rules.keys() - set(DATASETS)):

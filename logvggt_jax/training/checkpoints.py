@@ -102,11 +102,9 @@ class RunCheckpoints:
     def restore(self, like: TrainState, *, step: int | None = None) -> tuple[TrainState, Position]:
         """The state at `step` (None: the latest), with the shapes and placement of `like`.
 
-        Checkpoints of later steps are removed: the run that goes on from here will write its own.
-
-        Raises:
-          InputError: No such checkpoint, one of another configuration, or a damaged one; names the step, the
-            path and the other steps there are.
+        Checkpoints of later steps are removed: the run that goes on from here will write its own. Raises InputError
+        naming step, path and the other steps there are: no such checkpoint, one of another configuration, or a damaged
+        one.
         """
         steps = self.steps
         chosen = step if step is not None else (steps[-1] if steps else None)

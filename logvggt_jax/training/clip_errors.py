@@ -3,8 +3,6 @@
 The values tell progress from a plateau, and can be compared with validation and evaluation.
 """
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 
@@ -32,14 +30,11 @@ def clip_errors(predictions: Predictions, targets: Targets) -> dict[str, Mean]:
 def pose_errors(predicted: jax.Array, true: jax.Array, frame_valid: jax.Array) -> dict[str, Mean]:
     """Means over pairs of frames, in degrees; `relative_pose_errors` of the metrics.
 
-    `rotation` is the error of the relative rotation, `identity_rotation` that of the answer "no motion" (their
-    ratio stays at one while the network has learned no rotation), `translation_direction` the angle between the
-    lines of the relative translations: 0 to 90, 57 on average for random ones, 90 where one has no length.
-
-    Args:
-      predicted: [B, T, 3|4, 4] world-to-camera, any unit.
-      true: [B, T, 4, 4] world-to-camera.
-      frame_valid: [B, T] bool; the others form no pairs.
+    Cameras are world-to-camera, the predicted ones [B, T, 3|4, 4] in any unit, the true ones [B, T, 4, 4]; frames that
+    are not `frame_valid` bool [B, T] form no pairs. `rotation` is the error of the relative rotation,
+    `identity_rotation` that of the answer "no motion" (their ratio stays at one while the network has learned no
+    rotation), `translation_direction` the angle between the lines of the relative translations: 0 to 90, 57 on average
+    for random ones, 90 where one has no length.
     """
     frames = true.shape[1]
     pair = frame_valid[:, :, None] & frame_valid[:, None, :] & ~jnp.tri(frames, dtype=bool)
@@ -59,10 +54,7 @@ def pose_errors(predicted: jax.Array, true: jax.Array, frame_valid: jax.Array) -
 def depth_errors(depth: jax.Array, target: jax.Array, valid: jax.Array) -> dict[str, Mean]:
     """`abs_rel` and `delta_1.25` over valid pixels after each clip's median alignment; `depth_metrics` of the metrics.
 
-    Args:
-      depth: [B, T, H, W], predicted, any unit.
-      target: [B, T, H, W], positive where valid.
-      valid: [B, T, H, W] bool.
+    All are [B, T, H, W]: predicted depth in any unit, the target, positive where `valid` (bool).
     """
     depth, target, valid = (array.reshape(array.shape[0], -1) for array in (depth, target, valid))
     depth = depth * (_lower_median(target, valid) / _lower_median(depth, valid))[:, None]

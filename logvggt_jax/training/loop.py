@@ -1,7 +1,5 @@
 """The training loop: stages, logging, validation, checkpoints, and a clean end whatever ends it."""
 
-from __future__ import annotations
-
 import functools
 import time
 from collections import deque
@@ -40,23 +38,15 @@ class NonFiniteTraining(RuntimeError):
 
 
 def train(config: TrainConfig, workdir: Path, *, mesh: Mesh, resume_step: int | None = None) -> TrainState:
-    """Runs the stages of `config`, or what is left of them if `workdir` holds a checkpoint.
+    """Runs the stages of `config` on `mesh`, or what is left of them if `workdir` holds a checkpoint; the state at the
+    end.
 
-    Leaves `checkpoints/`, `model/` (for `load_model`), `metrics.jsonl` and `tensorboard/` in `workdir`. SIGTERM,
-    Ctrl-C and `config.max_minutes` end the run after the current step with a checkpoint.
+    Leaves `checkpoints/`, `model/` (for `load_model`), `metrics.jsonl` and `tensorboard/` in `workdir`. SIGTERM, Ctrl-C
+    and `config.max_minutes` end the run after the current step with a checkpoint; `resume_step` is the one to go on
+    from, None takes the latest.
 
-    Args:
-      config: the run.
-      workdir: its folder.
-      mesh: devices to train on.
-      resume_step: checkpoint to go on from; None takes the latest.
-
-    Returns:
-      The state at the end.
-
-    Raises:
-      InputError: Settings, data or a checkpoint that do not fit; one line.
-      NonFiniteTraining: `config.max_skipped_in_a_row` updates in a row were not finite.
+    Raises InputError for settings, data or a checkpoint that do not fit, in one line, and NonFiniteTraining where
+    `config.max_skipped_in_a_row` updates in a row were not finite.
     """
     for stage in config.stages:
         check_batch_size(stage, mesh)
@@ -85,7 +75,8 @@ class _Run:
         # Shapes alone: a run that goes on needs no initial weights.
         # Deep stacks are trained as one loop over stacked layers: their step compiles once and updates few arrays.
         self.shapes = jax.eval_shape(lambda: stack_layers(initial_parameters(config.model, seed=config.seed)))
-        self.optimizer = make_optimizer(config.optimizer, self.shapes, frozen=_frozen_modules(config))
+        frozen = ("encoder",) if config.model.encoder.frozen else ()
+        self.optimizer = make_optimizer(config.optimizer, self.shapes, frozen=frozen)
         schedule = learning_rate_schedule(config.optimizer, config.stages)
         terms = make_loss_terms(model, config.loss)
         self.step = make_train_step(terms, config.loss, self.optimizer, schedule, mesh)
@@ -221,7 +212,3 @@ class _Run:
         if step % ASK_EVERY or not any_process(reason is not None):
             return None
         return reason or "another process is to stop"
-
-
-def _frozen_modules(config: TrainConfig) -> tuple[str, ...]:
-    return ("encoder",) if config.model.encoder.frozen else ()

@@ -1,7 +1,5 @@
 """The paper's training objective as sums and counts, so that devices can add theirs before dividing."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import jax
@@ -34,14 +32,10 @@ def camera_loss(
 ) -> Mean:
     """L_camera, the mean over frames of (1/S) sum_s gamma^(S-s) |g_s - g|_1.
 
-    The distance is the weighted sum of the l1 norms of translation, quaternion and fields of view. Source:
-    LoG-VGGT, "Training Objective", second and third equation; the mean over frames instead of their sum makes
-    clips of different lengths weigh alike.
-
-    Args:
-      pose_encodings: [B, T, S, 9], the S rounds of the camera head.
-      target: [B, T, 9].
-      frame_valid: [B, T] bool.
+    The S rounds of the camera head [B, T, S, 9] are compared with the target [B, T, 9] where `frame_valid` bool [B, T].
+    The distance is the weighted sum of the l1 norms of translation, quaternion and fields of view. Source: LoG-VGGT,
+    "Training Objective", second and third equation; the mean over frames instead of their sum makes clips of different
+    lengths weigh alike.
     """
     rounds = pose_encodings.shape[-2]
     weights = jnp.asarray([translation_weight] * 3 + [rotation_weight] * 4 + [field_of_view_weight] * 2, jnp.float32)
@@ -54,17 +48,12 @@ def camera_loss(
 def depth_losses(
     depth: jax.Array, confidence: jax.Array, target: jax.Array, valid: jax.Array, *, alpha: float
 ) -> dict[str, Mean]:
-    """The three terms of L_depth, each a mean over valid pixels.
+    """The three terms of L_depth, each a mean over the pixels where `valid` bool [B, T, H, W].
 
-    `depth_error` is S |D' - D|, `depth_gradient` S (|dx(D' - D)| + |dy(D' - D)|) with forward differences where
-    both pixels are valid, `depth_confidence` -alpha log S; S is the predicted confidence. Source: LoG-VGGT,
-    "Training Objective", fourth equation, as means, with absolute values for the norm over one channel.
-
-    Args:
-      depth: [B, T, H, W], predicted.
-      confidence: [B, T, H, W], at least 1.
-      target: [B, T, H, W], finite everywhere.
-      valid: [B, T, H, W] bool.
+    `depth_error` is S |D' - D|, `depth_gradient` S (|dx(D' - D)| + |dy(D' - D)|) with forward differences where both
+    pixels are valid, `depth_confidence` -alpha log S, of depth D', its confidence S (at least 1) and the target D
+    (finite everywhere), all [B, T, H, W]. Source: LoG-VGGT, "Training Objective", fourth equation, as means, with
+    absolute values for the norm over one channel.
     """
     count = valid.sum().astype(jnp.float32)
     error = jnp.where(valid, depth - target, 0.0)

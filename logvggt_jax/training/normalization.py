@@ -1,7 +1,5 @@
 """One normalisation a clip: the first camera is the origin, the mean distance of the points is one."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import jax
@@ -39,17 +37,11 @@ def normalize_clips(
 ) -> Targets:
     """Expresses clips relative to their first camera, divided by the mean point distance.
 
-    Only ground truth is rescaled; predictions are compared as they are. Frames without a finite camera count as
-    absent, and so does a whole clip whose first camera is unknown or that has no valid depth: neither gives a
-    scale.
-
-    Args:
-      depth: [B, T, H, W] float32 z-depth, 0 or non-finite where invalid.
-      intrinsics: [B, T, 3, 3] float32, pixels.
-      extrinsics: [B, T, 3|4, 4] float32, world-to-camera (OpenCV).
-      frame_mask: [B, T] bool, False on padding; None if all frames are real.
-
-    Source: VGGT's released trainer (scene normalisation), per clip as in DUSt3R.
+    Float32: z-depth [B, T, H, W], 0 or non-finite where invalid, intrinsics [B, T, 3, 3] in pixels, extrinsics [B, T,
+    3|4, 4] world-to-camera (OpenCV); `frame_mask` bool [B, T] is False on padding, None if all frames are real. Only
+    ground truth is rescaled; predictions are compared as they are. Frames without a finite camera count as absent, and
+    so does a whole clip whose first camera is unknown or that has no valid depth: neither gives a scale. Source: VGGT's
+    released trainer (scene normalisation), per clip as in DUSt3R.
     """
     known = jnp.isfinite(extrinsics).all((-2, -1)) & jnp.isfinite(intrinsics).all((-2, -1))
     if frame_mask is not None:

@@ -1,7 +1,5 @@
 """The weighted objective over a whole batch."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 

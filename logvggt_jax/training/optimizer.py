@@ -1,7 +1,5 @@
 """AdamW with gradients clipped in each module by itself, and the schedule of its learning rate."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import jax

@@ -1,7 +1,5 @@
 """Several processes that train together, one or more for each machine."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from typing import Any
@@ -21,14 +19,9 @@ def join_processes(
 ) -> None:
     """Joins the other processes of this run; before JAX's first use of a device.
 
-    Args:
-      coordinator: host:port of process 0. None for all three lets JAX ask the cluster: Slurm, Open MPI, Kubernetes
-        and TPU pods know the answers.
-      num_processes: of the run.
-      process_id: of this process, from 0.
-
-    Raises:
-      InputError: some of the three are missing, or the cluster does not know them.
+    `coordinator` is host:port of process 0, `process_id` counts from 0. None for all three lets JAX ask the cluster:
+    Slurm, Open MPI, Kubernetes and TPU pods know the answers. Raises InputError where some of the three are missing, or
+    the cluster does not know them.
     """
     given = [value is not None for value in (coordinator, num_processes, process_id)]
     if any(given) and not all(given):

@@ -1,7 +1,5 @@
 """How fast a run trains, how long it will still take, and the line that the terminal shows of it."""
 
-from __future__ import annotations
-
 import time
 
 from logvggt_jax.training.config import StageConfig

@@ -1,7 +1,5 @@
 """Where arrays live: parameters on every device, batches split along the mesh axis `data`."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Mapping

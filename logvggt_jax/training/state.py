@@ -1,7 +1,5 @@
 """What a training step takes and returns."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import jax

@@ -1,7 +1,5 @@
 """One training step over all devices."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
@@ -75,11 +73,7 @@ def loss_and_gradients(
 
 
 def make_train_step(
-    terms: LossTerms,
-    config: LossConfig,
-    optimizer: optax.GradientTransformation,
-    schedule: optax.Schedule,
-    mesh: Mesh,
+    terms: LossTerms, config: LossConfig, optimizer: optax.GradientTransformation, schedule: optax.Schedule, mesh: Mesh
 ) -> jax.stages.Wrapped:
     """A jitted step (state, batch) -> (state, metrics); the state is donated, the batch split over `mesh`.
 

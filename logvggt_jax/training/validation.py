@@ -1,7 +1,5 @@
 """Accuracy on a few fixed clips that training never sees."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import jax

@@ -4,8 +4,6 @@ They average over whatever one device holds (the depth terms drop that batch's l
 averaged over devices as they are, which is what the trainer's data parallelism does.
 """
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 
@@ -24,21 +22,12 @@ def camera_losses(
     depth_valid: jax.Array,
     *,
     gamma: float,
-    kind: str = "l1",
 ) -> dict[str, Mean]:
-    """Translation, rotation and field-of-view terms, each (1/S) sum_s gamma^(S-s) of a mean over components.
+    """Translation, rotation and field-of-view terms, each (1/S) sum_s gamma^(S-s) of a mean absolute difference.
 
-    A clip counts if its first frame has more than 100 valid pixels. `kind` is `l1` (mean absolute difference) or
-    `l2` (Euclidean norm of the group of components).
-
-    Args:
-      pose_encodings: [B, T, S, 9].
-      target: [B, T, 9].
-      frame_valid: [B, T] bool.
-      depth_valid: [B, T, H, W] bool.
+    The rounds [B, T, S, 9] are compared with the target [B, T, 9] where `frame_valid` bool [B, T], in clips whose first
+    frame has more than 100 pixels that are `depth_valid` bool [B, T, H, W].
     """
-    if kind not in ("l1", "l2"):
-        raise ValueError(f"VGGT's camera loss is 'l1' or 'l2', got {kind!r}")
     rounds = pose_encodings.shape[-2]
     decay = jnp.asarray([gamma ** (rounds - 1 - s) / rounds for s in range(rounds)], jnp.float32)
     counted = frame_valid & (depth_valid[:, 0].sum((-2, -1)) > MIN_PIXELS)[:, None]
@@ -46,8 +35,7 @@ def camera_losses(
     parts = {"translation": slice(0, 3), "rotation": slice(3, 7), "field_of_view": slice(7, 9)}
     losses = {}
     for name, part in parts.items():
-        values = difference[..., part]
-        distance = jnp.abs(values) if kind == "l1" else _norm(values)
+        distance = jnp.abs(difference[..., part])
         if name == "translation":
             distance = jnp.minimum(distance, LIMIT)
         total = (distance.mean(-1) * decay).sum()
@@ -63,18 +51,11 @@ def depth_losses(
     *,
     alpha: float,
     quantile: float | None = 0.98,
-    confident_gradient: bool = False,
 ) -> dict[str, Mean]:
     """Confidence, regression and multi-scale gradient terms of the depth loss; 0 below 100 valid pixels.
 
-    `quantile` drops the largest errors of the first two terms (None: keeps all), `confident_gradient` weights
-    the gradient's differences with the confidence, its logarithm unmasked as in the trainer.
-
-    Args:
-      depth: [B, T, H, W], predicted.
-      confidence: [B, T, H, W], at least 1.
-      target: [B, T, H, W].
-      valid: [B, T, H, W] bool.
+    Predicted depth, its confidence (at least 1), target and `valid` (bool) are [B, T, H, W]. `quantile` drops the
+    largest errors of the first two terms (None: keeps all).
     """
     target = _bounded(target)
     enough = valid.sum() >= MIN_PIXELS
@@ -84,7 +65,7 @@ def depth_losses(
     values = {
         "depth_confidence": _mean_below_quantile(confident, valid, quantile),
         "depth_regression": _mean_below_quantile(error, valid, quantile),
-        "depth_gradient": _gradient_loss(depth - target, confidence, valid, alpha=alpha, confident=confident_gradient),
+        "depth_gradient": _gradient_loss(depth - target, valid),
     }
     return {name: _shard_value(jnp.where(enough, value, 0.0)) for name, value in values.items()}
 
@@ -92,13 +73,6 @@ def depth_losses(
 def _bounded(values: jax.Array) -> jax.Array:
     """Values of any shape within ±`LIMIT`, 0 where they are not finite."""
     return jnp.clip(jnp.where(jnp.isfinite(values), values, 0.0), -LIMIT, LIMIT)
-
-
-def _norm(values: jax.Array) -> jax.Array:
-    """l2 norm over the last axis, [..., C] -> [..., 1], whose gradient at zero is zero."""
-    squared = (values * values).sum(-1, keepdims=True)
-    positive = squared > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0)
 
 
 def _shard_value(value: jax.Array) -> Mean:
@@ -128,21 +102,15 @@ def _mean_below_quantile(values: jax.Array, valid: jax.Array, quantile: float | 
     return jnp.where(chosen, terms, 0.0).sum() / jnp.maximum(chosen.sum(), 1)
 
 
-def _gradient_loss(
-    error: jax.Array, confidence: jax.Array, valid: jax.Array, *, alpha: float, confident: bool
-) -> jax.Array:
+def _gradient_loss(error: jax.Array, valid: jax.Array) -> jax.Array:
     """Scalar: differences between neighbouring pixels of `error` [B, T, H, W], averaged over scales."""
     total = jnp.zeros_like(error[0, 0, 0, 0])
     for stride in GRADIENT_SCALES:
-        d, c, m = (array[..., ::stride, ::stride] for array in (error, confidence, valid))
+        d, m = (array[..., ::stride, ::stride] for array in (error, valid))
         d = jnp.where(m, d, 0.0)
         along_x = jnp.minimum(jnp.abs(d[..., :, 1:] - d[..., :, :-1]), LIMIT)
         along_y = jnp.minimum(jnp.abs(d[..., 1:, :] - d[..., :-1, :]), LIMIT)
         along_x = jnp.where(m[..., :, 1:] & m[..., :, :-1], along_x, 0.0)
         along_y = jnp.where(m[..., 1:, :] & m[..., :-1, :], along_y, 0.0)
-        if confident:
-            c_x, c_y = c[..., :, 1:], c[..., 1:, :]
-            along_x = along_x * c_x - alpha * jnp.log(c_x)
-            along_y = along_y * c_y - alpha * jnp.log(c_y)
         total += (along_x.sum() + along_y.sum()) / jnp.maximum(m.sum(), 1)
     return total / len(GRADIENT_SCALES)

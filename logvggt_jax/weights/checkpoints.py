@@ -6,8 +6,6 @@
 Orbax restores flipped bytes without complaint; the digests find them.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import hashlib
@@ -32,13 +30,7 @@ from logvggt_jax.weights.files import open_state_dict
 from logvggt_jax.weights.hub import licence, resolve
 from logvggt_jax.weights.lazy import LazyTensors
 from logvggt_jax.weights.provenance import Provenance
-from logvggt_jax.weights.vggt import (
-    ConversionReport,
-    config_from_vggt,
-    parameter_shapes,
-    params_from_vggt,
-    vggt_rules,
-)
+from logvggt_jax.weights.vggt import ConversionReport, config_from_vggt, parameter_shapes, params_from_vggt, vggt_rules
 
 FORMAT = "logvggt-jax model"
 VERSION = 1
@@ -48,25 +40,17 @@ _MEND = "the checkpoint is damaged: copy or convert it again"
 
 
 def digests(tree: Any) -> dict[str, str]:
-    """BLAKE2b of dtype, shape and bytes of every leaf, under its path (`encoder/norm/scale`).
+    """BLAKE2b of dtype, shape and bytes of every leaf of a pytree, under its path (`encoder/norm/scale`).
 
-    Args:
-      tree: Pytree of arrays, Python numbers or typed random keys. Arrays of several processes have to be
-        replicated.
+    Leaves are arrays, Python numbers or typed random keys; arrays of several processes have to be replicated.
     """
     return {name: _digest(leaf) for name, leaf in _named_leaves(tree)}
 
 
 def verify_digests(tree: Any, expected: dict[str, str], where: str) -> None:
-    """Compares a restored tree with the digests stored when it was saved.
+    """Compares a restored tree with the digests stored when it was saved; `where` is the checkpoint's path.
 
-    Args:
-      tree: Pytree of arrays.
-      expected: What `digests` gave for the saved tree.
-      where: The checkpoint's path, for the message.
-
-    Raises:
-      ValueError: A leaf differs, is missing or has no digest; names it.
+    Raises InputError naming the leaf that differs, is missing or has no digest.
     """
     found = digests(tree)
     for name in sorted(found.keys() | expected.keys()):
@@ -79,17 +63,20 @@ def verify_digests(tree: Any, expected: dict[str, str], where: str) -> None:
             )
 
 
+def first_misfit(found: Any, expected: Any, asking: str) -> str | None:
+    """The first parameter whose shape in the tree `found` is not the `expected` one, in words; None where all fit."""
+    theirs, ours = ({name: tuple(leaf.shape) for name, leaf in _named_leaves(tree)} for tree in (found, expected))
+    for name in sorted(theirs.keys() | ours.keys()):
+        if theirs.get(name) != ours.get(name):
+            return f"{name} has shape {theirs.get(name, 'none')}, {asking} asks for {ours.get(name, 'none')}"
+    return None
+
+
 def save_model(path: str | Path, config: ModelConfig, params: Any, provenance: Provenance = _UNKNOWN) -> None:
     """Writes a model folder; an older model folder at `path` is replaced once the new one is complete.
 
-    Args:
-      path: The folder to make.
-      config: Configuration of the model.
-      params: Its parameter tree, `variables["params"]`.
-      provenance: What the weights were trained for and where they come from.
-
-    Raises:
-      OutputExists: `path` exists and is not a model folder.
+    `params` is the parameter tree, `variables["params"]`; `provenance` says what the weights were trained for and where
+    they come from. Raises OutputExists where `path` exists and is not a model folder.
     """
     path = Path(path).expanduser().absolute()
     check_destination(path)
@@ -121,18 +108,11 @@ def check_destination(path: Path) -> None:
 
 
 def load_model(path: str | Path) -> tuple[LogVGGT, dict[str, Any]]:
-    """Reads a model folder onto the default device.
+    """The model in a folder and its variables {"params": …}, float32, on the default device.
 
-    Args:
-      path: A folder of `save_model`, `logvggt convert` or training (`<workdir>/model`).
-
-    Returns:
-      The model and its variables {"params": …}, float32.
-
-    Raises:
-      FileNotFoundError: Nothing is at `path`, or it is not a model folder.
-      ValueError: The configuration has an unknown field, the parameters do not fit it, a file is damaged, or a
-        leaf differs from its digest.
+    `path` is a folder of `save_model`, `logvggt convert` or training (`<workdir>/model`). Raises MissingInput where
+    nothing is there, or no model folder; InputError where the configuration has an unknown field, the parameters do not
+    fit it, a file is damaged, or a leaf differs from its digest.
     """
     path = Path(path).expanduser().absolute()
     description = _read_description(path)
@@ -149,10 +129,8 @@ def load_model(path: str | Path) -> tuple[LogVGGT, dict[str, Any]]:
 def read_provenance(path_or_repo: str | Path) -> Provenance:
     """What the weights that `from_pretrained` would read were trained for; reads no parameter.
 
-    A folder written before this was recorded gives a `Provenance` of unknowns, a VGGT checkpoint that of VGGT.
-
-    Raises:
-      InputError: As `from_pretrained`, for what can be seen without reading parameters.
+    A folder written before this was recorded gives a `Provenance` of unknowns, a VGGT checkpoint that of VGGT. Raises
+    InputError as `from_pretrained`, for what can be seen without reading parameters.
     """
     path = resolve(path_or_repo)
     if not (path.is_dir() and _is_model_folder(path)):
@@ -194,21 +172,12 @@ def from_pretrained(
 
 
 def convert(source: str | Path, destination: str | Path, *, point_head: bool = False) -> ConversionReport:
-    """Writes a VGGT checkpoint as a model folder that computes the same as VGGT.
+    """Writes a VGGT checkpoint (a file, its folder, or a hub repository) as a model folder that computes the same as
+    VGGT.
 
-    Shows progress and prints how many names were used, skipped and initialised.
-
-    Args:
-      source: VGGT checkpoint: a file, its folder, or a hub repository.
-      destination: The model folder to make.
-      point_head: Keep the point head.
-
-    Returns:
-      The names that were used, skipped and initialised.
-
-    Raises:
-      FileExistsError: The destination exists and is not a model folder.
-      FileNotFoundError, ValueError: As `from_pretrained`. Nothing is left behind.
+    Shows progress, prints how many names were used, skipped and initialised, and returns them; `point_head` keeps the
+    point head. Raises OutputExists where the destination is something other than a model folder, and InputError as
+    `from_pretrained`. Nothing is left behind.
     """
     destination = Path(destination).expanduser().absolute()
     check_destination(destination)
@@ -299,8 +268,8 @@ def _restore(path: Path, target: Any) -> Any:
             stored = checkpointer.metadata(path).item_metadata
             if stored is None:
                 raise FileNotFoundError("Orbax's description of the parameters is missing")
-            found = {name: tuple(leaf.shape) for name, leaf in _named_leaves(stored.tree)}
-            _check_shapes(found, {name: leaf.shape for name, leaf in _named_leaves(target)}, path)
+            if wrong := first_misfit(stored.tree, target, "the configuration in config.json"):
+                raise _OtherModelError(f"{path}: {wrong}; the two belong to different models")
             return checkpointer.restore(path, target)
     except _OtherModelError:
         raise
@@ -312,15 +281,6 @@ def _restore(path: Path, target: Any) -> Any:
 
 class _OtherModelError(InputError):
     """The stored parameters are not those of the configuration."""
-
-
-def _check_shapes(found: dict[str, tuple[int, ...]], expected: dict[str, tuple[int, ...]], path: Path) -> None:
-    for name in sorted(found.keys() | expected.keys()):
-        if found.get(name) != expected.get(name):
-            raise _OtherModelError(
-                f"{path}: {name} has shape {found.get(name, 'none')}, the configuration in config.json asks for "
-                f"{expected.get(name, 'none')}; the two belong to different models"
-            )
 
 
 @contextlib.contextmanager

@@ -1,7 +1,5 @@
 """VGGT checkpoint files: which file a path means, and its tensors read one by one."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
@@ -21,9 +19,8 @@ _USUAL_NAMES = ("model.safetensors", "model.pt")
 def find_weights(path: Path) -> Path:
     """The checkpoint file that `path` (a file, or a folder that holds one) means.
 
-    Raises:
-      MissingInput: Nothing is there, or the folder holds no checkpoint.
-      InputError: The file's suffix is not one of `SUFFIXES`, or the folder holds several checkpoints.
+    Raises MissingInput where nothing is there, or the folder holds no checkpoint; InputError for a suffix that is not
+    one of `SUFFIXES`, or a folder with several checkpoints.
     """
     if path.is_dir():
         with disk_errors(path):
@@ -39,14 +36,8 @@ def find_weights(path: Path) -> Path:
 def choose_weights(names: Sequence[str], where: str, prefix: str) -> str:
     """The one of these file names that holds a model's weights: the usual name, or the only checkpoint there is.
 
-    Args:
-      names: All files of the folder or repository.
-      where: What to call it in an error.
-      prefix: What a user puts before a name to choose the file.
-
-    Raises:
-      MissingInput: None is a checkpoint.
-      InputError: Several are, and none has a usual name; names them.
+    Errors call the folder or repository `where`; `prefix` is what a user puts before a name to choose the file. Raises
+    MissingInput if none is a checkpoint, InputError naming them if several are and none has a usual name.
     """
     weights = sorted(name for name in names if name.endswith(SUFFIXES))
     usual = [name for name in _USUAL_NAMES if name in weights]
@@ -58,17 +49,11 @@ def choose_weights(names: Sequence[str], where: str, prefix: str) -> str:
 
 
 def open_state_dict(path: str | Path) -> AbstractContextManager[Mapping[str, np.ndarray]]:
-    """Opens a checkpoint as a lazy mapping of PyTorch names to arrays, in the file's own dtype.
+    """Opens a `.safetensors` or `.pt` file, or a folder that holds one: PyTorch names to arrays in the file's own
+    dtype.
 
-    Args:
-      path: A `.safetensors` or `.pt` file, or a folder that holds one.
-
-    Returns:
-      A context manager; the mapping reads tensors only while it is open.
-
-    Raises:
-      MissingInput, InputError: As `find_weights`; InputError also for a damaged or truncated file, and for
-        a pickle that holds anything but tensors.
+    A context manager; its lazy mapping reads tensors only while it is open. Raises as `find_weights`, and InputError
+    for a damaged or truncated file, or a pickle that holds anything but tensors.
     """
     file = find_weights(Path(path))
     return _open_safetensors(file) if file.suffix == ".safetensors" else open_torch_zip(file)

@@ -1,7 +1,5 @@
 """Checkpoint files from the Hugging Face hub (extra `hub`)."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any
@@ -18,8 +16,7 @@ _TIMEOUT = 10.0  # seconds for the hub's answer, not for a download
 def resolve(path_or_repo: str | Path) -> Path:
     """The local path that a path or an address on the hub means; downloads in the second case.
 
-    Raises:
-      MissingInput: As `download`; or neither a path that exists nor an address.
+    Raises MissingInput as `download`, or for what is neither a path that exists nor an address.
     """
     found = _address(path_or_repo)
     if found is not None:
@@ -41,20 +38,12 @@ def licence(path_or_repo: str | Path) -> str | None:
 
 
 def download(repository: str, file: str | None = None) -> Path:
-    """Fetches a repository's weights into the hub's cache.
+    """Fetches the weights of `owner/name` into the hub's cache, unless they are there; the path of the file in the
+    cache.
 
-    Args:
-      repository: `owner/name`, as in `facebook/VGGT-1B`.
-      file: which of the repository's files; None takes the one that `choose_weights` finds.
-
-    Returns:
-      Path of the file in the cache; a file that is there already is not fetched again.
-
-    Raises:
-      MissingInput: The repository does not exist or asks for a login, holds no such file, or the hub cannot be reached
-        and the cache has no copy.
-      InputError: It holds several files of weights; names them.
-      MissingPackage: `huggingface_hub` is not installed.
+    `file` is one of the repository's, None takes the one that `choose_weights` finds. Raises MissingInput where the
+    repository does not exist or asks for a login, holds no such file, or the hub cannot be reached and the cache has no
+    copy; InputError naming several files of weights; MissingPackage without `huggingface_hub`.
     """
     hub = _client(repository)
     try:

@@ -1,20 +1,14 @@
 """State dicts that read one tensor at a time."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
 
 class LazyTensors(Mapping[str, np.ndarray]):
-    """A mapping of tensor names whose arrays are read each time they are asked for, and never kept.
+    """A mapping of tensor names, in file order, whose arrays `read` gives each time they are asked for; none is kept.
 
     It keeps the conversion of a 5 GB checkpoint at one copy of the parameters in memory.
-
-    Args:
-      names: The tensors' names, in file order.
-      read: Called with a name, returns its array.
     """
 
     def __init__(self, names: Sequence[str], read: Callable[[str], np.ndarray]) -> None:

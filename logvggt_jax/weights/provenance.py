@@ -1,7 +1,5 @@
 """What a model's weights were trained for, where they come from, and under which licence."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Literal
 

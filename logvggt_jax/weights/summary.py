@@ -1,7 +1,5 @@
 """A model in a few lines: sizes, parameters by part, memory."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import jax
@@ -12,12 +10,7 @@ from logvggt_jax.weights.provenance import Provenance
 
 
 def model_summary(config: ModelConfig, params: dict[str, Any]) -> Table:
-    """A table of a model's parts with their parameters and sizes.
-
-    Args:
-      config: the model's configuration.
-      params: its parameters by part, `variables["params"]`.
-    """
+    """A table of a model's parts (`variables["params"]` by part) with their parameters and sizes."""
     windows, refinement = config.windows, config.refinement
     cross = f"cross-window attention to the {windows.cache}s" if windows.cross_window else "no cross-window attention"
     when = "at the end" if refinement.period is None else f"every {refinement.period} frames"

@@ -5,8 +5,6 @@ member a storage (`<name>/data/<key>`). A pickle can call any function it names,
 the names that tensors need and nothing else.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import io
 import math
@@ -129,15 +127,10 @@ class _TensorUnpickler(pickle.Unpickler):
 def open_torch_zip(path: Path) -> Iterator[Mapping[str, np.ndarray]]:
     """Opens a state dict written by `torch.save`; tensors are read from the archive when asked for.
 
-    Args:
-      path: The `.pt` file: a zip archive whose pickle is a flat mapping of names to dense tensors.
-
-    Yields:
-      A lazy mapping of names to read-only arrays in the file's dtype (bfloat16 as `ml_dtypes.bfloat16`).
-
-    Raises:
-      ValueError: The file is not such an archive, is damaged or big-endian, or its pickle names anything but
-        tensors. Damage inside a storage is raised when its tensor is read.
+    The `.pt` file is a zip archive whose pickle is a flat mapping of names to dense tensors; yields a lazy mapping of
+    names to read-only arrays in the file's dtype (bfloat16 as `ml_dtypes.bfloat16`). Raises InputError: not such an
+    archive, damaged or big-endian, or a pickle that names anything but tensors. Damage inside a storage is raised when
+    its tensor is read.
     """
     try:
         with disk_errors(path):

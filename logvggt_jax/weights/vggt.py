@@ -4,8 +4,6 @@
 made from it. Source: the VGGT-1B checkpoint (1797 tensors).
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator, Mapping
@@ -28,6 +26,8 @@ from logvggt_jax.model.logvggt import LogVGGT
 
 ParamPath = tuple[str, ...]
 Layout = Callable[[np.ndarray], np.ndarray]
+_CONV = functools.partial(np.transpose, axes=(2, 3, 1, 0))
+_TRANSPOSED_CONV = functools.partial(np.transpose, axes=(2, 3, 0, 1))
 
 _OUTPUT_HIDDEN = 32  # width between the two convolutions of the DPT head's output, in every VGGT
 _DTYPES = ("float32", "float16", "bfloat16", "float64")
@@ -71,18 +71,6 @@ class ConversionReport:
     initialised: list[str] = dataclasses.field(default_factory=list)
 
 
-def _same(x: np.ndarray) -> np.ndarray:
-    return x
-
-
-def _conv_layout(x: np.ndarray) -> np.ndarray:
-    return x.transpose(2, 3, 1, 0)
-
-
-def _transposed_conv_layout(x: np.ndarray) -> np.ndarray:
-    return x.transpose(2, 3, 0, 1)
-
-
 def _first_third(x: np.ndarray) -> np.ndarray:
     return x[: len(x) // 3].T
 
@@ -92,7 +80,7 @@ def _other_thirds(x: np.ndarray) -> np.ndarray:
 
 
 def _raw(name: str, path: ParamPath, *shape: int) -> Iterator[Rule]:
-    yield Rule(name, shape, ((path, _same),))
+    yield Rule(name, shape, ((path, np.asarray),))
 
 
 def _norm(name: str, path: ParamPath, width: int) -> Iterator[Rule]:
@@ -106,13 +94,13 @@ def _linear(name: str, path: ParamPath, inputs: int, outputs: int) -> Iterator[R
 
 
 def _conv(name: str, path: ParamPath, inputs: int, outputs: int, size: int, *, bias: bool = True) -> Iterator[Rule]:
-    yield Rule(f"{name}.weight", (outputs, inputs, size, size), (((*path, "kernel"), _conv_layout),))
+    yield Rule(f"{name}.weight", (outputs, inputs, size, size), (((*path, "kernel"), _CONV),))
     if bias:
         yield from _raw(f"{name}.bias", (*path, "bias"), outputs)
 
 
 def _transposed_conv(name: str, path: ParamPath, width: int, size: int) -> Iterator[Rule]:
-    yield Rule(f"{name}.weight", (width, width, size, size), (((*path, "kernel"), _transposed_conv_layout),))
+    yield Rule(f"{name}.weight", (width, width, size, size), (((*path, "kernel"), _TRANSPOSED_CONV),))
     yield from _raw(f"{name}.bias", (*path, "bias"), width)
 
 
@@ -332,9 +320,8 @@ def config_from_vggt(state_dict: Mapping[str, np.ndarray], *, point_head: bool =
 def parameter_shapes(config: ModelConfig) -> dict[str, Any]:
     """The parameter tree as `jax.ShapeDtypeStruct`s placed on the default device, nothing computed."""
     sharding = jnp.zeros(()).sharding
-    return jax.tree.map(
-        lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding), _traced_shapes(config)
-    )
+    traced = _traced_shapes(config)
+    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding), traced)
 
 
 @functools.lru_cache(maxsize=8)

@@ -4,8 +4,6 @@ The room is a box seen from inside. World axes are OpenCV's (x right, y down, z 
 the place on the wall, so that lossy pictures come back nearly unchanged.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 HALF_SIZE = np.array([2.5, 1.4, 3.0])

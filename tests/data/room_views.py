@@ -1,7 +1,5 @@
 """What tests of readers on the analytic room share: its views from a moving camera, and the comparison with them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`check_frames` refuses what cannot be trained or evaluated on, and lets sets without poses pass only where asked."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from analytic_room import camera_to_world, pinhole, view

@@ -1,7 +1,5 @@
 """Listing, opening and reading data sets loads neither JAX nor Grain, which take seconds."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Small rooms that all tests of evaluation share."""
 
-from __future__ import annotations
-
 import pytest
 from known_answers import SIZE
 

@@ -1,7 +1,5 @@
 """Methods whose results are known beforehand, and evaluations of small rooms with them."""
 
-from __future__ import annotations
-
 import dataclasses
 import io
 from collections.abc import Callable, Sequence

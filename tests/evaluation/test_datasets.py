@@ -1,7 +1,5 @@
 """Benchmarks find their data: what is there is opened, what is missing is named."""
 
-from __future__ import annotations
-
 import io
 import json
 from pathlib import Path

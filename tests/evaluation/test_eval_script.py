@@ -1,7 +1,5 @@
 """The command line: one evaluation from its flags to its tables, and what a user types wrong."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

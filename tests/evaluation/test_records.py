@@ -1,7 +1,5 @@
 """What a later run takes over from an earlier one in the same folder, and what it leaves alone."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Whole evaluations as eval.py makes them: a configuration and a model folder in, tables out."""
 
-from __future__ import annotations
-
 import copy
 import csv
 import importlib

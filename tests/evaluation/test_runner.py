@@ -1,7 +1,5 @@
 """Whole evaluations of small rooms with methods whose results are known beforehand."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from collections.abc import Sequence

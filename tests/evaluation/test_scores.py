@@ -1,7 +1,5 @@
 """What is measured on one clip, and means over clips."""
 
-from __future__ import annotations
-
 import dataclasses
 import tracemalloc
 
@@ -15,13 +13,7 @@ from logvggt_jax.evaluation.methods.baselines import static_camera
 from logvggt_jax.evaluation.methods.method import Method
 from logvggt_jax.evaluation.protocols import PointsMeasure
 from logvggt_jax.evaluation.protocols.clips import clip_protocols
-from logvggt_jax.evaluation.scores import (
-    ClipScore,
-    benchmark_score,
-    clip_score,
-    prepare_truth,
-    valid_pixels,
-)
+from logvggt_jax.evaluation.scores import ClipScore, benchmark_score, clip_score, prepare_truth, valid_pixels
 from logvggt_jax.evaluation.scratch import scratch_array
 from logvggt_jax.metrics import depth_metrics
 from logvggt_jax.metrics.depth import pixel_errors, resize_depth

@@ -1,7 +1,5 @@
 """Arrays beyond the memory: in a file without a name, and a full disk named beforehand."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

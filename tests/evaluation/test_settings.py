@@ -1,7 +1,5 @@
 """What configuration files may say, and how mistakes are named."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

@@ -1,7 +1,5 @@
 """Cameras: rigid transforms, projection and its inverse, in numpy and in JAX."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -1,7 +1,5 @@
 """Pose encodings: what is encoded comes back, and what each number means."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rotations: quaternions, matrices and angles, against their definitions and at the awkward places."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

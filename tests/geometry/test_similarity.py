@@ -1,7 +1,5 @@
 """Similarity transforms: exact where the points fit, robust where some do not, refused where none exists."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

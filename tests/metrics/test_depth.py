@@ -1,9 +1,5 @@
 """Depth errors against stored values of the public reference code, and their invariances."""
 
-from __future__ import annotations
-
-import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +12,7 @@ from logvggt_jax.metrics import depth as depth_module
 from logvggt_jax.metrics import depth_metrics
 from logvggt_jax.metrics.depth import DEPTH_KEYS, align_depth, lower_median, mean_depth_metrics, resize_depth
 
+FAMILY = "depth"
 REFERENCE_NAMES = {"scale_shift_lad_adam": "scale_shift"}
 CASES = (
     "sintel_like",
@@ -32,12 +29,6 @@ CASES = (
     "custom_mask",
     "nan_pred",
 )
-
-
-@pytest.fixture
-def golden(golden_dir: Path) -> tuple[dict[str, Any], Any]:
-    cases = json.loads((golden_dir / "metrics" / "depth.json").read_text())["cases"]
-    return {case["id"]: case for case in cases}, np.load(golden_dir / "metrics" / "depth.npz")
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -1,7 +1,5 @@
 """No stored case of the reference metrics is left out of the tests."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -24,8 +22,9 @@ OF_READERS = {
     "nrgbd_poses",
     "seven_scenes_depth_filter",
 }
-# Alignments and pairings that no benchmark of ours uses: poses paired by time, FastVGGT's boxes and voxels.
-UNUSED = {"associate", "bbox_scale_fastvggt", "chamfer_fastvggt"}
+# Alignments and pairings that no benchmark of ours uses: poses paired by time, pointmaps aligned by median scale and
+# z-shift, FastVGGT's boxes and voxels.
+UNUSED = {"associate", "pointmap_protocol", "bbox_scale_fastvggt", "chamfer_fastvggt"}
 
 
 @pytest.mark.parametrize("family", FAMILIES)

@@ -1,9 +1,5 @@
 """Relative pose errors and accuracies against stored values of the public reference code."""
 
-from __future__ import annotations
-
-import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +11,7 @@ from hypothesis.extra.numpy import arrays as number_arrays
 from logvggt_jax.geometry import compose, quaternion_to_matrix
 from logvggt_jax.metrics import pose_accuracy, relative_pose_errors
 
+FAMILY = "relpose"
 POSE_CASES = (
     "noisy_small",
     "noisy_large",
@@ -39,12 +36,6 @@ def random_poses(rng: np.random.Generator, count: int) -> np.ndarray:
     poses[:, :3, :3] = quaternion_to_matrix(rng.normal(size=(count, 4)))
     poses[:, :3, 3] = rng.normal(size=(count, 3))
     return poses
-
-
-@pytest.fixture
-def golden(golden_dir: Path) -> tuple[dict[str, Any], Any]:
-    cases = json.loads((golden_dir / "metrics" / "relpose.json").read_text())["cases"]
-    return {case["id"]: case for case in cases}, np.load(golden_dir / "metrics" / "relpose.npz")
 
 
 def assert_accuracies(

@@ -1,9 +1,5 @@
 """Trajectory errors against stored values of the public reference code."""
 
-from __future__ import annotations
-
-import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +11,7 @@ from logvggt_jax.geometry import invert, quaternion_to_matrix, umeyama
 from logvggt_jax.metrics import NotMeasurable, trajectory_errors
 from logvggt_jax.metrics.trajectory import align_trajectory, rms_radius
 
+FAMILY = "trajectory"
 KEYS = {"ate": "ate_rmse", "rpe_translation": "rpe_trans_rmse", "rpe_rotation": "rpe_rot_deg_rmse"}
 CASES = (
     "noisy",
@@ -40,12 +37,6 @@ def spiral(count: int, seed: int = 0) -> np.ndarray:
     poses[:, :3, :3] = quaternion_to_matrix(rng.normal(size=(count, 4)))
     poses[:, :3, 3] = np.stack([np.cos(angle), np.sin(angle), 0.1 * angle], axis=-1)
     return poses
-
-
-@pytest.fixture
-def golden(golden_dir: Path) -> tuple[dict[str, Any], Any]:
-    cases = json.loads((golden_dir / "metrics" / "trajectory.json").read_text())["cases"]
-    return {case["id"]: case for case in cases}, np.load(golden_dir / "metrics" / "trajectory.npz")
 
 
 def assert_errors(actual: dict[str, float], expected: dict[str, float], tolerance: float) -> None:

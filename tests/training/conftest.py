@@ -1,7 +1,5 @@
 """A model that compiles at once, clips with uneven masks, and the settings of a short run."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 
@@ -12,14 +10,7 @@ import pytest
 
 from logvggt_jax import ModelConfig, Predictions
 from logvggt_jax.geometry import decode_poses, quaternion_to_matrix
-from logvggt_jax.training.config import (
-    DataConfig,
-    LossConfig,
-    OptimizerConfig,
-    SourceConfig,
-    StageConfig,
-    TrainConfig,
-)
+from logvggt_jax.training.config import DataConfig, LossConfig, OptimizerConfig, SourceConfig, StageConfig, TrainConfig
 
 ROOMS = (("height", 28), ("num_frames", 8), ("num_rooms", 8), ("width", 42))
 
@@ -130,13 +121,7 @@ def run_config(small_config: ModelConfig, loss_config: LossConfig, optimizer_con
 
     def stage(name: str, steps: int, clip_length: int) -> StageConfig:
         return StageConfig(
-            name=name,
-            steps=steps,
-            clip_length=clip_length,
-            batch_size=2,
-            min_stride=1,
-            max_stride=2,
-            sizes=((28, 42),),
+            name=name, steps=steps, clip_length=clip_length, batch_size=2, min_stride=1, max_stride=2, sizes=((28, 42),)
         )
 
     return TrainConfig(

@@ -1,7 +1,5 @@
 """Opening a run's data: what must not be trained on, what may be absent."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The training log, validation and evaluation agree on what an error is."""
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 import numpy as np
 import pytest

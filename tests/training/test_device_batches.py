@@ -1,7 +1,5 @@
 """Batches read ahead onto the devices: the state is that of the batch in hand, errors come in their turn."""
 
-from __future__ import annotations
-
 import jax
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Runs: interrupted ones end like uninterrupted ones; damaged or foreign checkpoints are refused by name."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import shutil

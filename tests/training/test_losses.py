@@ -1,7 +1,5 @@
 """The paper's losses against formulas written out, and their behaviour at the edges."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

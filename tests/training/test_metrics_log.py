@@ -1,7 +1,5 @@
 """The metrics file: one line a step, readable after a crash, continued without duplicates."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from rich.console import Console

@@ -1,7 +1,5 @@
 """Normalisation of clips against the original's values, and its behaviour on incomplete ground truth."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import jax

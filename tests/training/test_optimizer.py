@@ -1,7 +1,5 @@
 """Groups, clipping, weight decay and schedules."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Two processes that train together give one process's numbers and leave one set of files."""
 
-from __future__ import annotations
-
 import socket
 import subprocess
 import sys

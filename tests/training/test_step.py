@@ -1,7 +1,5 @@
 """The training step: the same on one device and on many, safe against non-finite numbers, traced once."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Configurations of runs: built from mappings, refused in one line where they make no sense."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from typing import Any

@@ -1,7 +1,5 @@
 """`train.py` itself: one step of a real model, its validation and its files; and what it says when it ends badly."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The data sets as text for people: what each needs, where it comes from and under which licence."""
 
-from __future__ import annotations
-
 import textwrap
 
 from logvggt_jax.data.dataset import Reader

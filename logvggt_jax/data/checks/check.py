@@ -1,7 +1,5 @@
 """Checks a copy of a data set: every sequence is listed, a sample of its frames (or all) decoded and compared."""
 
-from __future__ import annotations
-
 import os
 import warnings
 from collections.abc import Callable, Iterable

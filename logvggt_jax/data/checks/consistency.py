@@ -4,8 +4,6 @@ Depth of frame i is unprojected, moved into the camera of frame j and compared w
 nearest pixel. Where all three are right the two agree but for noise, rounding to pixels, occlusions and what moves.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -33,10 +31,7 @@ class Consistency(NamedTuple):
 def depth_consistency(frames: Frames, first: int, second: int) -> Consistency:
     """Carries the depth of frame `first` of `frames` into frame `second` and compares it with the depth there.
 
-    Args:
-      frames: at least these two, with poses; any unit of length.
-      first: index of the frame whose depth is carried.
-      second: index of the frame that it is compared with.
+    The frames have poses; lengths may have any unit.
     """
     depth = frames.depth[second].astype(np.float64)
     points = _world_points(frames, first)

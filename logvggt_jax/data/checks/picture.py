@@ -1,7 +1,5 @@
 """A picture of a data set's copy: frames, their depth, and the cameras seen from above (matplotlib, no display)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -23,10 +21,8 @@ _POINTS = 3000  # of a frame, in the view from above
 def check_picture_path(path: str | Path) -> Path:
     """`path` as `write_check_picture` needs it, checked before hours of work.
 
-    Raises:
-      InputError: not the name of a PNG file.
-      MissingFiles: no such folder to write it to.
-      MissingPackage: matplotlib is missing; names the extra that brings it.
+    Raises InputError for what is no PNG file's name, MissingFiles where its folder is missing, and MissingPackage
+    naming the extra that brings matplotlib.
     """
     _figure_class()
     path = Path(path)
@@ -63,9 +59,8 @@ def write_check_picture(path: Path, dataset: FolderDataset, sequences: Sequence[
 def view_from_above(extrinsics: np.ndarray) -> np.ndarray:
     """Axes [2, 3] float64 of the plane seen from above: right and up on the page, orthonormal, in the world.
 
-    Args:
-      extrinsics: [T, 3|4, 4] world-to-camera, OpenCV axes. The page's vertical out of it is the mean of the cameras'
-        upward directions, or for cameras that have no common one the direction in which they move least.
+    `extrinsics` are [T, 3|4, 4] world-to-camera, OpenCV axes. The page's vertical out of it is the mean of the cameras'
+    upward directions, or for cameras that have no common one the direction in which they move least.
     """
     poses = np.asarray(extrinsics, np.float64)
     upward = -poses[:, 1, :3].mean(0)

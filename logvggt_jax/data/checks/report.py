@@ -1,7 +1,5 @@
 """What a check of a data set's copy found, as values, JSON and text."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass

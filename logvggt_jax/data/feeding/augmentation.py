@@ -1,7 +1,5 @@
 """Random changes of colour and sharpness, of whole clips or frame by frame; cameras and depth do not change."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 
 import cv2

@@ -1,7 +1,5 @@
 """Clips that could not be read: how many a run bears, and which they were."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

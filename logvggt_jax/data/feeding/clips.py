@@ -1,7 +1,5 @@
 """Single clips, read and made ready for training; where one cannot be read, the next takes its place."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -61,10 +59,8 @@ class ClipReader:
 class ReplaceBroken:
     """Reads from the first of `streams`; where that fails, the clip of the next index takes the clip's place.
 
-    Where many in a row fail, the next stream goes on from the same index.
-
-    Args:
-      streams: (reader, its sequences: index to name) each, all of one size.
+    Where many in a row fail, the next stream goes on from the same index. A stream is a reader with its sequences,
+    index to name; all have one size.
     """
 
     def __init__(self, streams: Sequence[tuple[ClipReader, grain.MapDataset]]) -> None:

@@ -4,8 +4,6 @@ ScanNet, Co3Dv2 and Virtual KITTI are trained on and evaluated on; they are divi
 sets are not trained on at all.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -53,11 +51,7 @@ def check_held_out(
 ) -> None:
     """Raises InputError naming the training `sequences` of data set `name` that `rule` holds out.
 
-    Args:
-      name: of the data set.
-      sequences: those to be trained on.
-      rule: what is held out.
-      split_sequences: the sequences of a split of the same data set.
+    `split_sequences` gives the sequences of a split of the same data set.
     """
     of_split = set() if rule.split is None else set(split_sequences(rule.split))
     shared = [sequence for sequence in sequences if sequence in of_split or rule.matches(sequence)]

@@ -1,7 +1,5 @@
 """Which clip of which data set is example i of a run, and which examples have the same size."""
 
-from __future__ import annotations
-
 import hashlib
 import sys
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Which frames of a sequence make a training clip."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable

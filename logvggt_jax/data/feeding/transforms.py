@@ -5,8 +5,6 @@ antialiased bicubic filter (a = -0.5) of Pillow, which VGGT's weights were train
 pixel, since a mean across an edge is on neither surface.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -103,15 +101,10 @@ def preprocess(
 def resize(
     frame: np.ndarray, *, longer_edge: int = LONGER_EDGE, name: str = "the frame"
 ) -> tuple[np.ndarray, ResizeTransform]:
-    """One frame [h, w, 3] uint8 as `preprocess` resizes it, and how to map results back.
+    """One frame [H, W, 3] uint8 RGB as `preprocess` resizes it, [h, w, 3], and how to map results back.
 
-    Args:
-      frame: [H, W, 3] uint8 RGB.
-      longer_edge: pixels, a multiple of 14.
-      name: of the frame, for errors.
-
-    Raises:
-      ValueError: wrong shape, dtype or `longer_edge`.
+    `longer_edge` is in pixels, a multiple of 14; errors call the frame by its `name`. Raises ValueError for a wrong
+    shape, dtype or `longer_edge`.
     """
     check_longer_edge(longer_edge)
     if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:

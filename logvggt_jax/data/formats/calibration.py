@@ -1,7 +1,5 @@
 """Numbers from calibration and pose files, checked: intrinsics in pixels, world-to-camera OpenCV extrinsics."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -46,16 +44,9 @@ def scaled(intrinsics: np.ndarray, scale_x: float, scale_y: float) -> np.ndarray
 def world_to_camera(pose: np.ndarray, where: str | Path, *, stored: str) -> np.ndarray | None:
     """World-to-camera [4, 4] float64 of a stored rigid transform, its rotation projected onto SO(3).
 
-    Args:
-      pose: [3, 4] or [4, 4], OpenCV camera axes.
-      where: file (and line) for errors.
-      stored: `camera_to_world` or `world_to_camera`, what `pose` is.
-
-    Returns:
-      The extrinsics, or None where `pose` is not finite (lost tracking).
-
-    Raises:
-      InputError: not a rotation to 0.01, mirrored, or a last row other than 0 0 0 1.
+    The `pose` [3, 4] or [4, 4], OpenCV camera axes, is `stored` as `camera_to_world` or `world_to_camera`; None where
+    it is not finite (lost tracking). Raises InputError naming `where` (file and line): not a rotation to 0.01,
+    mirrored, or a last row other than 0 0 0 1.
     """
     if not np.isfinite(pose).all():
         return None

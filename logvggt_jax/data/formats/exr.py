@@ -1,7 +1,5 @@
 """Single-channel OpenEXR pictures, through the OpenEXR package: OpenCV's wheels come without that codec."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +11,8 @@ from logvggt_jax.errors import MissingPackage
 def read_exr(path: str | Path) -> np.ndarray:
     """The only channel of an OpenEXR file, [H, W] float32, in the file's own unit; half floats are widened.
 
-    Raises:
-      MissingPackage: the OpenEXR package is missing; names the extra that brings it.
-      MissingFiles: no such file.
-      InputError: truncated or damaged file, several parts or channels, or integer pixels; names the file.
+    Raises MissingPackage naming the extra that brings OpenEXR, MissingFiles, or InputError naming the file: truncated
+    or damaged, several parts or channels, or integer pixels.
     """
     try:
         import OpenEXR

@@ -1,7 +1,5 @@
 """Arrays from HDF5 files that hold one array each, with damage reported by file."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 
@@ -16,16 +14,9 @@ def read_hdf5(
 ) -> np.ndarray:
     """Array `dataset` of an HDF5 file, in the file's own type and unit.
 
-    Args:
-      path: the file, also where errors are named.
-      dataset: name of the array.
-      shape: what the array's shape must be; None stands for any length.
-      content: the file's bytes, where they have been read already.
-
-    Raises:
-      MissingPackage: the h5py package is missing; names the extra that brings it.
-      MissingFiles: no such file.
-      InputError: not an HDF5 file, truncated or damaged, no such array, not numbers or another shape; names the file.
+    Its shape must be `shape`, where None stands for any length; `content` are the file's bytes, where they have been
+    read already. Raises MissingPackage naming the extra that brings h5py, MissingFiles, or InputError naming the file:
+    not an HDF5 file, truncated or damaged, no such array, not numbers or another shape.
     """
     try:
         import h5py

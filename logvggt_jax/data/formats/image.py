@@ -4,8 +4,6 @@ OpenCV decodes truncated JPEG and PNG files without complaint and fills the miss
 therefore walked to their end marker first.
 """
 
-from __future__ import annotations
-
 import re
 import zlib
 from pathlib import Path
@@ -25,11 +23,8 @@ _JPEG_END, _JPEG_SCAN = 0xD9, 0xDA
 def read_rgb(path: str | Path) -> np.ndarray:
     """8-bit colour picture [H, W, 3] uint8 RGB; grey is repeated, alpha is composited over white.
 
-    Orientation tags are ignored: calibrations belong to the pixels as stored.
-
-    Raises:
-      MissingFiles: no such file.
-      InputError: truncated, damaged or undecodable file, or not 8 bits a channel; names the file.
+    Orientation tags are ignored: calibrations belong to the pixels as stored. Raises MissingFiles, or InputError naming
+    the file: truncated, damaged or undecodable, or not 8 bits a channel.
     """
     picture = _decode(Path(path))
     if picture.dtype != np.uint8:
@@ -45,9 +40,8 @@ def read_rgb(path: str | Path) -> np.ndarray:
 def read_depth(path: str | Path) -> np.ndarray:
     """16-bit single-channel picture [H, W] uint16, in the file's own unit.
 
-    Raises:
-      MissingFiles: no such file.
-      InputError: truncated, damaged or undecodable file, or not 16-bit with one channel; names the file.
+    Raises MissingFiles, or InputError naming the file: truncated, damaged or undecodable, or not 16-bit with one
+    channel.
     """
     picture = _decode(Path(path))
     if picture.dtype != np.uint16 or picture.ndim != 2:

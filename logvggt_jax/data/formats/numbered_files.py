@@ -1,7 +1,5 @@
 """Files whose names carry a frame's number: listed in numeric order, with the gaps between kinds reported."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,13 +13,8 @@ _PLACE = re.compile(r"\{[^}]*\}")
 def numbered_files(files: SourceFiles, folder: Path, template: str) -> dict[int, Path]:
     """Files of `folder` by number, in numeric order.
 
-    Args:
-      files: reads the folder.
-      folder: all other names in it are passed over.
-      template: format of the names with one number, `frame{:06d}.jpg` or, unpadded, `{}.jpg`.
-
-    Raises:
-      MissingFiles: no such folder, or no such file in it.
+    `template` is the format of the names with one number, `frame{:06d}.jpg` or, unpadded, `{}.jpg`; all other names are
+    passed over. Raises MissingFiles where there is no such folder, or no such file in it.
     """
     before, after = _PLACE.split(template)
     pattern = re.compile(f"{re.escape(before)}([0-9]+){re.escape(after)}")
@@ -34,14 +27,9 @@ def numbered_files(files: SourceFiles, folder: Path, template: str) -> dict[int,
 
 
 def numbered_frames(files: SourceFiles, *kinds: tuple[Path, str]) -> dict[int, tuple[Path, ...]]:
-    """Frames that consist of one file of each kind: number to paths, in numeric order.
+    """Frames that consist of one file of each kind (folder and template): number to paths, in numeric order.
 
-    Args:
-      files: reads the folders.
-      *kinds: folder and template of each kind, as in `numbered_files`.
-
-    Raises:
-      MissingFiles: no such folder, no such file in it, or a frame that lacks a kind; names the missing file.
+    Raises MissingFiles as `numbered_files`, and for frames that lack a kind; names the missing files.
     """
     found = [numbered_files(files, folder, template) for folder, template in kinds]
     numbers = sorted(set().union(*found))

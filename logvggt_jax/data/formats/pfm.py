@@ -1,7 +1,5 @@
 """Portable float maps: depth as 32-bit floats behind three lines of text."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -16,11 +14,8 @@ _HEADER = re.compile(rb"(P[fF])\s+(\d+)\s+(\d+)\s+([+-]?[0-9.]+(?:[eE][+-]?\d+)?
 def read_pfm(path: str | Path) -> np.ndarray:
     """Float map [H, W] float32, top row first (files hold the bottom row first).
 
-    A negative scale in the header means little-endian numbers; its size is no unit and is ignored.
-
-    Raises:
-      MissingFiles: no such file.
-      InputError: no header of a single-channel map, or another number of bytes than it promises; names the file.
+    A negative scale in the header means little-endian numbers; its size is no unit and is ignored. Raises MissingFiles,
+    or InputError naming the file: no header of a single-channel map, or another number of bytes than it promises.
     """
     path = Path(path)
     if not path.is_file():

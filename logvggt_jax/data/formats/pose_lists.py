@@ -1,7 +1,5 @@
 """Text files that hold the poses of all frames of a sequence as 4x4 matrices."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -14,16 +12,8 @@ from logvggt_jax.data.formats.source_files import SourceFiles
 def read_pose_list(files: SourceFiles, path: Path, *, count: int, numbers_per_line: int = 16) -> np.ndarray:
     """Matrices [count, 4, 4] float64 as stored, row-major; NaN and infinite entries are kept. Empty lines are skipped.
 
-    Args:
-      files: reads the file.
-      path: the pose file.
-      count: frames that need a pose.
-      numbers_per_line: 16, or 4 where a matrix takes four lines.
-
-    Raises:
-      MissingFiles: no such file.
-      InputError: a line with other words or another number of them, or another number of matrices than `count`;
-        names the file and the line.
+    A line has 16 numbers, or 4 where a matrix takes four lines. Raises MissingFiles, or InputError naming file and
+    line: other words or another number of them, or another number of matrices than the `count` of frames.
     """
     lines = enumerate(files.text(path, "the poses of the sequence's frames").splitlines(), 1)
     rows = [numbers(line, f"{path}, line {i}", count=numbers_per_line) for i, line in lines if line.strip()]

@@ -1,7 +1,5 @@
 """Camera poses at times, for sets whose pictures and poses have clocks of their own."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

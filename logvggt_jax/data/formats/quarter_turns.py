@@ -1,7 +1,5 @@
 """Pictures turned by multiples of 90 degrees, with their cameras; turns are counter-clockwise, as in `np.rot90`."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from logvggt_jax.data.formats.calibration import pinhole

@@ -1,7 +1,5 @@
 """Intrinsics of calibrations that state the picture's size, for pictures that may have been resized since."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,6 @@
 """The folders and text files that a listing is made from, read with their state remembered."""
 
-from __future__ import annotations
-
+import re
 from pathlib import Path
 
 from logvggt_jax.data.errors import MissingFiles
@@ -23,6 +22,11 @@ class SourceFiles:
             return sorted(path.name for path in folder.iterdir())
         except (FileNotFoundError, NotADirectoryError) as error:
             raise MissingFiles(f"{folder}: no such folder; expected {expected}") from error
+
+    def folders(self, parent: Path, expected: str, named: re.Pattern[str] | None = None) -> dict[str, Path]:
+        """Folders in `parent` by name, sorted, of those with a pattern the ones `named` so; MissingFiles as `names`."""
+        chosen = [name for name in self.names(parent, expected) if named is None or named.fullmatch(name)]
+        return {name: parent / name for name in chosen if (parent / name).is_dir()}
 
     def text(self, path: Path, expected: str) -> str:
         """A text file's content; MissingFiles saying what was `expected`, InputError for other bytes."""

@@ -1,7 +1,5 @@
 """Lists of a split's sequences, where a copy of the set need not be complete."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable
 from pathlib import Path
 

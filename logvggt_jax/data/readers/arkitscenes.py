@@ -12,8 +12,6 @@ Times are seconds with three decimals. The set does not say where a pixel's cent
 are. `confidence` tells how much the sensor trusts depth that it nevertheless gives: nothing is masked by it.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -83,8 +81,7 @@ class ARKitScenes(FolderDataset):
         for fold in _FOLDS[self.split]:
             folder = self.root / "raw" / fold
             if files.exists(folder):
-                videos = [name for name in files.names(folder, "videos") if _VIDEO.fullmatch(name)]
-                places |= {f"{fold}/{name}": folder / name for name in videos if (folder / name).is_dir()}
+                places |= {f"{fold}/{name}": video for name, video in files.folders(folder, "videos", _VIDEO).items()}
         return places
 
     def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:

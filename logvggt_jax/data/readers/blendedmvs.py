@@ -11,8 +11,6 @@ a pixel's centre is; the principal point is taken as it is. Depth is 0 where the
 empty.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -59,11 +57,7 @@ class BlendedMVS(FolderDataset):
 
         The scores are those of `cams/pair.txt`: larger where two photographs share more of the scene's points seen
         under a good angle; they have no unit. At most ten neighbours a frame, and not always both ways. Photographs
-        that do not count as frames are left out.
-
-        Raises:
-          MissingFiles: no `pair.txt`.
-          InputError: it is damaged.
+        that do not count as frames are left out. Raises MissingFiles without that file, InputError where it is damaged.
         """
         index = {int(name): i for i, name in enumerate(self.frame_names(sequence))}
         path = self._places[sequence] / "cams" / "pair.txt"
@@ -79,13 +73,9 @@ class BlendedMVS(FolderDataset):
         return [other for other, _ in self.covisibility(sequence).get(index, [])]
 
     def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
-        names = files.names(self.root, self.expects)
-        scenes = [name for name in names if _SCENE.fullmatch(name) and (self.root / name).is_dir()]
-        if self.split != "all":
-            scenes = self._listed(scenes, files)
-        return {name: self.root / name for name in scenes}
-
-    def _listed(self, scenes: list[str], files: SourceFiles) -> list[str]:
+        scenes = files.folders(self.root, self.expects, _SCENE)
+        if self.split == "all":
+            return scenes
         path = self.root / _LIST_FILES[self.split]
         if not files.exists(path):
             path = self.root / "project_lists" / path.name
@@ -94,14 +84,10 @@ class BlendedMVS(FolderDataset):
         for name in listed:
             if not _SCENE.fullmatch(name):
                 raise InputError(f"{path}: expected lines of 24 hexadecimal digits, got {name!r}: restore the file")
-        return sequences_present(listed, scenes, path)
+        return {name: scenes[name] for name in sequences_present(listed, scenes, path)}
 
     def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
-        kinds = (
-            ("blended_images", "{:08d}.jpg"),
-            ("rendered_depth_maps", "{:08d}.pfm"),
-            ("cams", "{:08d}_cam.txt"),
-        )
+        kinds = (("blended_images", "{:08d}.jpg"), ("rendered_depth_maps", "{:08d}.pfm"), ("cams", "{:08d}_cam.txt"))
         paths = numbered_frames(files, *((folder / place, template) for place, template in kinds))
         for image, depth, camera in paths.values():
             intrinsics, stored = _camera(files.text(camera, "the frame's camera"), camera)

@@ -8,8 +8,6 @@ camera's optical frame: use them for relative trajectory errors only. Intrinsics
 distortion is left in the pictures.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Annotations of Co3Dv2: gzip JSON of hundreds of megabytes a category, kept in compact form."""
 
-from __future__ import annotations
-
 import gzip
 import json
 import sys

@@ -9,8 +9,6 @@ Cameras are PyTorch3D's (see `co3d_annotations`), with a pixel's centre at half 
 reconstruction, stored as the bits of 16-bit floats in 16-bit PNG files, times the frame's `scale_adjustment`.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass

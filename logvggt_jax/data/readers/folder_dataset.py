@@ -1,7 +1,5 @@
 """What readers of data sets on disk share: sequences and frames listed once, pictures opened when asked for."""
 
-from __future__ import annotations
-
 import abc
 import contextlib
 import io
@@ -95,15 +93,10 @@ class FolderDataset(Reader):
     """
 
     def __init__(self, root: str | Path, split: str = "all") -> None:
-        """Lists the sequences; frames are listed when a sequence is first used.
+        """Lists the sequences of a `split` in the set's folder `root`; frames are listed when a sequence is first used.
 
-        Args:
-          root: the data set's folder.
-          split: one of `splits`.
-
-        Raises:
-          MissingFiles: no such folder, nothing of the set in it, or a list file is missing.
-          InputError: a split that the set does not have, or a damaged list file.
+        Raises MissingFiles where there is no such folder, nothing of the set in it, or a list file is missing;
+        InputError for a split that the set does not have, or a damaged list file.
         """
         check_split(split, self)
         self.root, self.split = Path(root), split

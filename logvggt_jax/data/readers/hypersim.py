@@ -133,9 +133,7 @@ class HyperSim(FolderDataset):
         path = self.root / _CAMERA_TABLE
         table = _table_lines(files, path)
         partition = {} if self.split == "all" else _partition(files, self.root / _SPLIT_TABLE)
-        for scene in files.names(self.root, "the scenes"):
-            if not _SCENE.fullmatch(scene) or not (self.root / scene).is_dir():
-                continue
+        for scene in files.folders(self.root, "the scenes", _SCENE):
             camera = _camera(table, scene, path)
             for folder in files.names(self.root / scene / "images", "the scene's pictures"):
                 if match := _FINAL_FOLDER.fullmatch(folder):

@@ -14,8 +14,6 @@ Also read, for drives without raw pictures, is the form that published evaluatio
 `image_gathered_50` and likewise; it needs the calibration too.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path

@@ -5,8 +5,6 @@ are unchanged it is taken from the index, else made anew. The index is a cache: 
 work without it.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import sqlite3
@@ -35,10 +33,8 @@ class ListingIndex:
     def __init__(self, identity: Mapping[str, Any], root: Path, code: str) -> None:
         """Nothing is opened yet.
 
-        Args:
-          identity: JSON values that tell readers and their options apart; `name` is one of them.
-          root: the data set's folder.
-          code: digest of the code that makes the listings; those of other code are not current.
+        `identity` has JSON values that tell readers and their options apart, `name` among them; `root` is the set's
+        folder; `code` is the digest of the code that makes the listings: those of other code are not current.
         """
         what = json.dumps([_FORMAT, identity, str(root.resolve())], sort_keys=True)
         digest = hashlib.sha256(what.encode()).hexdigest()[:16]

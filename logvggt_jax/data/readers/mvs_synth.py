@@ -6,8 +6,6 @@ in pixels. Depth is z in units of about 0.1 m, infinite in the sky. Of the three
 intrinsics stored with GTAV_540 do not fit its pictures.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator, Mapping
@@ -52,9 +50,8 @@ class MVSSynth(FolderDataset):
     )
 
     def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
-        folder = self.root / "GTAV_720"
-        names = files.names(folder, f"the sequences of {self.title} at 1280 x 720; other sizes are not read")
-        return {name: folder / name for name in names if _SEQUENCE.fullmatch(name) and (folder / name).is_dir()}
+        expected = f"the sequences of {self.title} at 1280 x 720; other sizes are not read"
+        return files.folders(self.root / "GTAV_720", expected, _SEQUENCE)
 
     def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
         kinds = (("images", "{:04d}.png"), ("depths", "{:04d}.exr"), ("poses", "{:04d}.json"))

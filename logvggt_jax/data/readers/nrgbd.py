@@ -7,8 +7,6 @@ holds four lines a frame, camera-to-world in metres with OpenGL camera axes (x r
 without a pose. `focal.txt` is the focal length for 640 x 480; the principal point is (320, 240) there.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -47,11 +45,8 @@ class NRGBD(FolderDataset):
 
     def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
         folders = {name: self.root / name for name in files.names(self.root, "scenes")}
-        return {
-            name: folder
-            for name, folder in folders.items()
-            if files.exists(folder / "images") or files.exists(folder / "poses.txt")
-        }
+        signs = ("images", "poses.txt")
+        return {name: each for name, each in folders.items() if any(files.exists(each / sign) for sign in signs)}
 
     def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
         kinds = ((folder / "images", "img{}.png"), (folder / "depth", "depth{}.png"))

@@ -5,8 +5,6 @@ the latter's arrays `intrinsics` [T, 3, 3] (pixels) and `extrinsics` [T, 4, 4] (
 read; the point tracks beside them, a hundred times larger, are not. Depth is 16-bit, 65535 for 1000 m.
 """
 
-from __future__ import annotations
-
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
@@ -50,16 +48,11 @@ class PointOdyssey(FolderDataset):
     )
 
     def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
-        folders = [self.root / split for split in _SPLITS]
-        if self.split == "all":
-            folders = [folder for folder in folders if files.exists(folder)]
-        else:
-            folders = [self.root / self.split]
+        chosen = [self.split] if self.split != "all" else [s for s in _SPLITS if files.exists(self.root / s)]
         return {
-            f"{folder.name}/{name}": folder / name
-            for folder in folders
-            for name in files.names(folder, f"the sequences of this split of {self.title}")
-            if (folder / name).is_dir()
+            f"{split}/{name}": folder
+            for split in chosen
+            for name, folder in files.folders(self.root / split, f"the sequences of this split of {self.title}").items()
         }
 
     def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:

@@ -6,8 +6,6 @@ centres are at integers. A line of `traj.txt` is one frame's camera-to-world mat
 OpenCV axes. Depth is uint16, `scale` a metre, 0 where invalid. Other renderings of Replica are not read.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -49,11 +47,8 @@ class Replica(FolderDataset):
 
     def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
         folders = {name: self.root / name for name in files.names(self.root, "scenes")}
-        return {
-            name: folder
-            for name, folder in folders.items()
-            if files.exists(folder / "results") or files.exists(folder / "traj.txt")
-        }
+        signs = ("results", "traj.txt")
+        return {name: each for name, each in folders.items() if any(files.exists(each / sign) for sign in signs)}
 
     def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
         camera = _camera(self.root / "cam_params.json", files)

@@ -11,8 +11,6 @@ Also read, where a scene has no `color`, is the form that published evaluations 
 numbers than 90. These are frames already chosen, every third from the first.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -112,14 +110,10 @@ class ScanNet(FolderDataset):
         listed = [files.exists(path) for path in lists.values()]
         scenes: dict[str, Path] = {}
         for part, part_split in parts.items():
-            if self.split != "all" and not any(listed) and part_split != self.split:
+            other = self.split != "all" and not any(listed) and part_split != self.split
+            if other or not files.exists(self.root / part):
                 continue
-            if not files.exists(self.root / part):
-                continue
-            for name in files.names(self.root / part, "scenes"):
-                folder = self.root / part / name
-                if not _SCENE.fullmatch(name) or not folder.is_dir():
-                    continue
+            for name, folder in files.folders(self.root / part, "scenes", _SCENE).items():
                 if name in scenes:
                     raise InputError(f"{folder} and {scenes[name]} are the same scene: remove one of them")
                 scenes[name] = folder

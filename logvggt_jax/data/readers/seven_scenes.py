@@ -6,8 +6,6 @@ camera-to-world in metres, OpenCV axes, of the depth camera. Colour and raw dept
 set does not register: depth has focal length 585, colour 525, and lies 25 mm to the side.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -119,8 +117,7 @@ class SevenScenes(FolderDataset):
 
 def _scenes(root: Path, files: SourceFiles) -> list[Path]:
     own = _sequence_folders(root, files)
-    folders = [root / name for name in files.names(root, "scenes") if (root / name).is_dir()]
-    scenes = [folder for folder in folders if _sequence_folders(folder, files)]
+    scenes = [folder for folder in files.folders(root, "scenes").values() if _sequence_folders(folder, files)]
     if own and scenes:
         raise InputError(
             f"{root} holds sequences ({own[0].name}) and scenes ({scenes[0].name}) side by side: "
@@ -130,8 +127,7 @@ def _scenes(root: Path, files: SourceFiles) -> list[Path]:
 
 
 def _sequence_folders(scene: Path, files: SourceFiles) -> list[Path]:
-    names = files.names(scene, "sequences")
-    return [scene / name for name in names if _SEQUENCE.fullmatch(name) and (scene / name).is_dir()]
+    return list(files.folders(scene, "sequences", _SEQUENCE).values())
 
 
 def _listed_folders(scene: Path, split: str, files: SourceFiles) -> list[Path]:
@@ -168,10 +164,8 @@ def _shifted(extrinsics: np.ndarray) -> np.ndarray:
 
 def _carry_to_colour(depth: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Depth camera's map [h, w] as the colour camera (`intrinsics`, `size`) sees it; 0 where no point falls."""
-    points = unproject(depth.astype(np.float64), _at_size(pinhole(_DEPTH_FOCAL, _DEPTH_FOCAL, *_CENTRE), depth.shape))[
-        depth > 0
-    ]
-    points = points + COLOUR_FROM_DEPTH
+    own = _at_size(pinhole(_DEPTH_FOCAL, _DEPTH_FOCAL, *_CENTRE), depth.shape)
+    points = unproject(depth.astype(np.float64), own)[depth > 0] + COLOUR_FROM_DEPTH
     z = points[:, 2]
     u = np.rint(points[:, 0] / z * intrinsics[0, 0] + intrinsics[0, 2]).astype(np.intp)
     v = np.rint(points[:, 1] / z * intrinsics[1, 1] + intrinsics[1, 2]).astype(np.intp)

@@ -4,8 +4,6 @@ Source: `pgt/sfm/7scenes/<scene>_{train,test}.txt` of the repository `visloc_pse
 `seq-01/frame-000591.color.png qw qx qy qz tx ty tz focal`: world-to-camera of the colour camera, metres, OpenCV axes.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +17,7 @@ _COLUMNS = 9
 def read_sfm_poses(path: Path) -> dict[str, np.ndarray]:
     """World-to-camera matrices [4, 4] float64 by `seq-01/frame-000591`.
 
-    Raises:
-      InputError: a line of another form, or numbers that are no pose; names file and line.
+    Raises InputError naming file and line for a line of another form, or numbers that are no pose.
     """
     poses: dict[str, np.ndarray] = {}
     for number, line in enumerate(path.read_text().splitlines(), start=1):

@@ -7,8 +7,6 @@ float32 z-depth row by row. A `.cam` file is the same tag, nine float64 of the i
 world-to-camera matrix, OpenCV axes, rows first.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -49,9 +47,7 @@ class Sintel(FolderDataset):
     )
 
     def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
-        folder = self.root / "training" / "final"
-        names = files.names(folder, "the pictures of the pass 'final'")
-        return {name: folder / name for name in names if (folder / name).is_dir()}
+        return files.folders(self.root / "training" / "final", "the pictures of the pass 'final'")
 
     def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
         training = self.root / "training"
@@ -67,12 +63,8 @@ class Sintel(FolderDataset):
 
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         depth = _depth(record.depth)
-        # NaN fails both comparisons.
-        return (
-            read_rgb(record.image),
-            np.where((depth > 0) & (depth <= _SKY), depth, np.float32(0.0)),
-            record.intrinsics,
-        )
+        depth = np.where((depth > 0) & (depth <= _SKY), depth, np.float32(0.0))  # NaN fails both comparisons
+        return read_rgb(record.image), depth, record.intrinsics
 
 
 def _camera(content: bytes, path: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -6,8 +6,6 @@ picture's width and height, in pixels of the picture. The text files have a row 
 pixels, and sixteen numbers of the world-to-camera matrix of the left camera, rows first, OpenCV axes, metres.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -50,15 +48,11 @@ class Spring(FolderDataset):
     )
 
     def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
-        folder = self.root / "train"
-        names = files.names(folder, "the training sequences")
-        return {name: folder / name for name in names if _SEQUENCE.fullmatch(name) and (folder / name).is_dir()}
+        return files.folders(self.root / "train", "the training sequences", _SEQUENCE)
 
     def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
         paths = numbered_frames(
-            files,
-            (folder / "frame_left", "frame_left_{:04d}.png"),
-            (folder / "disp1_left", "disp1_left_{:04d}.dsp5"),
+            files, (folder / "frame_left", "frame_left_{:04d}.png"), (folder / "disp1_left", "disp1_left_{:04d}.dsp5")
         )
         calibration, poses = folder / "cam_data" / "intrinsics.txt", folder / "cam_data" / "extrinsics.txt"
         pinholes = _rows(files, calibration, 4, "fx fy cx cy of each frame")
@@ -73,9 +67,8 @@ class Spring(FolderDataset):
             raise InputError(f"{paths[0][0]}: frames are numbered from 1: restore the original names")
         for number, (image, disparity) in paths.items():
             row = number - 1
-            extrinsics = world_to_camera(
-                matrices[row].reshape(4, 4), f"{poses}, row {number}", stored="world_to_camera"
-            )
+            where = f"{poses}, row {number}"
+            extrinsics = world_to_camera(matrices[row].reshape(4, 4), where, stored="world_to_camera")
             yield frame(image, disparity, pinhole(*pinholes[row]), extrinsics)
 
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

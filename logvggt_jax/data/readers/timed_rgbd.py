@@ -4,8 +4,6 @@
 metres and seconds; `#` starts a comment.
 """
 
-from __future__ import annotations
-
 import abc
 import re
 from collections.abc import Iterator, Mapping
@@ -75,12 +73,10 @@ class TimedRGBD(FolderDataset):
         parents = [self.root, *([self.root / self.container] if self.container else [])]
         folders: dict[str, Path] = {}
         for parent in filter(files.exists, parents):
-            for name in files.names(parent, "sequences"):
-                if not self.folder_pattern.fullmatch(name) or not (parent / name).is_dir():
-                    continue
+            for name, folder in files.folders(parent, "sequences", self.folder_pattern).items():
                 if name in folders:
-                    raise InputError(f"{parent / name} and {folders[name]} are the same sequence: remove one of them")
-                folders[name] = parent / name
+                    raise InputError(f"{folder} and {folders[name]} are the same sequence: remove one of them")
+                folders[name] = folder
         places: dict[str, Path] = {}
         for name, folder in sorted(folders.items()):
             held = files.names(folder, "rgb, depth, rgb.txt, depth.txt and groundtruth.txt")

@@ -6,8 +6,6 @@ are those of the colour camera, camera-to-world, OpenCV axes. Intrinsics are the
 Lens distortion is left in the pictures of freiburg1 and freiburg2; freiburg3's are undistorted.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -38,10 +36,7 @@ class TUM(TimedRGBD):
     container = None
     prepared_for = "poses"
     about = About(
-        source="the set's site: an archive a sequence",
-        licence=LICENCE_NOT_READ,
-        size="unknown",
-        roles=(EVALUATION,),
+        source="the set's site: an archive a sequence", licence=LICENCE_NOT_READ, size="unknown", roles=(EVALUATION,)
     )
 
     def _intrinsics(self, folder: Path) -> np.ndarray:

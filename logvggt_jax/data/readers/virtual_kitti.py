@@ -7,8 +7,6 @@ camera` and sixteen numbers of the world-to-camera matrix, rows first, OpenCV ax
 interleaved. Depth is 16-bit z in centimetres, 65535 in the sky and beyond 655.35 m.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -24,18 +22,7 @@ from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, Fram
 from logvggt_jax.errors import InputError
 
 _SCENE = re.compile(r"Scene\d{2}")
-_VARIATIONS = (
-    "15-deg-left",
-    "15-deg-right",
-    "30-deg-left",
-    "30-deg-right",
-    "clone",
-    "fog",
-    "morning",
-    "overcast",
-    "rain",
-    "sunset",
-)
+_VARIATION = re.compile("(15|30)-deg-(left|right)|clone|fog|morning|overcast|rain|sunset")
 _CAMERAS = ("Camera_0", "Camera_1")
 _TEST_SCENE = "Scene20"
 _SKY = 65535
@@ -68,7 +55,7 @@ class VirtualKITTI(FolderDataset):
             f"{scene}/{variation}/{camera}": self.root / scene / variation
             for scene in scenes
             for variation in files.names(self.root / scene, "the scene's variations")
-            if variation in _VARIATIONS
+            if _VARIATION.fullmatch(variation)
             for camera in files.names(self.root / scene / variation / "frames" / "rgb", "folders Camera_0 and Camera_1")
             if camera in _CAMERAS
         }

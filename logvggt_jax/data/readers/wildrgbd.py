@@ -7,8 +7,6 @@ category the lists `nvs_list.json` and `camera_eval_list.json`. (The set's READM
 `scene_<id>`.) Depth is z in millimetres, 0 invalid. `masks` show the object and are not needed.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator, Mapping
@@ -61,8 +59,7 @@ class WildRGBD(FolderDataset):
             scenes = self.root / category / "scenes"
             if not files.exists(scenes):
                 continue
-            names = [name for name in files.names(scenes, "scenes") if _SCENE.fullmatch(name)]
-            present = {f"{category}/{name}" for name in names if (scenes / name).is_dir()} - _EXCLUDED
+            present = {f"{category}/{name}" for name in files.folders(scenes, "scenes", _SCENE)} - _EXCLUDED
             if self.split != "all":
                 training = _training_scenes(self.root / category, files)
                 if self.split == "train":

@@ -1,7 +1,5 @@
 """Random furnished rooms: geometry, and textures as small tables that the ray caster looks up."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -189,11 +187,7 @@ def _cylinder_distance(points: np.ndarray, centre: np.ndarray, radius: float, ha
 
 
 def _random_textures(
-    rng: np.random.Generator,
-    box: np.ndarray,
-    sphere: np.ndarray,
-    cylinder: np.ndarray,
-    room_colours: np.ndarray | None,
+    rng: np.random.Generator, box: np.ndarray, sphere: np.ndarray, cylinder: np.ndarray, room_colours: np.ndarray | None
 ) -> Textures:
     # Normals that face the viewer: into the room on its faces, outwards on furniture; NaN on curved surfaces.
     axes = np.concatenate([np.eye(3)[:, None] * -1, np.eye(3)[:, None]], axis=1).reshape(6, 3)

@@ -1,7 +1,5 @@
 """A pool of rooms rendered once and kept in memory or in a cache folder, for training at full speed."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json

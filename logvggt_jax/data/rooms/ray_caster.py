@@ -4,8 +4,6 @@ Rays are scaled so that their camera z is 1; the ray parameter is then the z-dep
 Furniture is tested only inside the image rectangle that bounds it.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from logvggt_jax.data.rooms.layout import WAVES, Room, Textures

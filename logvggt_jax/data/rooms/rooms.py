@@ -1,7 +1,5 @@
 """Procedural rooms as a data set: images, exact depth and poses of rooms that exist only as a seed."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Sequence

@@ -48,7 +48,7 @@ class Trajectory:
         amplitude, phase = self.swing[:, 0], self.swing[:, 1]
         yaw, pitch, roll = (amplitude * np.sin(phases[:, None] + phase)).T
         yaw = yaw + self.heading + self.turns * phases
-        camera_to_world = _about_y(yaw) @ _about_x(pitch) @ _about_z(roll)
+        camera_to_world = _rotation(yaw, 2, 0) @ _rotation(pitch, 1, 2) @ _rotation(roll, 0, 1)
         rotation = camera_to_world.transpose(0, 2, 1)
         pose = np.tile(np.eye(4), (len(phases), 1, 1))
         pose[:, :3, :3] = rotation
@@ -84,20 +84,9 @@ def random_trajectory(rng: np.random.Generator, half_size: np.ndarray) -> Trajec
 
 
 def _rotation(angle: np.ndarray, first: int, second: int) -> np.ndarray:
+    """[N, 3, 3] that turn axis `first` towards axis `second`."""
     matrix = np.tile(np.eye(3), (len(angle), 1, 1))
     cosine, sine = np.cos(angle), np.sin(angle)
     matrix[:, first, first] = matrix[:, second, second] = cosine
     matrix[:, first, second], matrix[:, second, first] = -sine, sine
     return matrix
-
-
-def _about_x(angle: np.ndarray) -> np.ndarray:
-    return _rotation(angle, 1, 2)
-
-
-def _about_y(angle: np.ndarray) -> np.ndarray:
-    return _rotation(angle, 2, 0)
-
-
-def _about_z(angle: np.ndarray) -> np.ndarray:
-    return _rotation(angle, 0, 1)

@@ -1,7 +1,5 @@
 """What a stream costs: the parts of the model, their operations, time, compilation and memory."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import resource
@@ -61,12 +59,9 @@ def abstract_variables(model: LogVGGT) -> Any:
 
 
 def sequence_parts(model: LogVGGT, num_frames: int, image_size: tuple[int, int]) -> list[Part]:
-    """Everything that a sequence of `num_frames` frames runs, as `LogVGGT.apply` does.
+    """Everything that a sequence of `num_frames` frames of `image_size` (H, W) runs, as `LogVGGT.apply` does.
 
-    Args:
-      model: its refinement decides what runs how often.
-      num_frames: T.
-      image_size: (H, W).
+    The model's refinement decides what runs how often.
     """
     config = model.config
     stride, overlap = config.windows.stride, config.windows.size - config.windows.stride
@@ -136,13 +131,9 @@ def flops_by_part(model: LogVGGT, num_frames: int, image_size: tuple[int, int]) 
 
 
 def time_part(part: Part, variables: Any, *, rounds: int = 3, least_seconds: float = 0.2) -> PartTime:
-    """Compiles a part and times its calls.
+    """Compiles a part and times `rounds` of as many calls as take `least_seconds`.
 
-    Args:
-      part: of `sequence_parts`.
-      variables: {"params": …} on the device.
-      rounds: of as many calls as take `least_seconds`.
-      least_seconds: of one round.
+    `variables` are {"params": …} on the device.
     """
     # Values do not matter to the time, but masks have to let everything through.
     arguments = jax.tree.map(lambda x: jnp.ones(x.shape, x.dtype), part.arguments)
@@ -170,12 +161,9 @@ def time_part(part: Part, variables: Any, *, rounds: int = 3, least_seconds: flo
 
 
 def matmul_flops_per_second(dtype: str, *, size: int | None = None, rounds: int = 5) -> float:
-    """The fastest of some large matrix products on the default device: a peak that programs can be held against.
+    """The fastest of `rounds` large products of square matrices of `dtype`: a peak that programs can be held against.
 
-    Args:
-      dtype: of the factors.
-      size: side of the square matrices; None takes 1536 on CPUs and 8192 elsewhere.
-      rounds: products that are timed.
+    `size` is their side; None takes 1536 on CPUs and 8192 elsewhere.
     """
     side = size or (1536 if jax.default_backend() == "cpu" else 8192)
     factor = jnp.ones((side, side), dtype)

@@ -1,7 +1,5 @@
 """Frames a second of whole sequences, and their time by part: what the paper's tables of cost measure."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import time
@@ -67,16 +65,10 @@ def random_pictures(image_size: tuple[int, int]) -> np.ndarray:
 
 
 def time_stream(predictor: Predictor, pictures: np.ndarray, num_frames: int, *, watch: bool = False) -> StreamTime:
-    """Sends frames through a predictor: host pictures in, host depth out, cameras at the end.
+    """Sends `num_frames` frames through a predictor: host pictures in, host depth out, cameras at the end.
 
-    Args:
-      predictor: to which no frame has been pushed.
-      pictures: [N, H, W, 3] uint8, shown in turn.
-      num_frames: of the stream.
-      watch: look at memory between frames, which takes time of its own.
-
-    Raises:
-      PredictionError: the predictor cannot take so many frames.
+    No frame has been pushed to it; `pictures` [N, H, W, 3] uint8 are shown in turn. `watch` looks at memory between
+    frames, which takes time of its own. Raises PredictionError where the predictor cannot take so many frames.
     """
     steps: list[float] = []
     first_result, live = 0.0, 0

@@ -1,7 +1,5 @@
 """Answers that need no learning, to be printed beside every result."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import jax
@@ -33,24 +31,12 @@ class DepthStatistics:
 
 
 def depth_statistics(
-    dataset: Dataset,
-    image_size: tuple[int, int],
-    *,
-    source: str,
-    max_sequences: int = 64,
-    max_frames: int = 256,
+    dataset: Dataset, image_size: tuple[int, int], *, source: str, max_sequences: int = 64, max_frames: int = 256
 ) -> DepthStatistics:
-    """Mean depth, mean depth map and mean intrinsics of evenly spaced frames.
+    """Mean depth, mean depth map and mean intrinsics of evenly spaced frames, fitted to `image_size` (H, W).
 
-    Args:
-      dataset: a `logvggt_jax.data` data set.
-      image_size: (H, W) that the frames are fitted to.
-      source: name of these frames in the table.
-      max_sequences: that many evenly spaced sequences at most.
-      max_frames: that many frames at most, the same number of evenly spaced ones from each sequence.
-
-    Raises:
-      InputError: no frame has a valid depth.
+    They are of `max_sequences` sequences and `max_frames` frames at most, the same number from each; `source` is their
+    name in the table. Raises InputError where no frame has a valid depth.
     """
     depth_sum, valid_count = np.zeros(image_size), np.zeros(image_size)
     intrinsics: list[np.ndarray] = []
@@ -104,12 +90,8 @@ def all_baselines(
 ) -> list[Method]:
     """Constant depth, mean depth map, static camera and the untrained network.
 
-    Args:
-      model: its configuration is that of the untrained network.
-      dataset: whose frames the depth baselines take their means of.
-      image_size: (H, W) of the model's input.
-      source: name of these frames in the table.
-      seed: of the random parameters.
+    The depth baselines take their means of frames of `dataset`, which `source` names in the table; the untrained
+    network has the sizes of `model`, whose input is of `image_size` (H, W), and random parameters from `seed`.
     """
     statistics = depth_statistics(dataset, image_size, source=source)
     constant = np.full_like(statistics.mean_map, statistics.mean_depth)

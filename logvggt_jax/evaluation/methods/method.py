@@ -84,14 +84,10 @@ class Method:
 
 
 def predicted(predictor: Predictor, images: np.ndarray) -> ClipPrediction:
-    """A whole clip through a predictor; depth goes to disk as it comes, where the clip is long.
+    """A whole clip [T, H, W, 3] uint8 through a predictor; depth goes to disk as it comes, where the clip is long.
 
-    Args:
-      predictor: to which no frame has been pushed. It is closed afterwards.
-      images: [T, H, W, 3] uint8; may be a memory map.
-
-    Raises:
-      PredictionError: the predictor cannot take this clip.
+    No frame has been pushed to the predictor, which is closed afterwards; images may be a memory map. Raises
+    PredictionError where it cannot take this clip.
     """
     depth = scratch_array(images.shape[:3], np.float32)
     for image in track(images, len(images), f"network, {len(images)} frames"):
@@ -104,21 +100,11 @@ def predicted(predictor: Predictor, images: np.ndarray) -> ClipPrediction:
 
 
 def model_row(
-    method: str,
-    checkpoint: Checkpoint,
-    settings: Any = None,
-    *,
-    name: str = "LoG-VGGT",
-    knows: str = "its training",
+    method: str, checkpoint: Checkpoint, settings: Any = None, *, name: str = "LoG-VGGT", knows: str = "its training"
 ) -> Method:
-    """A row of the model, run by one of the methods of `logvggt_jax.streaming`.
+    """A row of the model, run by the `method` of that name of `logvggt_jax.streaming`.
 
-    Args:
-      method: its name in the registry.
-      checkpoint: the model.
-      settings: the method's own dataclass; None for its defaults.
-      name: label of the row.
-      knows: for the reader of the table.
+    `settings` are the method's own dataclass, None for its defaults; `name` is the row's label.
     """
 
     def start() -> Predictor:

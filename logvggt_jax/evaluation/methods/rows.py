@@ -1,7 +1,5 @@
 """The rows of the model: LoG-VGGT, and on the same weights VGGT offline and on chunks."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from typing import Any
@@ -40,15 +38,10 @@ class ReferenceConfig:
 
 
 def model_rows(checkpoint: Checkpoint, names: Sequence[str], limits: ReferenceConfig) -> list[Method]:
-    """One row for each named method of running the model, all on the same parameters.
+    """One row for each of these methods of `logvggt_jax.streaming.METHODS`, all on the checkpoint's parameters.
 
-    Args:
-      checkpoint: the model.
-      names: of `logvggt_jax.streaming.METHODS`.
-      limits: settings of `offline` and `chunks`; other methods have their defaults.
-
-    Raises:
-      InputError: an unknown name.
+    `limits` are the settings of `offline` and `chunks`; other methods have their defaults. Raises InputError for an
+    unknown name.
     """
     shared = f"{limits.chunk_size} frames, {limits.chunk_overlap} shared with the next"
     known: dict[str, tuple[str, str, Any]] = {

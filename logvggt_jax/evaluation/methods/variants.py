@@ -1,7 +1,5 @@
 """Ablations: one checkpoint run with parts switched off, other windows, or refinement at other times."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Mapping, Sequence
@@ -33,12 +31,10 @@ class Variant:
     online: bool = False
 
     def config(self, base: ModelConfig, *, context: int | None = None) -> ModelConfig:
-        """A checkpoint's configuration, changed.
+        """A checkpoint's configuration `base`, changed.
 
-        Args:
-          base: the checkpoint's.
-          context: frames that the camera head's trunk sees beside frame 0; None for all. A trunk over all frames is
-            a global path of its own, beside which the others hardly show.
+        `context` is how many frames the camera head's trunk sees beside frame 0; None for all. A trunk over all frames
+        is a global path of its own, beside which the others hardly show.
         """
         windows = dataclasses.replace(base.windows, **{"cross_window": True, **self.windows})
         period = windows.stride if self.online else None
@@ -68,17 +64,10 @@ VARIANTS: Mapping[str, Variant] = {
 
 
 def variant_methods(checkpoint: Checkpoint, names: Sequence[str]) -> list[Method]:
-    """Every named variant twice: the camera head's trunk over all frames, and limited to K.
+    """Every variant of these names twice: the camera head's trunk over all frames, and limited to K.
 
-    All share the checkpoint's parameters; none was trained for what it changes. A variant that is the same model as
-    an earlier one is left out.
-
-    Args:
-      checkpoint: whose sizes and parameters they have.
-      names: of `VARIANTS`.
-
-    Raises:
-      InputError: a name that is not known.
+    All share the checkpoint's sizes and parameters; none was trained for what it changes. A variant that is the same
+    model as an earlier one is left out. Raises InputError for a name that is not one of `VARIANTS`.
     """
     for name in names:
         if name not in VARIANTS:

@@ -1,7 +1,5 @@
 """The benchmarks of the paper, one file each, in the order of its tables."""
 
-from __future__ import annotations
-
 import fnmatch
 from collections.abc import Sequence
 
@@ -45,8 +43,7 @@ def paper_protocols(settings: ProtocolSettings) -> list[Protocol]:
 def chosen_protocols(settings: ProtocolSettings, patterns: Sequence[str]) -> list[Protocol]:
     """Those benchmarks whose name matches one of the patterns (`seven_scenes-*`, `*-depth-110`), in their order.
 
-    Raises:
-      InputError: a pattern that matches none; names the benchmarks.
+    Raises InputError naming the benchmarks for a pattern that matches none.
     """
     protocols = paper_protocols(settings)
     names = [protocol.name for protocol in protocols]

@@ -1,7 +1,5 @@
 """Short clips with all metrics, of any data set at one small size: the benchmark of small models."""
 
-from __future__ import annotations
-
 import dataclasses
 
 from logvggt_jax.config import require_counts, require_within

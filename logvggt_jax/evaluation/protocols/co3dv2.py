@@ -1,7 +1,5 @@
 """Camera poses on Co3Dv2: test sequences of every category, 500 random frames; and VGGT's own 10 frames."""
 
-from __future__ import annotations
-
 from logvggt_jax.evaluation.protocols.frame_selection import RandomFrames
 from logvggt_jax.evaluation.protocols.images import WidthResize
 from logvggt_jax.evaluation.protocols.protocol import Protocol, ProtocolSettings

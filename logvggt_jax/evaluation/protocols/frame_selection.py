@@ -1,7 +1,5 @@
 """Which frames of a sequence are evaluated."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 import zlib

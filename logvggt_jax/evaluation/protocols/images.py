@@ -5,8 +5,6 @@ VGGT family's; other lengths (a small model's) scale them. Sources: the evaluati
 reconstruction: crop about the principal point; video depth: whole picture; poses: VGGT's own loader).
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import ClassVar, Protocol
 
@@ -128,22 +126,13 @@ class WidthResize:
 def crop_about_principal_point(
     image: np.ndarray, depth: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """One frame as `PrincipalPointCrop` hands it out.
+    """One frame as `PrincipalPointCrop` hands it out: image [h, w, 3], depth [h, w] and intrinsics [3, 3], `size` (h,
+    w).
 
-    The intrinsics are the reference's: the crop of the resized picture falls on whole pixels, its principal point
-    on the exact half margin, so that they may differ by half a pixel.
-
-    Args:
-      image: [H, W, 3] uint8.
-      depth: [H, W].
-      intrinsics: [3, 3] float64.
-      size: (h, w).
-
-    Returns:
-      image [h, w, 3], depth [h, w], intrinsics [3, 3].
-
-    Raises:
-      InputError: the principal point lies outside the picture.
+    The frame is an image [H, W, 3] uint8 with depth [H, W] and intrinsics [3, 3] float64. The intrinsics handed out are
+    the reference's: the crop of the resized picture falls on whole pixels, its principal point on the exact half
+    margin, so that they may differ by half a pixel. Raises InputError where the principal point lies outside the
+    picture.
     """
     source_height, source_width = image.shape[:2]
     centre_u, centre_v = (round(float(c)) for c in intrinsics[:2, 2])

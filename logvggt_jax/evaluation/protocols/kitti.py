@@ -1,7 +1,5 @@
 """Video depth on KITTI: the 13 validation drives, their first 110 annotated frames; 200 and 500 in the appendix."""
 
-from __future__ import annotations
-
 from logvggt_jax.evaluation.protocols.frame_selection import Leading
 from logvggt_jax.evaluation.protocols.images import WholePicture
 from logvggt_jax.evaluation.protocols.protocol import DepthMeasure, Protocol, ProtocolSettings

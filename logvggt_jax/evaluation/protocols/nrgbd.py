@@ -1,7 +1,5 @@
 """3D reconstruction on Neural RGB-D: every synthetic scene, 200, 500 and 1,000 frames at a fixed stride."""
 
-from __future__ import annotations
-
 import dataclasses
 
 from logvggt_jax.evaluation.protocols.frame_selection import Leading, Spread

@@ -1,7 +1,5 @@
 """What a benchmark is: frames, images, metrics, and the decisions that its paper leaves to the reader."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 from collections.abc import Mapping

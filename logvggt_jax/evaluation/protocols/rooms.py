@@ -1,7 +1,5 @@
 """Procedural rooms: the benchmark that everyone has; exact depth, poses and points of rooms that are only a seed."""
 
-from __future__ import annotations
-
 from logvggt_jax.evaluation.protocols.frame_selection import Leading
 from logvggt_jax.evaluation.protocols.images import PrincipalPointCrop
 from logvggt_jax.evaluation.protocols.protocol import DepthMeasure, Protocol, ProtocolSettings

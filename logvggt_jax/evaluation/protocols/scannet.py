@@ -1,7 +1,5 @@
 """Camera poses on ScanNet's test scenes: 500 random frames a scene; ATE against the number of views."""
 
-from __future__ import annotations
-
 from logvggt_jax.evaluation.protocols.frame_selection import Leading, RandomFrames
 from logvggt_jax.evaluation.protocols.images import WidthResize
 from logvggt_jax.evaluation.protocols.protocol import Protocol, ProtocolSettings

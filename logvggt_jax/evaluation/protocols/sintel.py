@@ -1,7 +1,5 @@
 """Video depth on Sintel: all 23 training sequences, whole (20 to 50 frames), pass `final`."""
 
-from __future__ import annotations
-
 from logvggt_jax.evaluation.protocols.frame_selection import Leading
 from logvggt_jax.evaluation.protocols.images import WholePicture
 from logvggt_jax.evaluation.protocols.protocol import DepthMeasure, Protocol, ProtocolSettings

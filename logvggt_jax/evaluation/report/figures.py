@@ -1,7 +1,5 @@
 """Pictures of results: trajectories, depth and point clouds beside their truth (matplotlib, no display needed)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,13 +21,10 @@ _PAPER_FRAMES_PER_SECOND = {
 
 
 def trajectory_plot(path: Path, predicted_extrinsics: np.ndarray, true_extrinsics: np.ndarray) -> None:
-    """Camera positions in the plane of their largest extent, the prediction aligned by a similarity.
+    """Camera positions in the plane of their largest extent, the prediction aligned by a similarity, as a PNG file.
 
-    Args:
-      path: PNG file; its folder is created.
-      predicted_extrinsics: [N, 3|4, 4], world-to-camera. A prediction that cannot be aligned (static, straight) is
-        left out and the plot says so.
-      true_extrinsics: [N, 3|4, 4].
+    Extrinsics are [N, 3|4, 4], world-to-camera. A prediction that cannot be aligned (static, straight) is left out and
+    the plot says so.
     """
     true = camera_centres(np.asarray(true_extrinsics, np.float64))
     curves = {"truth": true}
@@ -59,14 +54,11 @@ def trajectory_plot(path: Path, predicted_extrinsics: np.ndarray, true_extrinsic
 def depth_panel(
     path: Path, images: np.ndarray, target: np.ndarray, prediction: np.ndarray, *, max_frames: int = 4
 ) -> None:
-    """Rows of image, true depth, predicted depth (scaled to the truth by medians) and relative error.
+    """Rows of image, true depth, predicted depth (scaled to the truth by medians) and relative error, as a PNG file.
 
-    Args:
-      path: PNG file; its folder is created.
-      images: [T, h, w, 3] uint8.
-      target: [T, H, W] metres, 0 = invalid (drawn white).
-      prediction: [T, h, w], resized to the target where its size is another.
-      max_frames: evenly spaced frames of the clip that are drawn; the medians are those of these frames.
+    Images are [T, h, w, 3] uint8, the target [T, H, W] in metres, 0 = invalid (drawn white), the prediction [T, h, w],
+    resized to the target where its size is another. `max_frames` evenly spaced frames are drawn; the medians are
+    theirs.
     """
     chosen = np.unique(np.linspace(0, len(images) - 1, max_frames).round().astype(int))
     images, target, prediction = images[chosen], target[chosen], prediction[chosen]
@@ -98,12 +90,10 @@ def depth_panel(
 
 
 def efficiency_plot(path: Path, report: Mapping[str, Any]) -> None:
-    """Frames a second by length beside the paper's, both relative to the shortest, and the time by part.
+    """Frames a second by length beside the paper's, both relative to the shortest, and the time by part, as a PNG file.
 
-    Args:
-      path: PNG file; its folder is created.
-      report: as benchmarks/efficiency.py writes it: `device`, `speed` (rows of `mode`, `frames`,
-        `frames_per_second`) and `parts` (by mode, rows of `name` and `seconds`) of `part_frames` frames.
+    `report` is as benchmarks/efficiency.py writes it: `device`, `speed` (rows of `mode`, `frames`, `frames_per_second`)
+    and `parts` (by mode, rows of `name` and `seconds`) of `part_frames` frames.
     """
     figure, (rates, relative, parts) = _figure(1, 3, (13.0, 4.0))
     for mode in dict.fromkeys(row["mode"] for row in report["speed"]):
@@ -136,14 +126,11 @@ def efficiency_plot(path: Path, report: Mapping[str, Any]) -> None:
 
 
 def point_clouds(path: Path, prediction: np.ndarray, target: np.ndarray, colours: np.ndarray, view: np.ndarray) -> None:
-    """Two clouds side by side, seen from behind and above one camera (orthographic, nearest point in front).
+    """Two clouds side by side as a PNG file, seen from behind and above one camera (orthographic, nearest point in
+    front).
 
-    Args:
-      path: PNG file; its folder is created.
-      prediction: [N, 3] points in the target's world.
-      target: [M, 3].
-      colours: [N, 3] uint8 of the predicted points, and of the true ones where M = N (grey otherwise).
-      view: [4, 4] world-to-camera matrix of that camera.
+    The prediction [N, 3] lies in the world of the target [M, 3]. `colours` [N, 3] uint8 are the predicted points', and
+    the true ones' where M = N (grey otherwise); `view` [4, 4] is that camera's world-to-camera matrix.
     """
     frame = target @ _viewing_rotation(view).T
     low, high = np.percentile(frame[:, :2], 1, axis=0), np.percentile(frame[:, :2], 99, axis=0)
@@ -160,13 +147,7 @@ def point_clouds(path: Path, prediction: np.ndarray, target: np.ndarray, colours
 
 
 def ate_against_views(path: Path, curves: Mapping[str, Sequence[tuple[int, float]]], title: str) -> None:
-    """ATE over the number of views.
-
-    Args:
-      path: PNG file; its folder is created.
-      curves: by method, (number of views, ATE in metres).
-      title: of the figure.
-    """
+    """ATE in metres over the number of views, a curve of (views, ATE) for each method, as a PNG file."""
     figure, (axis,) = _figure(1, 1, (5.5, 4.0))
     for name, points in curves.items():
         axis.plot(*zip(*points, strict=True), ".-", label=name)

@@ -1,7 +1,5 @@
 """One self-contained HTML page of tables, notes and pictures."""
 
-from __future__ import annotations
-
 import base64
 import html
 import re

@@ -1,7 +1,5 @@
 """The paper's tables: its layout, its rows, and below them the rows of this run."""
 
-from __future__ import annotations
-
 import importlib.resources
 import json
 import statistics

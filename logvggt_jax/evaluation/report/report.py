@@ -1,7 +1,5 @@
 """An evaluation's results for readers: on the terminal, as Markdown, CSV and one HTML page."""
 
-from __future__ import annotations
-
 import csv
 import io
 import re
@@ -78,7 +76,7 @@ def write_report(results: Mapping[str, Any], output: Path) -> None:
 
 def tables(results: Mapping[str, Any]) -> list[Table]:
     """All tables: for the paper's benchmarks their coverage and the paper's own tables first."""
-    if not _is_paper_run(results):
+    if all("-clips-" in benchmark["name"] for benchmark in results["benchmarks"]):
         return benchmark_tables(results)
     return [coverage_table(results), *paper_tables(results), *benchmark_tables(results)]
 
@@ -115,10 +113,6 @@ def _points_settings(benchmark: Mapping[str, Any]) -> str:
     crop = "" if points["crop"] is None else f"middle {points['crop']} x {points['crop']} pixels, "
     icp = "no ICP" if points["icp_threshold"] is None else f"ICP within {points['icp_threshold']} m"
     return f"; {crop}{count} points a clip at most (seed {points['seed']}); {icp}"
-
-
-def _is_paper_run(results: Mapping[str, Any]) -> bool:
-    return not all("-clips-" in benchmark["name"] for benchmark in results["benchmarks"])
 
 
 def _of(entry: Mapping[str, Any]) -> str:

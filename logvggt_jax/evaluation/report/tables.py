@@ -1,7 +1,5 @@
 """Results as tables of text, one set for every benchmark; the paper's own are in `paper_tables`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 

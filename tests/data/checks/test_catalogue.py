@@ -1,7 +1,5 @@
 """The catalogue has every data set with all that a user needs to know before fetching it."""
 
-from __future__ import annotations
-
 import importlib
 from dataclasses import asdict
 

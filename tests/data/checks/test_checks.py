@@ -1,7 +1,5 @@
 """`check_copy`: each kind of damage is reported by file and counted, the rest goes on, a sound copy is clean."""
 
-from __future__ import annotations
-
 import re
 import shutil
 from pathlib import Path

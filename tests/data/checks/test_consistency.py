@@ -1,7 +1,5 @@
 """The consistency figure: small where depth, intrinsics and poses belong together, large where one of them is wrong."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Colour augmentation: what each part does to colours, and who shares a draw."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Evaluation sequences are recognised however a reader nests their names."""
 
-from __future__ import annotations
-
 import pytest
 
 from logvggt_jax.data.feeding.holdouts import PUBLISHED, HoldOut, check_disjoint, check_held_out

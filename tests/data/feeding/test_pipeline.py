@@ -1,7 +1,5 @@
 """Batches: shapes, coverage, shards, exact resume, and bad data named or replaced."""
 
-from __future__ import annotations
-
 import json
 from itertools import islice
 

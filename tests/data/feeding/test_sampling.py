@@ -1,7 +1,5 @@
 """Clips: evenly spaced in either direction, or walks over neighbours; inside the sequence, reproducible."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

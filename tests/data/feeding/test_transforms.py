@@ -1,7 +1,5 @@
 """Resizing matches the reference filter, and cameras follow pixels."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Whole pictures are read as they are; truncated, damaged and mistyped ones are named."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """Numbered files: numeric order, strays passed over, gaps named."""
 
-from __future__ import annotations
-
 import pickle
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """ARKitScenes: coarse depth, a calibration file a picture, a trajectory of axis-angle vectors with the world's z up."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,7 +8,7 @@ from analytic_room import camera_to_world, view
 from room_views import RoomView, millimetres, write_image
 from scipy.spatial.transform import Rotation, Slerp
 
-from layouts.layout import Layout
+from layouts.layout import Layout, written
 from logvggt_jax.data.readers.arkitscenes import ARKitScenes
 
 NAME = "Training/41048190"
@@ -117,4 +115,27 @@ LAYOUT = Layout(
     tables=(f"{VIDEO}/lowres_wide.traj", f"{VIDEO}/vga_wide_intrinsics/41048190_100.101.pincam"),
     views=stored_views(sensor_path(), POSE_TIMES),
     poses="rigid",
+    damages=(
+        *(
+            (rf"lowres_wide\.traj.*{complaint}", written(f"{VIDEO}/lowres_wide.traj", text))
+            for text, complaint in (
+                ("", "no poses"),
+                ("100 0 0 0 1 2", "line 1: expected 7 numbers, got 6"),
+                ("100 0 0 0 1 2 3\nnan 0 0 0 1 2 3", "line 2: expected a time"),
+            )
+        ),
+        *(
+            (
+                rf"41048190_100\.000\.(pincam|png).*{complaint}",
+                written(f"{VIDEO}/vga_wide_intrinsics/41048190_100.000.pincam", text),
+            )
+            for text, complaint in (
+                ("160 120 110 112 73", "expected 6 numbers, got 5"),
+                ("0 120 110 112 73 66", "above 0"),
+                ("120 160 110 112 73 66", "shape of its calibration"),
+                ("160 120 nan 112 73 66", ""),
+                ("160 120 1 1 73 66", "intrinsics"),
+            )
+        ),
+    ),
 )

@@ -1,14 +1,12 @@
 """BlendedMVS: float maps, a text file a camera, pairs of photographs that see the same."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from room_views import INTRINSICS, RoomView, write_image
+from room_views import INTRINSICS, SIZE, RoomView, write_image
 
-from layouts.layout import Layout
+from layouts.layout import Layout, changed, written
 from logvggt_jax.data.readers.blendedmvs import BlendedMVS
 
 SCENE = "5bfe5ae0fe0ea555e6a969ca"
@@ -61,4 +59,26 @@ LAYOUT = Layout(
     tables=(FILES[2],),
     depth_error=1e-6,
     picture_error=2.0,
+    damages=(
+        *(
+            (rf"00000001_cam\.txt.*{complaint}", changed(FILES[2], change))
+            for change, complaint in (
+                (lambda data: data.replace(b"intrinsic\n", b"intrinsic\n1 1 "), "got 32 words"),
+                (lambda data: data[: len(data) // 2], "expected 'extrinsic'"),
+                (lambda data: data.replace(b"intrinsic\n", b"intrinsic\nx", 2), "expected numbers"),
+            )
+        ),
+        (
+            r"00000001\.jpg: intrinsics fx=0\.5",
+            written(FILES[2], camera_text(np.eye(4), np.diag([0.5, 0.5, 1]))),
+        ),
+        *(
+            (rf"00000001\.pfm.*{complaint}", written(FILES[1], content))
+            for content, complaint in (
+                (pfm_bytes(np.ones(SIZE))[:-8], "12288 bytes after its header, got 12280"),
+                (pfm_bytes(np.ones(SIZE)).replace(b"Pf", b"PF", 1), "single-channel"),
+                (b"Pf\n0 0\n-1\n", "0 x 0"),
+            )
+        ),
+    ),
 )

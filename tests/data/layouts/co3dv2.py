@@ -1,7 +1,5 @@
 """Co3Dv2: annotations in gzip JSON, PyTorch3D's cameras, depth as the bits of 16-bit floats."""
 
-from __future__ import annotations
-
 import gzip
 import json
 from collections.abc import Sequence
@@ -12,7 +10,7 @@ import numpy as np
 from analytic_room import pinhole
 from room_views import RoomView, room_views, write_image
 
-from layouts.layout import Layout
+from layouts.layout import Layout, written
 from logvggt_jax.data.readers.co3dv2 import Co3Dv2
 
 LANDSCAPE, PORTRAIT = (48, 64), (64, 48)
@@ -112,6 +110,7 @@ FILES = [
     f"{NAME}/{name}"
     for name in ("images/frame000003.jpg", "depths/frame000003.jpg.geometric.png", "depth_masks/frame000003.png")
 ]
+ANNOTATIONS = "apple/frame_annotations.jgz"
 LAYOUT = Layout(
     Co3Dv2,
     NAME,
@@ -120,8 +119,41 @@ LAYOUT = Layout(
     image=FILES[0],
     depth=FILES[1],
     needed=(*FILES, "apple/sequence_annotations.jgz"),
-    tables=("apple/frame_annotations.jgz", "apple/sequence_annotations.jgz"),
+    tables=(ANNOTATIONS, "apple/sequence_annotations.jgz"),
     views=views_of(LANDSCAPE),
     depth_error=0.003,  # half floats between 2 and 4 are 1/512 apart
     picture_error=2.0,
+    damages=(
+        *(
+            (f"apple/{name}: .*fetch it again", written(f"apple/{name}", content))
+            for name in ("frame_annotations.jgz", "sequence_annotations.jgz")
+            for content in (b"", b"[]", gzip.compress(b"{"), gzip.compress(b"{}"), gzip.compress(b"[3]"))
+        ),
+        *(
+            (rf"frame_annotations\.jgz.*{complaint}", lambda root, change=change: edit(root / ANNOTATIONS, change))
+            for change, complaint in (
+                (
+                    lambda each: each["viewpoint"].update(R=np.diag([1, 1, -1]).tolist()),
+                    r"images/frame000\d+\.jpg: .*rigid",
+                ),
+                (lambda each: each["viewpoint"].update(T=[1, 2]), "fetch it again"),
+                (lambda each: each["viewpoint"].update(intrinsics_format="pixels"), "'pixels'"),
+                (lambda each: each["viewpoint"].pop("focal_length"), "focal_length"),
+                (lambda each: each.pop("image"), "image"),
+            )
+        ),
+        (f"{NAME}: no frame of Co3Dv2 counts", lambda root: write_gzip(root / ANNOTATIONS, [])),
+        (
+            r"depth_masks/frame000003\.png: size \(24, 32\)",
+            lambda root: write_image(root / FILES[2], np.ones((24, 32), np.uint8)),
+        ),
+        (
+            r"images/frame000003\.jpg: a picture of 48 x 64",
+            lambda root: write_image(root / FILES[0], np.zeros((*PORTRAIT, 3), np.uint8)),
+        ),
+        (
+            r"frame000009\.jpg: intrinsics fx=0\.024",
+            lambda root: edit(root / ANNOTATIONS, lambda each: each["viewpoint"].update(focal_length=[1e-3, 1e-3])),
+        ),
+    ),
 )

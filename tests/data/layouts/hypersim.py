@@ -1,7 +1,5 @@
 """HyperSim: HDF5 of linear colour and ray distance, cameras as a matrix from the picture's borders to rays."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,7 +7,7 @@ import h5py
 import numpy as np
 from room_views import INTRINSICS, SIZE, RoomView
 
-from layouts.layout import Layout
+from layouts.layout import Layout, written
 from logvggt_jax.data.readers.hypersim import HyperSim
 
 UNIT = 0.0254
@@ -91,6 +89,7 @@ def write(root: Path, views: Sequence[RoomView]) -> None:
 
 GEOMETRY = f"{SCENE}/images/scene_cam_00_geometry_hdf5/frame.0002"
 FILES = (f"{SCENE}/images/scene_cam_00_final_hdf5/frame.0002.color.hdf5", f"{GEOMETRY}.depth_meters.hdf5")
+ENTITIES = f"{GEOMETRY}.render_entity_id.hdf5"
 TABLES = [
     f"{SCENE}/_detail/{name}"
     for name in (
@@ -106,8 +105,49 @@ LAYOUT = Layout(
     names=[f"frame.{number:04d}" for number in (0, 2, 3, 4)],
     image=FILES[0],
     depth=FILES[1],
-    needed=(*FILES, f"{GEOMETRY}.render_entity_id.hdf5", *TABLES, TABLE),
+    needed=(*FILES, ENTITIES, *TABLES, TABLE),
     tables=(*TABLES, TABLE),
     developed=lambda picture: np.floor(tone_mapped(linear(picture))),
     picture_error=0.05,
+    damages=(
+        *(
+            (
+                rf"camera_parameters\.csv: M_cam_from_uv of {SCENE} {complaint}",
+                lambda root, matrix=matrix: write_table(root, {SCENE: matrix}),
+            )
+            for matrix, complaint in (
+                (np.diag([1.0, 1, 0]), "has no inverse"),
+                (np.full((3, 3), np.nan), "has no inverse"),
+                (np.diag([0.577, 0.433, 1.0]), "mirrors"),
+            )
+        ),
+        (
+            rf"camera_parameters\.csv: expected M_cam_from_uv_00.*{SCENE}",
+            written(TABLE, f"scene_name,M_cam_from_uv_00\n{SCENE},zero\n"),
+        ),
+        (rf"camera_parameters\.csv: no row for {SCENE}", lambda root: write_table(root, {"ai_099_009": PLAIN})),
+        (
+            r"positions\.hdf5: expected numbers of shape 5 x 3.*\(3, 3\)",
+            lambda root: write_array(root / TABLES[1], np.zeros((3, 3))),
+        ),
+        (
+            "_detail/cam_00: expected a keyframe for each frame up to 4, got 3",
+            lambda root: write_keyframes(root / SCENE, [np.eye(4)] * 3),
+        ),
+        *(
+            (r"metadata_scene\.csv: expected a row meters_per_asset_unit", written(TABLES[0], text))
+            for text in (
+                "",
+                "parameter_name,parameter_value\nmeters_per_asset_unit,0\n",
+                "meters_per_asset_unit,inch\n",
+            )
+        ),
+        *(
+            (
+                rf"{name}: expected numbers of shape .*\(24, 32\)",
+                lambda root, name=name, kind=kind: write_array(root / name, np.zeros((24, 32), kind)),
+            )
+            for name, kind in ((FILES[0], np.float32), (FILES[1], np.float32), (ENTITIES, np.int16))
+        ),
+    ),
 )

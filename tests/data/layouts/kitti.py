@@ -1,7 +1,5 @@
 """KITTI depth: sparse depth of a part of the pictures, a calibration a day, no poses."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from room_views import INTRINSICS, SIZE, RoomView, write_image
 
-from layouts.layout import VIEWS, Layout
+from layouts.layout import VIEWS, Layout, written
 from logvggt_jax.data.readers.kitti import KITTI
 
 DATE, DRIVE = "2011_09_26", "2011_09_26_drive_0002_sync"
@@ -46,6 +44,7 @@ def write(root: Path, views: Sequence[RoomView] = SPARSE, drive: str = DRIVE, pa
     write_calibration(root, date)
 
 
+CALIBRATION = f"{DATE}/calib_cam_to_cam.txt"
 LAYOUT = Layout(
     KITTI,
     DRIVE,
@@ -53,9 +52,17 @@ LAYOUT = Layout(
     names=[f"{number:010d}" for number in NUMBERS],
     image=f"{IMAGES}/0000000006.png",
     depth=f"{DEPTHS}/0000000006.png",
-    needed=(f"{IMAGES}/0000000006.png", IMAGES, DEPTHS, f"{DATE}/calib_cam_to_cam.txt"),
-    tables=(f"{DATE}/calib_cam_to_cam.txt",),
+    needed=(f"{IMAGES}/0000000006.png", IMAGES, DEPTHS, CALIBRATION),
+    tables=(CALIBRATION,),
     views=SPARSE,
     depth_error=0.501 / 256,
     poses="none",
+    damages=(
+        (
+            r"image_02/0000000006\.png: expected 16-bit depth",
+            lambda root: write_image(root / f"{DEPTHS}/0000000006.png", np.zeros(SIZE, np.uint8)),
+        ),
+        (r"calib_cam_to_cam\.txt, P_rect_02: expected 12 numbers, got 3", written(CALIBRATION, "P_rect_02: 1 2 3\n")),
+        (r"calib_cam_to_cam\.txt: no line P_rect_02", written(CALIBRATION, "P_rect_00: 1 2 3\n")),
+    ),
 )

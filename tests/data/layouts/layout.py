@@ -1,7 +1,5 @@
 """What the contract test needs to know of a data set's files."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +9,25 @@ from room_views import RoomView, room_views
 from logvggt_jax.data.readers.folder_dataset import FolderDataset
 
 VIEWS = room_views(4)
+Damage = Callable[[Path], object]
+"""Does something to a copy in the folder it is given."""
+
+
+def written(name: str, content: str | bytes) -> Damage:
+    data = content.encode() if isinstance(content, str) else content
+    return lambda root: (root / name).write_bytes(data)
+
+
+def changed(name: str, change: Callable[[bytes], bytes]) -> Damage:
+    return lambda root: (root / name).write_bytes(change((root / name).read_bytes()))
+
+
+def relined(name: str, change: Callable[[list[str]], list[str]]) -> Damage:
+    return lambda root: (root / name).write_text("\n".join(change((root / name).read_text().splitlines())))
+
+
+def removed(*names: str) -> Damage:
+    return lambda root: [(root / name).unlink() for name in names]
 
 
 @dataclass(frozen=True)
@@ -30,6 +47,8 @@ class Layout:
       depth_error: metres.
       picture_error: mean, in levels.
       unit: lengths handed out for a metre.
+      damages: what is done to a copy, each with what the error then says.
+      lose_intrinsics: makes the intrinsics of one frame not finite, where a frame has its own.
       poses: `matrix` where the files can hold any matrix, `rigid` where only rigid poses, `none`.
     """
 
@@ -46,4 +65,6 @@ class Layout:
     depth_error: float = 1e-5
     picture_error: float = 0.0
     unit: float = 1.0
+    damages: Sequence[tuple[str, Damage]] = ()
+    lose_intrinsics: Damage | None = None
     poses: str = "matrix"

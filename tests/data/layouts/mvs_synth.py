@@ -1,7 +1,5 @@
 """MVS-Synth: EXR depth, JSON cameras, a left-handed world, ten units a metre."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,7 +8,7 @@ import numpy as np
 import OpenEXR
 from room_views import CENTRE, FOCAL, RoomView, pinhole_row, write_image
 
-from layouts.layout import Layout
+from layouts.layout import Layout, changed, written
 from logvggt_jax.data.readers.mvs_synth import MVSSynth
 
 # The game's world has x and y swapped, so that it is left-handed.
@@ -54,4 +52,29 @@ LAYOUT = Layout(
     needed=FILES,
     tables=(FILES[2],),
     unit=UNIT,
+    damages=(
+        (r"0001\.json.*left-handed.*\+1", lambda root: write_pose(root / FILES[2], np.eye(4))),
+        # Only the size 720 is read.
+        ("GTAV_720", lambda root: (root / "GTAV_720").rename(root / "GTAV_540")),
+        (r"0001\.exr: truncated or damaged", changed(FILES[1], lambda data: data[:900] + b"\xff" * 200)),
+        (
+            r"0001\.exr: expected one part with one channel, got 1 with B, G, R",
+            lambda root: write_exr(root / FILES[1], np.zeros((48, 64, 3), np.float32), "RGB"),
+        ),
+        (
+            r"0001\.exr: expected half or float pixels, got uint32",
+            lambda root: write_exr(root / FILES[1], np.zeros((48, 64), np.uint32)),
+        ),
+        (r"0001\.json.*TypeError", written(FILES[2], "[]")),
+        (r"0001\.json.*f_x", written(FILES[2], '{"extrinsic": [[1]]}')),
+        (
+            r"0001\.json.*4 x 4 numbers, got \(1, 1\)",
+            written(FILES[2], '{"extrinsic": [[1]], "f_x": 1, "f_y": 1, "c_x": 1, "c_y": 1}'),
+        ),
+        (
+            r"0001\.png: intrinsics .* cannot belong to a picture of 64 x 48",
+            lambda root: write_pose(root / FILES[2], SWAP, c_x=960.0, c_y=540.0),
+        ),
+    ),
+    lose_intrinsics=lambda root: write_pose(root / FILES[2], SWAP, f_x=float("inf")),
 )

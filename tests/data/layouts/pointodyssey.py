@@ -1,14 +1,12 @@
 """PointOdyssey v1.2: 16-bit depth up to 1000 m, cameras in an npz file beside large point tracks."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from room_views import RoomView, write_image
+from room_views import INTRINSICS, RoomView, write_image
 
-from layouts.layout import VIEWS, Layout
+from layouts.layout import VIEWS, Layout, changed, removed
 from logvggt_jax.data.readers.pointodyssey import PointOdyssey
 
 STEP = 1000 / 65535
@@ -36,13 +34,20 @@ def write_sequence(folder: Path, views: Sequence[RoomView] = VIEWS) -> None:
 
 
 def write(root: Path, views: Sequence[RoomView]) -> None:
-    write_sequence(root / "train/dancing", views)
+    write_sequence(root / SCENE, views)
 
 
-FILES = [f"train/dancing/{name}" for name in ("rgbs/rgb_00001.jpg", "depths/depth_00001.png", "anno.npz")]
+def flipped(content: bytes) -> bytes:
+    """Bytes of the extrinsics' numbers that are others."""
+    start = content.index(b"extrinsics.npy")
+    return content[: start + 200] + bytes(40) + content[start + 240 :]
+
+
+SCENE = "train/dancing"
+FILES = [f"{SCENE}/{name}" for name in ("rgbs/rgb_00001.jpg", "depths/depth_00001.png", "anno.npz")]
 LAYOUT = Layout(
     PointOdyssey,
-    "train/dancing",
+    SCENE,
     write,
     names=[f"rgb_{index:05d}" for index in range(4)],
     image=FILES[0],
@@ -51,4 +56,51 @@ LAYOUT = Layout(
     tables=(FILES[2],),
     depth_error=0.51 * STEP,
     picture_error=2.0,
+    damages=(
+        (r"anno\.npz: .*valids.*fetch v1\.2", lambda root: write_cameras(root / SCENE, valids=None)),
+        (
+            r"anno\.npz.*annotations\.npz is of an older release.*fetch v1\.2",
+            lambda root: (root / FILES[2]).rename(root / "train/dancing/annotations.npz"),
+        ),
+        (
+            "train/dancing: expected frames 0 to 3.*got 3 frames from 0 to 2",
+            removed(f"{SCENE}/rgbs/rgb_00003.jpg", f"{SCENE}/depths/depth_00003.png"),
+        ),
+        (
+            "got 4 frames from 0 to 4",
+            lambda root: [
+                (root / SCENE / stem.format(3)).rename(root / SCENE / stem.format(4))
+                for stem in ("rgbs/rgb_{:05d}.jpg", "depths/depth_{:05d}.png")
+            ],
+        ),
+        (r"anno\.npz: truncated or damaged", changed(FILES[2], lambda data: data[:-50])),
+        (r"anno\.npz: truncated or damaged", changed(FILES[2], flipped)),
+        (
+            r"anno\.npz: truncated or damaged",
+            lambda root: [np.save(root / "a.npy", np.eye(4)), (root / "a.npy").rename(root / FILES[2])],
+        ),
+        *(
+            (
+                r"anno\.npz: expected (in|ex)trinsics of",
+                lambda root, change={name: array}: write_cameras(root / SCENE, **change),
+            )
+            for name, array in (
+                ("intrinsics", np.zeros((2, 3, 3))),
+                ("extrinsics", np.zeros((3, 3, 4))),
+                ("extrinsics", np.zeros((0, 4, 4))),
+                ("extrinsics", np.array("none")),
+            )
+        ),
+        (
+            r"anno\.npz: truncated or damaged.*allow_pickle",
+            lambda root: write_cameras(root / SCENE, extrinsics=np.array([{}, {}, {}], dtype=object)),
+        ),
+        (
+            r"rgb_00000\.jpg: intrinsics fx=-55",
+            lambda root: write_cameras(root / SCENE, intrinsics=np.stack([np.diag([-55.0, 55, 1])] * 4)),
+        ),
+    ),
+    lose_intrinsics=lambda root: write_cameras(
+        root / SCENE, intrinsics=np.stack([INTRINSICS, INTRINSICS, INTRINSICS * np.nan, INTRINSICS])
+    ),
 )

@@ -1,7 +1,5 @@
 """Replica as NICE-SLAM renders it: JPEG, 16-bit depth, one line a pose, one camera for all scenes."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from room_views import CENTRE, FOCAL, SIZE, RoomView, write_image
 
-from layouts.layout import Layout
+from layouts.layout import Layout, changed, relined, removed, written
 from logvggt_jax.data.readers.replica import Replica
 
 SCALE = 6553.5
@@ -44,4 +42,20 @@ LAYOUT = Layout(
     tables=("room0/traj.txt", "cam_params.json"),
     depth_error=0.51 / SCALE,
     picture_error=2.0,
+    damages=(
+        (r"traj\.txt: expected 4 poses.*got 5 lines", relined("room0/traj.txt", lambda lines: [*lines, lines[0]])),
+        (
+            r"traj\.txt, line 1: expected 16 numbers, got 17",
+            changed("room0/traj.txt", lambda data: data.replace(b" ", b" 7 ", 1)),
+        ),
+        (
+            "results: frame 1 is missing",
+            removed("room0/results/frame000001.jpg", "room0/results/depth000001.png"),
+        ),
+        (r"cam_params\.json.*expected", written("cam_params.json", "[1]")),
+        (r"cam_params\.json.*expected.*'h'", written("cam_params.json", '{"camera": {"w": 64}}')),
+        (r"cam_params\.json.*must be positive", lambda root: write_camera(root, scale=0)),
+        (r"cam_params\.json.*expected.*wide", lambda root: write_camera(root, fx="wide")),
+        (r"frame000000\.jpg: intrinsics.*cannot belong", lambda root: write_camera(root, cx=500.0)),
+    ),
 )

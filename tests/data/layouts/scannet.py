@@ -1,7 +1,5 @@
 """ScanNet: the export of its SensReader, and the form that published evaluations prepare from it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,7 +7,7 @@ import cv2
 import numpy as np
 from room_views import INTRINSICS, RoomView, millimetres, write_image
 
-from layouts.layout import VIEWS, Layout
+from layouts.layout import VIEWS, Layout, written
 from logvggt_jax.data.readers.scannet import ScanNet
 
 COLOUR_SIZE = (97, 130)
@@ -64,4 +62,15 @@ LAYOUT = Layout(
     tables=TABLES,
     depth_error=0.00051,
     picture_error=3.0,
+    damages=(
+        (
+            r"depth/9\.png: 64 x 48 has another aspect ratio than 48 x 64",
+            lambda root: write_image(root / f"{SCENE}/color/9.jpg", np.zeros((64, 48, 3), np.uint8)),
+        ),
+        (r"pose/9\.txt: expected 16 numbers, got 12", written(TABLES[0], "1 0 0 0\n" * 3)),
+        (
+            r"scannetv2/scene0000_00 and .*scans_train/scene0000_00 are the same",
+            lambda root: write_scene(root / "scannetv2/scene0000_00"),
+        ),
+    ),
 )

@@ -1,7 +1,5 @@
 """MPI Sintel: binary depth and cameras byte by byte, numbered from 1."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from room_views import INTRINSICS, RoomView, write_image
 
-from layouts.layout import Layout
+from layouts.layout import Layout, changed
 from logvggt_jax.data.readers.sintel import Sintel
 
 TAG = struct.pack("<f", 202021.25)
@@ -48,4 +46,22 @@ LAYOUT = Layout(
     depth=FILES[1],
     needed=(*FILES, CAMERA_FILE),
     tables=(CAMERA_FILE,),
+    damages=(
+        (
+            r"frame_0002\.dpt: expected 12300 bytes for 64 x 48 pixels, got 12299",
+            changed(FILES[1], lambda data: data[:-1]),
+        ),
+        (r"frame_0002\.dpt: expected 12300 bytes", changed(FILES[1], lambda data: data + b"\0")),
+        (r"frame_0002\.dpt: .*for 64 x 0", changed(FILES[1], lambda data: data[:8])),
+        (
+            r"frame_0002\.dpt.*bytes for -1 x -3072 pixels",
+            changed(FILES[1], lambda data: TAG + struct.pack("<ii", -1, -3072) + data[12:]),
+        ),
+        (r"frame_0002\.dpt.*tag 202021\.25", changed(FILES[1], lambda data: data[:4][::-1] + data[4:])),
+        (r"frame_0002\.cam: expected 172 bytes, got 164", changed(CAMERA_FILE, lambda data: data[:-8])),
+        (r"frame_0002\.cam.*tag 202021\.25", changed(CAMERA_FILE, lambda data: b"PIEX" + data[4:])),
+        (r"frame_0002\.png: intrinsics", lambda root: write_camera(root / CAMERA_FILE, np.eye(4), INTRINSICS.T)),
+        ("training/final: no such folder", lambda root: (root / "training/final").rename(root / "training/albedo")),
+    ),
+    lose_intrinsics=lambda root: write_camera(root / CAMERA_FILE, np.eye(4), np.full((3, 3), np.nan)),
 )

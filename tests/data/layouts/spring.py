@@ -1,7 +1,5 @@
 """Spring: stereo disparity of twice the picture's size in HDF5, rows of numbers for the cameras."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,7 +7,7 @@ import h5py
 import numpy as np
 from room_views import FOCAL, RoomView, pinhole_row, write_image
 
-from layouts.layout import Layout
+from layouts.layout import Layout, relined
 from logvggt_jax.data.readers.spring import Spring
 
 BASELINE = 0.065
@@ -46,4 +44,30 @@ LAYOUT = Layout(
     depth=FILES[1],
     needed=(*FILES, *TABLES),
     tables=TABLES,
+    damages=(
+        *(
+            (
+                f"{name}: expected a row for each of the frames 1 to 4, got 2 rows",
+                relined(name, lambda lines: lines[:2]),
+            )
+            for name in TABLES
+        ),
+        *(
+            (
+                f"{name}, row 2: expected (4|16) numbers, got (5|17)",
+                relined(name, lambda lines: [lines[0], lines[1] + " 1", *lines[2:]]),
+            )
+            for name in TABLES
+        ),
+        (
+            r"disp1_left_0002\.dsp5: expected numbers of shape 96 x 128.*\(48, 64\)",
+            lambda root: write_disparity(root / FILES[1], np.ones((48, 64), np.float32)),
+        ),
+        (
+            r"disp1_left_0002\.dsp5: no array 'disparity', only flow",
+            lambda root: write_disparity(root / FILES[1], np.ones((96, 128), np.float32), name="flow"),
+        ),
+        ("train: no such folder", lambda root: (root / "train").rename(root / "spring_train")),
+    ),
+    lose_intrinsics=relined(TABLES[0], lambda lines: [*lines[:3], "inf inf inf inf"]),
 )

@@ -1,7 +1,5 @@
 """TUM RGB-D and Bonn: pictures, depth and poses with clocks of their own."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,7 +7,7 @@ import numpy as np
 from room_views import RoomView, room_views, write_image
 from scipy.spatial.transform import Rotation
 
-from layouts.layout import Layout
+from layouts.layout import Layout, relined, removed, written
 from logvggt_jax.data.readers.bonn import Bonn
 from logvggt_jax.data.readers.tum import TUM
 
@@ -77,6 +75,17 @@ def _layout(reader: type[TUM | Bonn], name: str, views: Sequence[RoomView]) -> L
         tables=tables,
         views=views,
         depth_error=0.51 * STEP,
+        damages=(
+            *((f"{table}: expected lines", written(table, "# nothing\n")) for table in tables),
+            (rf"rgb/{NAMES[2]}\.png: no such file, but rgb\.txt lists it", removed(f"{name}/rgb/{NAMES[2]}.png")),
+            (r"rgb\.txt, line 7: expected 'time file'", relined(tables[0], lambda lines: [*lines, "1305031102.0"])),
+            (r"rgb\.txt, line 7: expected numbers", relined(tables[0], lambda lines: [*lines, "noon rgb/a.png"])),
+            (r"rgb\.txt, line 7: .* is listed twice", relined(tables[0], lambda lines: [*lines, "1" + lines[1][17:]])),
+            (
+                r"groundtruth\.txt, line 43: expected 8 numbers, got 4",
+                relined(tables[2], lambda lines: [*lines, "1305031102.0 1 2 3"]),
+            ),
+        ),
     )
 
 

@@ -1,14 +1,12 @@
 """Virtual KITTI 2: two cameras whose rows are interleaved in text files, depth in centimetres."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from room_views import RoomView, pinhole_row, room_views, write_image
 
-from layouts.layout import VIEWS, Layout
+from layouts.layout import VIEWS, Layout, changed, relined
 from logvggt_jax.data.readers.virtual_kitti import VirtualKITTI
 
 BASELINE = 0.532725
@@ -47,4 +45,25 @@ LAYOUT = Layout(
     views=RIGHT,
     depth_error=0.0051,
     picture_error=2.0,
+    damages=(
+        *(
+            (f"{name}.*{complaint}", relined(name, change))
+            for name in TABLES
+            for complaint, change in (
+                ("no row for frame 1 of Camera_1", lambda lines: [line for line in lines if line[:3] != "1 1"]),
+                ("expected a header", lambda lines: lines[1:]),
+                (
+                    r"line 9: expected (6|18) numbers, got (5|17)",
+                    lambda lines: [*lines[:-1], lines[-1].rpartition(" ")[0]],
+                ),
+                ("line 9: expected numbers", lambda lines: [*lines[:-1], lines[-1] + "x"]),
+            )
+        ),
+        (
+            r"rgb_00001\.jpg: intrinsics fx=0\.01",
+            changed(TABLES[0], lambda data: data.replace(b"1 1 55.0", b"1 1 0.01")),
+        ),
+        (r"depth_00001\.png: expected 16-bit", lambda root: write_image(root / FILES[1], np.ones((48, 64), np.uint8))),
+    ),
+    lose_intrinsics=changed(TABLES[0], lambda data: data.replace(b"2 1 55.0", b"2 1 inf")),
 )

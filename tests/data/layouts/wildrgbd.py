@@ -1,15 +1,14 @@
 """WildRGB-D: portrait pictures, millimetres, intrinsics column by column, numbered lines of poses."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from analytic_room import pinhole
 from room_views import RoomView, millimetres, room_views, write_image
 
-from layouts.layout import Layout
+from layouts.layout import Layout, relined, written
 from logvggt_jax.data.readers.wildrgbd import WildRGBD
 
 SIZE = (64, 48)
@@ -48,4 +47,30 @@ LAYOUT = Layout(
     tables=FILES[2:],
     views=room_views(4, INTRINSICS, SIZE),
     depth_error=0.00051,
+    damages=(
+        *(
+            (
+                rf"cam_poses\.txt, line 2: .*{complaint}",
+                relined(FILES[3], lambda lines, text=text: [lines[0], text, *lines[2:]]),
+            )
+            for text, complaint in (
+                ("1 0 0 0", "expected 17 numbers, got 4"),
+                ("1.5 1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1", "frame number"),
+                ("1 1 0 0 0 0 -1 0 0 0 0 1 0 0 0 0 1", "rigid"),
+            )
+        ),
+        *(
+            (r"scene_007/metadata: .*fetch it again", written(FILES[2], text))
+            for text in (
+                "",
+                "[]",
+                '{"w": 4, "h": 3}',
+                '{"w": 4, "h": 3, "K": [1, 2]}',
+                '{"w": 0, "h": 3, "K": [1,0,0,0,1,0,0,0,1]}',
+            )
+        ),
+        # Row by row, and a focal length of a million pixels.
+        (r"00000\.png: intrinsics", lambda root: write_metadata(root / SCENE, INTRINSICS.T)),
+        (r"00000\.png: intrinsics fx=1e\+06", lambda root: write_metadata(root / SCENE, pinhole(SIZE, 1e6))),
+    ),
 )

@@ -1,7 +1,5 @@
 """ARKitScenes: the room comes back whichever way up the tablet was held; times, splits and damage."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2
@@ -144,33 +142,3 @@ def test_splits_follow_the_folders(root: Path):
     assert ARKitScenes(root, "val").sequences == ("Validation/41069021",)
     with pytest.raises(FileNotFoundError, match="raw/Training/<video>"):
         ARKitScenes(root / "raw")
-
-
-@pytest.mark.parametrize(
-    ("text", "complaint"),
-    [
-        ("", "no poses"),
-        ("100 0 0 0 1 2", "line 1: expected 7 numbers, got 6"),
-        ("100 0 0 0 1 2 3\nnan 0 0 0 1 2 3", "line 2: expected a time"),
-    ],
-)
-def test_a_damaged_trajectory_is_named(root: Path, video: Path, text: str, complaint: str):
-    (video / "lowres_wide.traj").write_text(text)
-    with pytest.raises(ValueError, match=rf"lowres_wide\.traj.*{complaint}"):
-        ARKitScenes(root).num_frames(NAME)
-
-
-@pytest.mark.parametrize(
-    ("text", "complaint"),
-    [
-        ("160 120 110 112 73", "expected 6 numbers, got 5"),
-        ("0 120 110 112 73 66", "above 0"),
-        ("120 160 110 112 73 66", "shape of its calibration"),
-        ("160 120 nan 112 73 66", ""),
-        ("160 120 1 1 73 66", "intrinsics"),
-    ],
-)
-def test_a_damaged_calibration_is_named(root: Path, video: Path, text: str, complaint: str):
-    (video / "vga_wide_intrinsics/41048190_100.000.pincam").write_text(text)
-    with pytest.raises(ValueError, match=rf"41048190_100\.000\.(pincam|png).*{complaint}"):
-        ARKitScenes(root).read(NAME, [0])

@@ -1,7 +1,5 @@
 """Bonn RGB-D Dynamic: where sequences lie, and the prepared form with and without poses."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

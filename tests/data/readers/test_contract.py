@@ -1,7 +1,5 @@
 """What every reader promises, on the analytic room written in each set's own files."""
 
-from __future__ import annotations
-
 import importlib
 import pickle
 from dataclasses import replace
@@ -180,6 +178,27 @@ def test_damaged_calibrations_and_poses_are_named(layout: Layout, tmp_path: Path
             opened(layout, tmp_path).read(layout.sequence, [0, 1])
         assert named(error, str(path)), error.value
         path.write_bytes(whole)
+
+
+@pytest.mark.parametrize(
+    ("layout", "place"),
+    [(name, place) for name in NAMES for place in range(len(layout_of(name).damages))],
+    indirect=["layout"],
+)
+def test_what_is_wrong_with_a_copy_is_named(layout: Layout, tmp_path: Path, place: int):
+    complaint, damage = layout.damages[place]
+    layout.write(tmp_path, layout.views)
+    damage(tmp_path)
+    with pytest.raises(InputError, match=complaint) as error:
+        opened(layout, tmp_path).read(layout.sequence, [0, 1])
+    assert named(error, str(tmp_path))
+
+
+@pytest.mark.parametrize("layout", [name for name in NAMES if layout_of(name).lose_intrinsics], indirect=True)
+def test_frames_without_finite_intrinsics_do_not_count(layout: Layout, tmp_path: Path):
+    layout.write(tmp_path, layout.views)
+    layout.lose_intrinsics(tmp_path)
+    assert opened(layout, tmp_path).dropped_frames(layout.sequence) == {"no intrinsics": 1}
 
 
 @every_set

@@ -1,7 +1,5 @@
 """The index of listings: a second start lists nothing, every change of the folder is seen, damage costs time only."""
 
-from __future__ import annotations
-
 import importlib
 import os
 import sqlite3

@@ -1,14 +1,11 @@
 """Replica: the camera file decides, or the rendering's own camera; poses belong to pictures by their line."""
 
-from __future__ import annotations
-
-import json
 from pathlib import Path
 
 import pytest
 from analytic_room import pinhole
 from layouts.layout import VIEWS
-from layouts.replica import CAMERA, SCALE, write, write_camera, write_scene
+from layouts.replica import SCALE, write, write_camera, write_scene
 from room_views import check_views, room_views
 
 from logvggt_jax.data.readers.replica import Replica
@@ -38,39 +35,3 @@ def test_without_the_camera_file_the_renderings_own_is_used(tmp_path: Path):
     views = room_views(3, pinhole((34, 60), 30.0), (34, 60))
     write_scene(tmp_path / "room0", views)
     check_views(Replica(tmp_path).read("room0", [0, 1, 2]), views, **ERRORS)
-
-
-def test_superfluous_lines_and_gaps_are_named(root: Path):
-    trajectory = root / "room0/traj.txt"
-    text = trajectory.read_text()
-    trajectory.write_text(text + text.splitlines()[0])
-    with pytest.raises(ValueError, match=r"traj\.txt: expected 4 poses.*got 5 lines"):
-        Replica(root).num_frames("room0")
-    trajectory.write_text(text.replace(" ", " 7 ", 1))
-    with pytest.raises(ValueError, match=r"traj\.txt, line 1: expected 16 numbers, got 17"):
-        Replica(root).num_frames("room0")
-    for kind in ("depth000001.png", "frame000001.jpg"):
-        (root / "room0/results" / kind).unlink()
-    with pytest.raises(FileNotFoundError, match="results: frame 1 is missing"):
-        Replica(root).num_frames("room0")
-
-
-@pytest.mark.parametrize(
-    ("text", "complaint"),
-    [
-        ("[1]", "expected"),
-        (json.dumps({"camera": {"w": 64}}), "expected.*'h'"),
-        (json.dumps({"camera": CAMERA | {"scale": 0}}), "must be positive"),
-        (json.dumps({"camera": CAMERA | {"fx": "wide"}}), "expected.*wide"),
-    ],
-)
-def test_a_damaged_camera_file_is_named(root: Path, text: str, complaint: str):
-    (root / "cam_params.json").write_text(text)
-    with pytest.raises(ValueError, match=rf"cam_params\.json.*{complaint}"):
-        Replica(root).num_frames("room0")
-
-
-def test_a_camera_that_cannot_belong_to_the_pictures_is_refused(root: Path):
-    write_camera(root, cx=500.0)
-    with pytest.raises(ValueError, match=r"frame000000\.jpg: intrinsics.*cannot belong"):
-        Replica(root).read("room0", [0])

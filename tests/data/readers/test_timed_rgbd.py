@@ -1,7 +1,5 @@
 """Association by time: one partner each, the closest first, within the tolerance."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st

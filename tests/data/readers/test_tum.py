@@ -1,7 +1,5 @@
 """TUM RGB-D: three clocks, quaternions x y z w, three cameras, the prepared form."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -99,32 +97,3 @@ def test_prepared_poses_must_be_those_of_the_pictures(tmp_path: Path):
 def test_the_full_sequence_goes_before_what_was_prepared_from_it(root: Path):
     (root / NAME / "rgb_90").mkdir()
     assert TUM(root).sequences == (NAME,)
-
-
-@pytest.mark.parametrize("kind", ["rgb.txt", "depth.txt", "groundtruth.txt"])
-def test_an_empty_list_is_named(root: Path, kind: str):
-    (root / NAME / kind).write_text("# nothing\n")
-    with pytest.raises(ValueError, match=rf"{kind}: expected lines"):
-        TUM(root).num_frames(NAME)
-
-
-def test_a_listed_file_that_is_missing_is_named(root: Path):
-    (root / NAME / f"rgb/{NAMES[2]}.png").unlink()
-    with pytest.raises(FileNotFoundError, match=rf"rgb/{NAMES[2]}\.png: no such file, but rgb\.txt lists it"):
-        TUM(root).num_frames(NAME)
-
-
-@pytest.mark.parametrize(
-    ("kind", "line", "complaint"),
-    [
-        ("rgb.txt", "1305031102.0", "rgb.txt, line 7: expected 'time file'"),
-        ("rgb.txt", "noon rgb/a.png", "rgb.txt, line 7: expected numbers"),
-        ("rgb.txt", f"1 rgb/{NAMES[0]}.png", "rgb.txt, line 7: .* is listed twice"),
-        ("groundtruth.txt", "1305031102.0 1 2 3", "groundtruth.txt, line 43: expected 8 numbers, got 4"),
-    ],
-)
-def test_a_damaged_line_is_named(root: Path, kind: str, line: str, complaint: str):
-    with (root / NAME / kind).open("a") as file:
-        file.write(line + "\n")
-    with pytest.raises(ValueError, match=complaint):
-        TUM(root).num_frames(NAME)

@@ -1,7 +1,5 @@
 """The pool holds what `Rooms` renders, is opened rather than rendered again, and is never left half-written."""
 
-from __future__ import annotations
-
 import pickle
 from pathlib import Path
 

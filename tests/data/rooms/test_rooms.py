@@ -1,7 +1,5 @@
 """Procedural rooms: determinism, exact geometry, paths that keep clear, textures that belong to surfaces."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

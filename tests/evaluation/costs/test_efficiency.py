@@ -1,7 +1,5 @@
 """What a frame costs: counts, which depend on no machine. Times are the business of benchmarks/efficiency.py."""
 
-from __future__ import annotations
-
 import dataclasses
 import importlib
 from pathlib import Path

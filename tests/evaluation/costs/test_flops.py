@@ -1,7 +1,5 @@
 """Operations counted through loops."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import pytest

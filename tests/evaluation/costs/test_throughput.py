@@ -1,7 +1,5 @@
 """Timings of whole sequences: what is run, what is kept, what cannot be run; how fast is no test's business."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import json

@@ -1,7 +1,5 @@
 """Baselines know what their row says, and no more."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

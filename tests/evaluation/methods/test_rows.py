@@ -1,7 +1,5 @@
 """Rows of the model: the methods that users run, by their names, and what they refuse."""
 
-from __future__ import annotations
-
 import jax
 import numpy as np
 import pytest

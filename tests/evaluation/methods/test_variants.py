@@ -1,7 +1,5 @@
 """Ablation variants: the models they claim to be, on one checkpoint, with shared windows."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import jax

@@ -1,7 +1,5 @@
 """Images for the network against the sizes, intrinsics and pixels of the public reference code."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

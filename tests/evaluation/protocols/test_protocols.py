@@ -1,7 +1,5 @@
 """The paper's benchmarks: frames, sizes and settings as its paragraphs and the peers' code say."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 

@@ -1,7 +1,5 @@
 """The paper's tables: every number of the paper once, ours below, incomplete means marked."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections import Counter

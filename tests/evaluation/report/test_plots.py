@@ -1,7 +1,5 @@
 """Pictures of results: they show what they claim, read back from the file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2
