@@ -40,6 +40,16 @@ def room_views(
     return [RoomView(pose, intrinsics, *view(pose, intrinsics, size)) for pose in poses]
 
 
+def frames_of(views: Sequence[RoomView]) -> Frames:
+    return Frames(
+        images=np.stack([each.picture for each in views]),
+        depth=np.stack([each.depth for each in views]).astype(np.float32),
+        intrinsics=np.stack([each.intrinsics for each in views]).astype(np.float32),
+        extrinsics=np.stack([each.extrinsics for each in views]).astype(np.float32),
+        metric=True,
+    )
+
+
 def write_image(path: Path, image: np.ndarray) -> None:
     """8-bit RGB, or 8- or 16-bit grey as it is; JPEG nearly without loss."""
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -55,8 +55,7 @@ def test_what_cannot_be_used_is_named_before_anything_is_written(
     values = configuration(name, changes)
     with pytest.raises(InputError, match=message) as raised:
         run_evaluation(values, tmp_path / "no-model", tmp_path / "out", data_root=data_root, command="command")
-    assert "\n" not in str(raised.value)
-    assert not (tmp_path / "out").exists()
+    assert "\n" not in str(raised.value) and not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(("field", "message"), [("methods", "unknown 'w'; known are windows"), ("variants", "'w'")])

@@ -101,8 +101,7 @@ def test_sigterm_saves_ends_cleanly_and_can_be_resumed(
     with pytest.MonkeyPatch.context() as patch:
         _at_step(patch, 1, lambda: os.kill(os.getpid(), signal.SIGTERM))
         stopped = train(run_config, tmp_path, mesh=data_mesh(2))
-    assert 1 <= int(stopped.step) <= 2
-    assert signal.getsignal(signal.SIGTERM) == before
+    assert 1 <= int(stopped.step) <= 2 and signal.getsignal(signal.SIGTERM) == before
     with RunCheckpoints(tmp_path, run_config) as checkpoints:
         assert checkpoints.steps == [int(stopped.step)]
     _same(train(run_config, tmp_path, mesh=data_mesh(2)), straight[0])
@@ -126,8 +125,7 @@ def test_number_of_devices_may_change(
     run_config: TrainConfig, straight: tuple[TrainState, Path], finished: Path
 ) -> None:
     state = train(run_config, finished, mesh=data_mesh(1), resume_step=4)
-    assert int(state.step) == 6
-    assert len(state.step.devices()) == 1
+    assert int(state.step) == 6 and len(state.step.devices()) == 1
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4), state.params, straight[0].params)
 
 

@@ -22,8 +22,7 @@ def _mapping(config: TrainConfig) -> dict[str, Any]:
 
 def test_mapping_gives_the_same_run(run_config: TrainConfig) -> None:
     found = TrainConfig.from_dict(_mapping(run_config))
-    assert found == run_config
-    assert hash(found) == hash(run_config)
+    assert found == run_config and hash(found) == hash(run_config)
 
 
 def test_every_data_setting_survives_the_mapping(run_config: TrainConfig) -> None:
@@ -42,8 +41,7 @@ def test_every_data_setting_survives_the_mapping(run_config: TrainConfig) -> Non
 
 def test_settings_survive_the_form_that_checkpoints_store(run_config: TrainConfig) -> None:
     stored = json.loads(json.dumps(run_config.to_dict()))
-    assert TrainConfig.from_dict(stored) == run_config
-    assert stored == run_config.to_dict()
+    assert TrainConfig.from_dict(stored) == run_config and stored == run_config.to_dict()
 
 
 def test_stages_run_in_the_order_written(run_config: TrainConfig) -> None:
