@@ -40,18 +40,13 @@ class Sampler(Protocol):
 
 @dataclass(frozen=True)
 class ClipSampler:
-    """Clips of evenly spaced frames in time order, with random stride, start and direction.
+    """Clips of evenly spaced frames in time order, with random stride, start and direction."""
 
-    Attributes:
-      length: frames of a clip.
-      stride: smallest and largest distance between neighbouring frames; drawn uniformly from the strides with
-        which a clip fits into the sequence.
-      reverse: probability that a clip runs backwards in time.
-    """
-
-    length: int
+    length: int  # frames of a clip
+    # Smallest and largest distance between neighbouring frames; drawn uniformly from the strides with which a clip fits
+    # into the sequence.
     stride: tuple[int, int] = (1, 1)
-    reverse: float = 0.5
+    reverse: float = 0.5  # probability that a clip runs backwards in time
 
     def __post_init__(self) -> None:
         _check_length(self.length)
@@ -103,12 +98,9 @@ class CovisibilityWalk:
     The walk starts anywhere and goes on to a neighbour not yet visited, with a probability in proportion to its
     score. Where there is none it steps back to the last frame that still has one, so that every frame after the first
     sees something that an earlier one sees. Neighbourhood counts in both directions, with the larger score.
-
-    Attributes:
-      length: frames of a clip.
     """
 
-    length: int
+    length: int  # frames of a clip
 
     def __post_init__(self) -> None:
         _check_length(self.length)
