@@ -58,20 +58,6 @@ def test_what_cannot_be_used_is_named_before_anything_is_written(
     assert "\n" not in str(raised.value) and not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(("field", "message"), [("methods", "unknown 'w'; known are windows"), ("variants", "'w'")])
-def test_unknown_rows_are_named(
-    field: str, message: str, small_config: ModelConfig, small_variables: dict[str, Any], tmp_path: Path
-) -> None:
-    save_model(tmp_path / "model", small_config, small_variables["params"])
-    with pytest.raises(InputError, match=message):
-        run_evaluation(
-            configuration("rooms", {field: ("w",), "baselines": False}),
-            tmp_path / "model",
-            tmp_path / "out",
-            command="command",
-        )
-
-
 def test_the_model_and_all_baselines_make_a_table(
     small_config: ModelConfig, small_variables: dict[str, Any], tmp_path: Path
 ) -> None:

@@ -21,23 +21,6 @@ class CovisibleDataset(Protocol):
         ...
 
 
-class Sampler(Protocol):
-    """Chooses the frames of a clip."""
-
-    @property
-    def requirement(self) -> str:
-        """What a sequence needs to hold a clip, for messages."""
-        ...
-
-    def fits(self, dataset: Dataset, sequence: str) -> bool:
-        """Whether a clip fits into the sequence."""
-        ...
-
-    def draw(self, dataset: Dataset, sequence: str, rng: np.random.Generator) -> np.ndarray:
-        """Frame indices [length] int64 of one clip."""
-        ...
-
-
 @dataclass(frozen=True)
 class ClipSampler:
     """Clips of evenly spaced frames in time order, with random stride, start and direction."""
@@ -156,6 +139,10 @@ class CovisibilityWalk:
             if len(part) >= self.length:
                 starts.extend(part)
         return sorted(starts)
+
+
+Sampler = ClipSampler | CovisibilityWalk
+"""Chooses the frames of a clip."""
 
 
 def sampler_for(dataset: Dataset, *, length: int, stride: tuple[int, int], reverse: float) -> Sampler:
