@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from absl import app, flags, logging
 from ml_collections import config_flags
 
-from logvggt_jax.compile import enable_compilation_cache
+from logvggt_jax.compile import check_devices, enable_compilation_cache
 from logvggt_jax.errors import InputError, one_line
 from logvggt_jax.evaluation.report.report import print_report
 from logvggt_jax.evaluation.run import run_evaluation
@@ -38,8 +38,9 @@ def main(arguments: Sequence[str]) -> None:
     """Evaluates and prints."""
     if len(arguments) > 1:
         raise app.UsageError(f"unknown argument {arguments[1]!r}; settings are given as --config.NAME=VALUE")
-    enable_compilation_cache(_CACHE.value)
     try:
+        check_devices()
+        enable_compilation_cache(_CACHE.value)
         results = run_evaluation(
             _CONFIG.value.to_dict(),
             _CHECKPOINT.value,

@@ -20,7 +20,7 @@ import jax
 from absl import app, flags, logging
 from ml_collections import config_flags
 
-from logvggt_jax.compile import enable_compilation_cache
+from logvggt_jax.compile import check_devices, enable_compilation_cache
 from logvggt_jax.errors import InputError, one_line
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.loop import NonFiniteTraining, train
@@ -55,6 +55,7 @@ def main(arguments: Sequence[str]) -> None:
             join_processes(
                 coordinator=_COORDINATOR.value, num_processes=_NUM_PROCESSES.value, process_id=_PROCESS_ID.value
             )
+        check_devices()
         train(config, Path(_WORKDIR.value), mesh=data_mesh(), resume_step=_RESUME_STEP.value)
     except Exception as error:
         # What a user can mend is one line (-v 1 shows where it arose); anything else is a fault of ours.

@@ -59,7 +59,7 @@ def _convert(options: argparse.Namespace) -> None:
 
 
 def _reconstruct(options: argparse.Namespace) -> None:
-    from logvggt_jax.compile import enable_compilation_cache
+    from logvggt_jax.compile import check_devices, enable_compilation_cache
     from logvggt_jax.reconstruction.method import choose_method
     from logvggt_jax.reconstruction.point_cloud import PointFilter
     from logvggt_jax.reconstruction.reconstruct import LONGER_EDGE, check_request, reconstruct
@@ -72,6 +72,7 @@ def _reconstruct(options: argparse.Namespace) -> None:
     }
     # Before the model: a misspelt path should not have to wait for gigabytes of weights.
     check_request(options.source, options.output, longer_edge=options.longer_edge, **selection)
+    check_devices()
     enable_compilation_cache(options.compilation_cache)
     point_filter = PointFilter(
         confidence_percentile=options.confidence_percentile,
@@ -160,6 +161,33 @@ def _check_data(options: argparse.Namespace) -> int:
     )
     print(json.dumps(report.as_json(), indent=1) if options.json else report.text())
     return PROBLEMS_FOUND if report.problems else 0
+
+
+def _doctor(options: argparse.Namespace) -> int:
+    from logvggt_jax.doctor.examination import LIMITS, QUICK, examine, part_findings
+    from logvggt_jax.doctor.finding import Finding
+
+    if unknown := sorted(set(options.part or ()) - set(LIMITS)):
+        raise InputError(f"doctor has no part {unknown[0]!r}; it has {', '.join(LIMITS)}")
+    parts = options.part or (QUICK if options.quick else tuple(LIMITS))
+    marks = {True: "ok", False: "WRONG", None: ""}
+
+    def show(finding: Finding) -> None:
+        if options.json:
+            print(finding.to_json(), flush=True)
+            return
+        line = f"{finding.part:12} {finding.what:42} {finding.value_text():>20}  {marks[finding.ok]:5} {finding.note}"
+        print(line.rstrip(), flush=True)
+
+    if options.in_process:
+        findings = [
+            finding for part in parts for finding in part_findings(part, tiny=options.tiny, quick=options.quick)
+        ]
+        for finding in findings:
+            show(finding)
+    else:
+        findings = examine(parts, tiny=options.tiny, quick=options.quick, show=show)
+    return PROBLEMS_FOUND if any(finding.ok is False for finding in findings) else 0
 
 
 def _list_data(_: argparse.Namespace) -> None:
@@ -304,6 +332,22 @@ def _parser() -> argparse.ArgumentParser:
         "logvggt info models/vggt-1b",
     )
     sub.add_argument("checkpoint", type=Path, help="model folder made by `logvggt convert` or by training")
+
+    sub = command(
+        "doctor",
+        _doctor,
+        "what this machine has, whether the model computes right on it, and how fast",
+        "logvggt doctor --quick",
+        details=" Parts run one after the other, each in a process of its own with a time limit: environment "
+        "(versions, devices, builds that do not belong together), parity (a small network against recorded values), "
+        "inference (kernels, memory, time and utilisation of a step), training (the same for the training step), "
+        "whole (from files to files). On a CPU the model is a tiny one. Exit code 0: nothing wrong, 1: something is.",
+    )
+    sub.add_argument("--quick", action="store_true", help="environment, parity and inference alone, in a minute")
+    sub.add_argument("--part", action="append", metavar="NAME", help="this part alone; may be given several times")
+    sub.add_argument("--tiny", action="store_true", help="the tiny model on an accelerator as well")
+    sub.add_argument("--json", action="store_true", help="print one JSON object a line")
+    sub.add_argument("--in-process", action="store_true", help=argparse.SUPPRESS)
 
     data = commands.add_parser("data", help="data sets: what there is, and whether a copy on disk is sound")
     data_commands = data.add_subparsers(title="commands", metavar="COMMAND", required=True)

@@ -1,11 +1,43 @@
-"""Compiled programs kept between runs, so that only the first run of a shape waits for the compiler."""
+"""Before anything compiles: the devices that were asked for, and a cache of compiled programs."""
 
 import os
+import shutil
+import warnings
 from pathlib import Path
 
 import jax
 
+from logvggt_jax.errors import InputError
 from logvggt_jax.files import user_cache_folder
+
+_INSTALL = 'pip install "logvggt-jax[cuda]"'
+
+
+def nvidia_gpu_present() -> bool:
+    """Whether this machine has an NVIDIA GPU and its driver, whatever JAX sees."""
+    return Path("/dev/nvidia0").exists() or shutil.which("nvidia-smi") is not None
+
+
+def check_devices() -> None:
+    """Starts JAX's back end; warns where a GPU lies idle.
+
+    Raises:
+      InputError: the platform that JAX_PLATFORMS asks for does not start.
+    """
+    asked = jax.config.jax_platforms or ""
+    try:
+        platform = jax.default_backend()
+    except (RuntimeError, AssertionError) as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(
+            f"JAX_PLATFORMS={asked}: these devices do not start ({reason:.200}); install JAX for them ({_INSTALL} for "
+            "NVIDIA GPUs) or unset JAX_PLATFORMS"
+        ) from error
+    if platform == "cpu" and "cpu" not in asked and nvidia_gpu_present():
+        warnings.warn(
+            f"JAX computes on the CPU, but this machine has an NVIDIA GPU: {_INSTALL}, or set JAX_PLATFORMS=cpu",
+            stacklevel=2,
+        )
 
 
 def default_cache_folder() -> Path:

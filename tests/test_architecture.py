@@ -19,7 +19,8 @@ ALLOWED: dict[str, set[str]] = {
     "reconstruction": {"geometry", "model", "data", "weights", "streaming"},
     "evaluation": {"geometry", "metrics", "model", "data", "weights", "streaming"},
 }
-ENTRY_POINTS = {"__init__", "__main__", "cli"}
+# `doctor` examines everything and is called by the command line alone.
+ENTRY_POINTS = {"__init__", "__main__", "cli", "doctor"}
 
 
 def imported_modules(path: Path) -> set[str]:

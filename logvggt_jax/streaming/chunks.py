@@ -16,6 +16,7 @@ from contextlib import AbstractContextManager
 import jax
 import numpy as np
 
+from logvggt_jax.config import require_counts
 from logvggt_jax.errors import InputError
 from logvggt_jax.geometry import Similarity, robust_similarity, unproject_pixels
 from logvggt_jax.model.logvggt import LogVGGT, Variables
@@ -41,10 +42,7 @@ class ChunkPlan:
     overlap: int = 30
 
     def __post_init__(self) -> None:
-        for name in ("size", "overlap"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise InputError(f"chunk {name} must be a whole number of at least 1 frame, got {value!r}")
+        require_counts(self, "size", "overlap")
         if not self.overlap < self.size:
             raise InputError(
                 f"chunk overlap must be at least 1 frame and below the chunk size {self.size}, got {self.overlap}: "

@@ -10,8 +10,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from logvggt_jax.config import WindowConfig
-from logvggt_jax.errors import InputError
+from logvggt_jax.config import WindowConfig, require_counts
 from logvggt_jax.geometry import encode_poses
 from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.model.parameters import in_compute_type
@@ -121,9 +120,7 @@ class OfflineSettings:
     max_frames: int | None = 200
 
     def __post_init__(self) -> None:
-        limit = self.max_frames
-        if limit is not None and (isinstance(limit, bool) or not isinstance(limit, int) or limit < 1):
-            raise InputError(f"offline max_frames must be at least 1 frame or None, got {limit!r}")
+        require_counts(self, "max_frames")
 
 
 class OfflineSession:

@@ -348,16 +348,16 @@ def _insert(tree: dict[str, Any], path: ParamPath, value: jax.Array) -> None:
 
 def _initial(config: ModelConfig, params: dict[str, Any]) -> dict[ParamPath, jax.Array]:
     """Initial values of the model's parameters that `params` lacks."""
-    known = {_path(path) for path, _ in jax.tree_util.tree_leaves_with_path(params)}
+    known = frozenset(_path(path) for path, _ in jax.tree_util.tree_leaves_with_path(params))
+    return {tuple(name.split("/")): leaf for name, leaf in _drawn(jax.random.key(0), config, known).items()}
 
-    # Under jit the initial values that nobody asks for are never computed.
-    @jax.jit
-    def draw(key: jax.Array) -> dict[str, jax.Array]:
-        drawn = LogVGGT(config).init(key, _smallest_images(config))["params"]
-        leaves = {_path(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(drawn)}
-        return {"/".join(path): leaf for path, leaf in leaves.items() if path not in known}
 
-    return {tuple(name.split("/")): leaf for name, leaf in draw(jax.random.key(0)).items()}
+# Under jit the initial values that nobody asks for are never computed.
+@functools.partial(jax.jit, static_argnums=(1, 2))
+def _drawn(key: jax.Array, config: ModelConfig, known: frozenset[ParamPath]) -> dict[str, jax.Array]:
+    drawn = LogVGGT(config).init(key, _smallest_images(config))["params"]
+    leaves = {_path(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(drawn)}
+    return {"/".join(path): leaf for path, leaf in leaves.items() if path not in known}
 
 
 def _smallest_images(config: ModelConfig) -> jax.Array:

@@ -50,6 +50,11 @@ def frames_of(views: Sequence[RoomView]) -> Frames:
     )
 
 
+def pinhole_row(each: RoomView) -> list[float]:
+    """fx, fy, cx, cy."""
+    return [float(each.intrinsics[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2))]
+
+
 def write_image(path: Path, image: np.ndarray) -> None:
     """8-bit RGB, or 8- or 16-bit grey as it is; JPEG nearly without loss."""
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -45,7 +45,7 @@ def test_wrong_clips_are_named(values: dict[str, Any], message: str) -> None:
         ("protocol", {"max_points": 0}, r"config\.protocol\.max_points must be"),
         ("benchmarks", (), r"config\.benchmarks must name at least one"),
         ("max_sequences", 0, r"config\.max_sequences must be a positive integer"),
-        ("references", {"max_frames": 0}, r"config\.references: offline max_frames must be"),
+        ("references", {"max_frames": 0}, r"config\.references: OfflineSettings.max_frames must be"),
         ("references", {"chunk_size": 4, "chunk_overlap": 4}, "below the chunk size 4, got 4"),
         ("timings", {"lengths": (0,)}, r"config\.timings\.lengths must be numbers of frames, 1 or more each"),
         ("timings", {"rounds": 0}, r"config\.timings\.rounds must be"),

@@ -31,7 +31,7 @@ def session(small_config: ModelConfig, monkeypatch: pytest.MonkeyPatch) -> Chunk
         return PlainPrediction(depth[numbers], np.full((len(images), *SIZE), 2.0, np.float32), extrinsics, intrinsics)
 
     monkeypatch.setattr(module, "predict_plain", predict)
-    return ChunkSession(LogVGGT(small_config), {}, ChunkPlan(4, 2))
+    return ChunkSession(LogVGGT(small_config), {"params": {}}, ChunkPlan(4, 2))
 
 
 def test_results_come_in_order_and_final(session: ChunkSession) -> None:

@@ -173,9 +173,9 @@ def test_chunks_that_do_not_fit_are_named(truth: PlainPrediction) -> None:
     [
         (4, 4, "below the chunk size 4, got 4"),
         (1, 1, "below the chunk size 1"),
-        (4, 0, "chunk overlap must be a whole number of at least 1 frame, got 0"),
-        (0, 1, "chunk size must be"),
-        (4.0, 2, "chunk size must be a whole number"),
+        (4, 0, "ChunkPlan.overlap must be a positive integer, got 0"),
+        (0, 1, "ChunkPlan.size must be"),
+        (4.0, 2, "ChunkPlan.size must be a positive integer"),
     ],
 )
 def test_impossible_chunks_are_named(size: int, overlap: int, message: str) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import OpenEXR
-from room_views import CENTRE, FOCAL, RoomView, write_image
+from room_views import CENTRE, FOCAL, RoomView, pinhole_row, write_image
 
 from layouts.layout import Layout, changed, written
 from logvggt_jax.data.readers.mvs_synth import MVSSynth
@@ -36,7 +36,8 @@ def write(root: Path, views: Sequence[RoomView]) -> None:
         write_exr(folder / f"depths/{index:04d}.exr", (UNIT * each.depth).astype(np.float32))
         stored = each.extrinsics @ SWAP
         stored[:3, 3] *= UNIT
-        write_pose(folder / f"poses/{index:04d}.json", stored)
+        camera = dict(zip(("f_x", "f_y", "c_x", "c_y"), pinhole_row(each), strict=True))
+        write_pose(folder / f"poses/{index:04d}.json", stored, **camera)
     (root / "GTAV_720" / "num_images.json").write_text("[3]")
 
 
@@ -75,5 +76,4 @@ LAYOUT = Layout(
             lambda root: write_pose(root / FILES[2], SWAP, c_x=960.0, c_y=540.0),
         ),
     ),
-    lose_intrinsics=lambda root: write_pose(root / FILES[2], SWAP, f_x=float("inf")),
 )

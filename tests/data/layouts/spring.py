@@ -5,7 +5,7 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-from room_views import CENTRE, FOCAL, RoomView, write_image
+from room_views import FOCAL, RoomView, pinhole_row, write_image
 
 from layouts.layout import Layout, relined
 from logvggt_jax.data.readers.spring import Spring
@@ -28,7 +28,7 @@ def write(root: Path, views: Sequence[RoomView]) -> None:
         disparity[::2, ::2] = np.divide(FOCAL * BASELINE, each.depth, out=0 * each.depth, where=each.depth > 0)
         write_disparity(folder / f"disp1_left/disp1_left_{number:04d}.dsp5", disparity)
     (folder / "cam_data").mkdir()
-    np.savetxt(folder / "cam_data/intrinsics.txt", [[FOCAL, FOCAL, *CENTRE]] * len(views))
+    np.savetxt(folder / "cam_data/intrinsics.txt", [pinhole_row(each) for each in views])
     np.savetxt(folder / "cam_data/extrinsics.txt", [each.extrinsics.ravel() for each in views])
     np.savetxt(folder / "cam_data/focaldistance.txt", [[1.0]] * len(views))
 
@@ -69,5 +69,4 @@ LAYOUT = Layout(
         ),
         ("train: no such folder", lambda root: (root / "train").rename(root / "spring_train")),
     ),
-    lose_intrinsics=relined(TABLES[0], lambda lines: [*lines[:3], "inf inf inf inf"]),
 )

@@ -58,13 +58,6 @@ def test_splits_hold_the_last_scene_out(root: Path):
     assert VirtualKITTI(root, "test").sequences == last
 
 
-def test_a_camera_without_finite_intrinsics_leaves_the_others_frames(root: Path):
-    edit(root / "Scene01/clone/intrinsic.txt", f"2 0 {FOCAL}", "2 0 inf")
-    drives = VirtualKITTI(root)
-    assert drives.dropped_frames("Scene01/clone/Camera_0") == {"no intrinsics": 1}
-    assert drives.num_frames("Scene01/clone/Camera_1") == 4
-
-
 def test_a_variation_without_pictures_is_named(root: Path):
     (root / "Scene01/fog").mkdir()
     with pytest.raises(FileNotFoundError, match="Scene01/fog/frames/rgb"):

@@ -40,7 +40,9 @@ def test_rows_differ_by_method_parameters_and_limits(small_config: ModelConfig) 
 
 
 def test_a_clip_beyond_the_limit_is_refused(small_config: ModelConfig) -> None:
-    (row,) = model_rows(Checkpoint(LogVGGT(small_config), {}, ""), ("offline",), ReferenceConfig(max_frames=5))
+    (row,) = model_rows(
+        Checkpoint(LogVGGT(small_config), {"params": {}}, ""), ("offline",), ReferenceConfig(max_frames=5)
+    )
     with pytest.raises(PredictionError, match="6 frames exceeds max_frames=5"):
         row.predict(IMAGES)
 

@@ -1,0 +1,80 @@
+"""Runs the parts, each in a process of its own with a time limit, and shows what they find as it comes."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+
+from logvggt_jax.doctor.finding import Finding
+
+# Seconds that a part may take: quick, and in full.
+LIMITS: Mapping[str, tuple[int, int]] = {
+    "environment": (30, 60),
+    "parity": (60, 120),
+    "inference": (90, 150),
+    "training": (200, 300),
+    "whole": (90, 150),
+}
+QUICK = ("environment", "parity", "inference")
+
+
+def part_findings(part: str, *, tiny: bool, quick: bool) -> Iterator[Finding]:
+    """The findings of one part, in this process."""
+    if part == "environment":
+        from logvggt_jax.doctor import environment
+
+        yield from environment.examine()
+        return
+    if part == "parity":
+        from logvggt_jax.doctor import parity
+
+        yield from parity.examine()
+        return
+    from logvggt_jax.doctor import inference, training, whole
+    from logvggt_jax.doctor.subject import subject
+
+    module = {"inference": inference, "training": training, "whole": whole}[part]
+    yield from module.examine(subject(tiny=tiny, quick=quick))
+
+
+def examine(parts: Sequence[str], *, tiny: bool, quick: bool, show: Callable[[Finding], None]) -> list[Finding]:
+    """All findings of some parts; `show` gets each as it comes.
+
+    A part that fails or takes too long is a finding of its own, and the others go on.
+    """
+    findings: list[Finding] = []
+    for part in parts:
+        for finding in _in_own_process(part, tiny=tiny, quick=quick):
+            findings.append(finding)
+            show(finding)
+    return findings
+
+
+def _in_own_process(part: str, *, tiny: bool, quick: bool) -> Iterator[Finding]:
+    command = [sys.executable, "-m", "logvggt_jax", "doctor", "--part", part, "--in-process", "--json"]
+    command += [option for option, given in (("--tiny", tiny), ("--quick", quick)) if given]
+    limit, started = LIMITS[part][0 if quick else 1], time.monotonic()
+    with (
+        tempfile.TemporaryFile("w+") as errors,
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True) as process,
+    ):
+        assert process.stdout is not None  # a pipe was asked for
+        late = threading.Timer(limit, process.kill)
+        late.start()
+        for line in process.stdout:
+            with contextlib.suppress(ValueError, TypeError):  # what a library printed
+                yield Finding(**json.loads(line))
+        code, over = process.wait(), not late.is_alive()
+        late.cancel()
+        errors.seek(0)
+        last = next((line.strip() for line in reversed(errors.readlines()) if line.strip()), "no message")
+    if code != 0:
+        reason = f"stopped after its limit of {limit} s" if over else f"{last:.300}"
+        yield Finding(part, "this part", "failed", ok=False, note=reason)
+    yield Finding(part, "time", time.monotonic() - started, "s")

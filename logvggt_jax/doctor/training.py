@@ -1,0 +1,95 @@
+"""The training step of `configs/h20.py`: what it needs and how fast it is, for one clip of twelve frames and more."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import numpy as np
+
+from logvggt_jax.doctor.finding import Finding
+from logvggt_jax.doctor.subject import Subject, random_variables
+from logvggt_jax.evaluation.costs.operations import count_flops
+from logvggt_jax.evaluation.costs.parts import matmul_flops_per_second
+from logvggt_jax.model.logvggt import LogVGGT
+from logvggt_jax.model.parameters import stack_layers
+from logvggt_jax.training.config import LossConfig, OptimizerConfig
+from logvggt_jax.training.optimizer import make_optimizer
+from logvggt_jax.training.sharding import data_mesh, replicated, split
+from logvggt_jax.training.state import initial_state
+from logvggt_jax.training.step import make_loss_terms, make_train_step
+
+# As configs/h20.py has them; what they are changes no time.
+_LOSS = LossConfig("log_vggt", 1.0, 1.0, 1.0, 1.0, 0.5, 0.6, 0.2)
+_OPTIMIZER = OptimizerConfig(5e-5, 0.0, "cosine", 0.05, False, 0.9, 0.95, 0.05, False, 1.0)
+
+
+def examine(subject: Subject) -> Iterator[Finding]:
+    """Steps of 1, 2, 3, 4 clips a device, until one does not fit."""
+    model, mesh = subject.model, data_mesh(1)
+    length = 3 if subject.tiny else 12
+    params = stack_layers(random_variables(model))["params"]
+    optimizer = make_optimizer(_OPTIMIZER, params, frozen=("encoder",))
+    step = make_train_step(make_loss_terms(model, _LOSS), _LOSS, optimizer, lambda _: 1e-6, mesh)
+    peak = matmul_flops_per_second("bfloat16", size=256 if subject.tiny else None)
+    for clips in (1,) if subject.tiny or subject.quick else (4, 1):
+        name = f"{clips} clips of {length} frames"
+        state = jax.device_put(initial_state(params, optimizer), replicated(mesh))
+        batch = jax.device_put(_clips(clips, length, subject.image_size), split(mesh))
+        try:
+            started = time.perf_counter()
+            program = step.lower(state, batch).compile()
+            compilation = time.perf_counter() - started
+            memory = program.memory_analysis()
+            yield Finding("training", f"{name}: compilation", compilation, "s")
+            yield Finding("training", f"{name}: arguments", memory.argument_size_in_bytes / 2**30, "GiB")
+            yield Finding("training", f"{name}: temporaries", memory.temp_size_in_bytes / 2**30, "GiB")
+            state, metrics = program(state, batch)
+            jax.block_until_ready(metrics)
+            started, rounds = time.perf_counter(), 1 if subject.tiny else 3
+            for _ in range(rounds):
+                state, metrics = program(state, batch)
+            jax.block_until_ready(metrics)
+        except jax.errors.JaxRuntimeError as error:
+            if "RESOURCE_EXHAUSTED" not in str(error):
+                raise
+            yield Finding("training", name, "does not fit the device's memory", note="fewer clips a device: batch_size")
+            continue
+        seconds = (time.perf_counter() - started) / rounds
+        loss = float(metrics["loss/total"])
+        yield Finding("training", f"{name}: loss", loss, ok=bool(np.isfinite(loss)))
+        yield Finding("training", f"{name}: step", seconds, "s", note=f"{clips * length / seconds:.4g} frames/s")
+        operations = _operations(subject, params, batch)
+        yield Finding("training", f"{name}: utilisation", operations / seconds / peak, note="without recomputation")
+        return
+
+
+def _operations(subject: Subject, params: Any, batch: Any) -> float:
+    """Of a forward pass and its gradient, nothing computed twice."""
+    model = LogVGGT(dataclasses.replace(subject.model.config, attention="xla"))
+
+    def loss(params: Any) -> jax.Array:
+        out = model.apply({"params": params}, batch["images"])
+        return out.depth.sum() + out.pose_encodings.sum()
+
+    # A frozen encoder has no gradient; everything else costs its forward pass twice more.
+    forward = count_flops(loss, params)
+    encoder = count_flops(lambda p: model.windows.encode({"params": p}, batch["images"]), params)
+    return 3 * forward - 2 * encoder if model.config.encoder.frozen else 3 * forward
+
+
+def _clips(clips: int, length: int, image_size: tuple[int, int]) -> dict[str, np.ndarray]:
+    generator = np.random.default_rng(0)
+    height, width = image_size
+    extrinsics = np.tile(np.eye(4, dtype=np.float32), (clips, length, 1, 1))
+    extrinsics[..., 0, 3] = 0.1 * np.arange(length)
+    intrinsics = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]], np.float32)
+    return {
+        "images": generator.integers(0, 256, (clips, length, *image_size, 3), np.uint8),
+        "depth": generator.uniform(1, 4, (clips, length, *image_size)).astype(np.float32),
+        "intrinsics": np.tile(intrinsics, (clips, length, 1, 1)),
+        "extrinsics": extrinsics,
+    }

@@ -1,0 +1,54 @@
+"""From files to files: `reconstruct` on a rendered sequence, and what a frame costs the host."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+import jax
+from PIL import Image
+
+from logvggt_jax.data.rooms.rooms import Rooms
+from logvggt_jax.doctor.finding import Finding
+from logvggt_jax.doctor.subject import Subject, random_variables
+from logvggt_jax.reconstruction import reconstruct
+
+_RENDERED = 4  # distinct frames, shown in turn: rendering is not what is measured
+
+
+def examine(subject: Subject) -> Iterator[Finding]:
+    """A sequence of JPEGs, once to compile and once to be timed."""
+    size = (60, 80) if subject.tiny else (480, 640)
+    count = 6 if subject.tiny else 60 if subject.quick else 300
+    rooms = Rooms("test", num_rooms=1, num_frames=_RENDERED, height=size[0], width=size[1])
+    pictures = rooms.read(rooms.sequences[0], range(_RENDERED)).images
+    variables = jax.device_get(random_variables(subject.model))
+    with tempfile.TemporaryDirectory() as temporary, warnings.catch_warnings():
+        # Random parameters have no field of view worth the name.
+        warnings.simplefilter("ignore")
+        folder = Path(temporary) / "frames"
+        folder.mkdir()
+        for index in range(count):
+            Image.fromarray(pictures[index % _RENDERED]).save(folder / f"{index:05d}.jpg", quality=92)
+        for name, frames in (("first", 6), ("timed", count)):
+            started, cores = time.perf_counter(), time.process_time()
+            result = reconstruct(
+                folder,
+                Path(temporary) / name,
+                model=subject.model,
+                variables=variables,
+                longer_edge=max(subject.image_size),
+                max_frames=frames,
+                progress=False,
+            )
+            seconds, cores = time.perf_counter() - started, time.process_time() - cores
+    yield Finding("whole", "frames", float(result.num_frames), ok=result.num_frames == count)
+    yield Finding(
+        "whole", "rate, files to files", count / seconds, "frames/s", note="parameters to the device included"
+    )
+    # On a CPU this is the model as well.
+    note = "the model included" if jax.default_backend() == "cpu" else "all threads of this process"
+    yield Finding("whole", "processor time a frame", 1e3 * cores / count, "ms", note=note)
