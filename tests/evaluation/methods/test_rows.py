@@ -34,8 +34,7 @@ def test_rows_differ_by_method_parameters_and_limits(small_config: ModelConfig) 
         return [str(row.identity) for row in rows]
 
     first = identities("a", LIMITS)
-    assert len(set(first)) == len(METHODS)
-    assert not set(first) & set(identities("b", LIMITS))
+    assert len(set(first)) == len(METHODS) and not set(first) & set(identities("b", LIMITS))
     same = [a == b for a, b in zip(first, identities("a", ReferenceConfig(6, 6, 2)), strict=True)]
     assert same == [name != "chunks" for name in METHODS]
 
