@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Iterator
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -32,9 +33,9 @@ def examine(subject: Subject) -> Iterator[Finding]:
     step = jax.jit(model.step, donate_argnums=1).lower(variables, state, frames).compile()
     yield Finding("inference", "compilation", time.perf_counter() - started, "s")
     if platform in _ATTENTION_CALLS:
-        calls, wanted = step.as_text().count(_ATTENTION_CALLS[platform]), _num_attentions(model)
+        calls, wanted = (step.as_text() or "").count(_ATTENTION_CALLS[platform]), _num_attentions(model)
         yield Finding("inference", "fast attention calls", float(calls), ok=calls == wanted, note=f"of {wanted}")
-    memory = step.memory_analysis()
+    memory: Any = step.memory_analysis()
     for what, size in (("arguments", memory.argument_size_in_bytes), ("temporaries", memory.temp_size_in_bytes)):
         yield Finding("inference", what, size / 2**30, "GiB")
 

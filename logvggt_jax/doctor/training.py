@@ -43,7 +43,7 @@ def examine(subject: Subject) -> Iterator[Finding]:
             started = time.perf_counter()
             program = step.lower(state, batch).compile()
             compilation = time.perf_counter() - started
-            memory = program.memory_analysis()
+            memory: Any = program.memory_analysis()
             yield Finding("training", f"{name}: compilation", compilation, "s")
             yield Finding("training", f"{name}: arguments", memory.argument_size_in_bytes / 2**30, "GiB")
             yield Finding("training", f"{name}: temporaries", memory.temp_size_in_bytes / 2**30, "GiB")
