@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import shutil
 import sys
@@ -14,7 +15,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from logvggt_jax.errors import InputError, one_line
+from logvggt_jax.errors import InputError, disk_errors, one_line
 
 if TYPE_CHECKING:
     from logvggt_jax.streaming import ChunkPlan
@@ -168,30 +169,35 @@ def _check_data(options: argparse.Namespace) -> int:
 
 
 def _doctor(options: argparse.Namespace) -> int:
-    from logvggt_jax.doctor.examination import LIMITS, QUICK, examine, part_findings
+    from logvggt_jax.doctor.examination import QUICK, SHARES, examine, part_findings
     from logvggt_jax.doctor.finding import Finding
 
-    if unknown := sorted(set(options.part or ()) - set(LIMITS)):
-        raise InputError(f"doctor has no part {unknown[0]!r}; it has {', '.join(LIMITS)}")
-    parts = options.part or (QUICK if options.quick else tuple(LIMITS))
+    if unknown := sorted(set(options.part or ()) - set(SHARES)):
+        raise InputError(f"doctor has no part {unknown[0]!r}; it has {', '.join(SHARES)}")
+    parts = options.part or (QUICK if options.quick else tuple(SHARES))
     marks = {True: "ok", False: "WRONG", None: ""}
 
-    def show(finding: Finding) -> None:
-        if options.json:
-            print(finding.to_json(), flush=True)
-            return
-        line = f"{finding.part:12} {finding.what:42} {finding.value_text():>20}  {marks[finding.ok]:5} {finding.note}"
-        print(line.rstrip(), flush=True)
+    with contextlib.ExitStack() as stack:
+        file = None
+        if options.json not in (None, "-"):
+            with disk_errors(options.json):
+                file = stack.enter_context(Path(options.json).open("w"))
 
-    if options.in_process:
-        findings = [
-            finding for part in parts for finding in part_findings(part, tiny=options.tiny, quick=options.quick)
-        ]
-        for finding in findings:
-            show(finding)
-    else:
-        findings = examine(parts, tiny=options.tiny, quick=options.quick, show=show)
-    return PROBLEMS_FOUND if any(finding.ok is False for finding in findings) else 0
+        def show(finding: Finding) -> None:
+            if file is not None:
+                print(finding.to_json(), file=file, flush=True)
+            line = (
+                f"{finding.part:12} {finding.what:42} {finding.value_text():>20}  {marks[finding.ok]:5} {finding.note}"
+            )
+            print(finding.to_json() if options.json == "-" else line.rstrip(), flush=True)
+
+        if not options.in_process:
+            return 0 if examine(parts, tiny=options.tiny, quick=options.quick, show=show) else PROBLEMS_FOUND
+        # Of a part in a process of its own the exit code says whether it ran to its end.
+        for part in parts:
+            for finding in part_findings(part, tiny=options.tiny, quick=options.quick):
+                show(finding)
+    return 0
 
 
 def _list_data(_: argparse.Namespace) -> None:
@@ -342,15 +348,21 @@ def _parser() -> argparse.ArgumentParser:
         _doctor,
         "what this machine has, whether the model computes right on it, and how fast",
         "logvggt doctor --quick",
-        details=" Parts run one after the other, each in a process of its own with a time limit: environment "
-        "(versions, devices, builds that do not belong together), parity (a small network against recorded values), "
+        details=" Parts run one after the other, each in a process of its own, five minutes in all and one with "
+        "--quick: environment (versions, devices, builds that do not belong together), parity (a small network against recorded values), "
         "inference (kernels, memory, time and utilisation of a step), training (the same for the training step), "
         "whole (from files to files). On a CPU the model is a tiny one. Exit code 0: nothing wrong, 1: something is.",
     )
     sub.add_argument("--quick", action="store_true", help="environment, parity and inference alone, in a minute")
     sub.add_argument("--part", action="append", metavar="NAME", help="this part alone; may be given several times")
     sub.add_argument("--tiny", action="store_true", help="the tiny model on an accelerator as well")
-    sub.add_argument("--json", action="store_true", help="print one JSON object a line")
+    sub.add_argument(
+        "--json",
+        nargs="?",
+        const="-",
+        metavar="FILE",
+        help="write one JSON object a line to a file as well, or print them instead of the table (no file, or -)",
+    )
     sub.add_argument("--in-process", action="store_true", help=argparse.SUPPRESS)
 
     data = commands.add_parser("data", help="data sets: what there is, and whether a copy on disk is sound")

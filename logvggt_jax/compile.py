@@ -24,7 +24,7 @@ def check_devices() -> None:
     Raises:
       InputError: the platform that JAX_PLATFORMS asks for does not start.
     """
-    asked = jax.config.jax_platforms or ""
+    asked = getattr(jax.config, "jax_platforms", None) or ""
     try:
         platform = jax.default_backend()
     except (RuntimeError, AssertionError) as error:

@@ -62,8 +62,7 @@ def test_a_mapping_becomes_the_dataclass_that_its_types_describe() -> None:
     found = from_mapping(Settings, WHOLE, "config")
     assert found.parts == (Part("ten"), Part("two", 2.0)), "in the order written"
     assert isinstance(found.rate, float) and isinstance(found.parts[1].weight, float)
-    assert found.sizes == ((1, 2), (3, 4))
-    assert found.options == (("b", (1, 2)), ("a", None))
+    assert found.sizes == ((1, 2), (3, 4)) and found.options == (("b", (1, 2)), ("a", None))
     assert from_mapping(Settings, {"count": np.int64(3), "parts": [{"name": "one"}]}, "config").parts == (Part("one"),)
     assert from_mapping(Settings, {"count": 3, "parts": [Part("one")]}, "config").parts == (Part("one"),)
 
@@ -177,8 +176,7 @@ def test_what_does_not_fit_is_named(build: Callable[[], Any], message: str) -> N
 
 def test_lists_become_tuples_so_that_configurations_hash() -> None:
     listed = ModelConfig(aggregator=AggregatorConfig(key_layers=[4, 11, 17, 23]))  # type: ignore[arg-type]
-    assert listed == ModelConfig()
-    assert hash(listed) == hash(ModelConfig())
+    assert listed == ModelConfig() and hash(listed) == hash(ModelConfig())
 
 
 def test_a_point_head_survives_the_round_trip() -> None:

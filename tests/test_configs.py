@@ -151,8 +151,7 @@ def _check_step(
     program = traced.lower(lowering_platforms=(platform,)).as_text()
     # Layers and windows are loops, so that a kernel is in the program a few times and runs many: attention of a frame
     # and of a window with its cache at least.
-    assert program.count(backward) >= 2
-    assert program.count(forward) >= 2
+    assert program.count(backward) >= 2 and program.count(forward) >= 2
 
 
 @pytest.mark.parametrize(
@@ -166,10 +165,8 @@ def _check_step(
 def test_command_line_mistakes_are_one_line(arguments: list[str], message: str, tmp_path: Path) -> None:
     command = [sys.executable, "train.py", "--config=configs/tiny.py", f"--workdir={tmp_path / 'run'}", *arguments]
     finished = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
-    assert finished.returncode != 0
-    assert message in finished.stderr
-    assert "Traceback" not in finished.stderr
-    assert not (tmp_path / "run").exists()
+    assert finished.returncode != 0 and message in finished.stderr
+    assert "Traceback" not in finished.stderr and not (tmp_path / "run").exists()
 
 
 def test_frozen_encoder_is_configured_by_the_model(monkeypatch: pytest.MonkeyPatch) -> None:

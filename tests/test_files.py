@@ -20,8 +20,7 @@ def test_a_file_appears_whole_or_not_at_all(tmp_path: Path, failure: type[BaseEx
     with pytest.raises(failure), atomic_file(path) as temporary:
         temporary.write_text("half")
         raise failure
-    assert path.read_text() == "old"
-    assert names(tmp_path) == ["f.txt"]
+    assert path.read_text() == "old" and names(tmp_path) == ["f.txt"]
 
 
 def test_two_writers_of_one_file_do_not_meet(tmp_path: Path) -> None:
@@ -30,8 +29,7 @@ def test_two_writers_of_one_file_do_not_meet(tmp_path: Path) -> None:
         assert first != second and first.suffix == second.suffix == ".png"
         second.write_text("second")
         first.write_text("first")
-    assert path.read_text() == "first"
-    assert names(tmp_path) == ["picture.png"]
+    assert path.read_text() == "first" and names(tmp_path) == ["picture.png"]
 
 
 def test_what_the_disk_refuses_is_one_line_that_names_the_file(tmp_path: Path) -> None:
@@ -57,8 +55,7 @@ def test_a_folder_appears_whole_or_not_at_all(tmp_path: Path) -> None:
     with atomic_folder(target) as folder:
         assert not target.exists()
         (folder / "done").write_text("1")
-    assert (target / "done").read_text() == "1"
-    assert names(tmp_path / "deep") == ["out"]
+    assert (target / "done").read_text() == "1" and names(tmp_path / "deep") == ["out"]
 
 
 def test_only_results_are_overwritten_and_only_when_asked(tmp_path: Path) -> None:
@@ -77,8 +74,7 @@ def test_only_results_are_overwritten_and_only_when_asked(tmp_path: Path) -> Non
     assert (target / "thesis.tex").exists()
     with atomic_folder(target, replace=True) as folder:
         (folder / "new").touch()
-    assert names(target) == ["new"]
-    assert names(tmp_path) == ["out"]
+    assert names(target) == ["new"] and names(tmp_path) == ["out"]
 
 
 def test_a_folder_that_cannot_be_replaced_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -95,8 +91,7 @@ def test_a_folder_that_cannot_be_replaced_stays(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(Path, "rename", refuse)
     with pytest.raises(DiskError, match="out: in use"), atomic_folder(target, replace=True) as folder:
         (folder / "done").write_text("new")
-    assert (target / "done").read_text() == "old"
-    assert names(tmp_path) == ["out"]
+    assert (target / "done").read_text() == "old" and names(tmp_path) == ["out"]
 
 
 def test_of_two_runs_the_second_to_end_leaves_the_first_result(tmp_path: Path) -> None:
@@ -105,5 +100,4 @@ def test_of_two_runs_the_second_to_end_leaves_the_first_result(tmp_path: Path) -
         (second / "done").write_text("second")
         with atomic_folder(target) as first:
             (first / "done").write_text("first")
-    assert (target / "done").read_text() == "first"
-    assert names(tmp_path) == ["out"]
+    assert (target / "done").read_text() == "first" and names(tmp_path) == ["out"]

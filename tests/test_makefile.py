@@ -32,8 +32,7 @@ def test_the_demo_names_configurations_and_fields_that_exist(
             continue
         scripts += [word for word in words if word.endswith(".py") and not word.startswith("--")]
         spec = importlib.util.spec_from_file_location("configuration", ROOT / options["config"])
-        assert spec is not None
-        assert spec.loader is not None
+        assert spec is not None and spec.loader is not None
         module = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(module)
         config = module.get_config()

@@ -45,20 +45,13 @@ class About:
     """What people need to know of a data set before they fetch it.
 
     "Inferred" and "unknown" are meant: nobody read it in the set's own documents.
-
-    Attributes:
-      source: how one gets it.
-      licence: its terms.
-      size: bytes and counts, as far as known.
-      roles: `training`, `evaluation` or both, in the paper.
-      extra: extra of this package that its files need; None = none.
     """
 
-    source: str
-    licence: str
-    size: str
-    roles: tuple[str, ...]
-    extra: str | None = None
+    source: str  # how one gets it
+    licence: str  # its terms
+    size: str  # bytes and counts, as far as known
+    roles: tuple[str, ...]  # `training`, `evaluation` or both, in the paper
+    extra: str | None = None  # extra of this package that its files need; None = none
 
 
 TRAINING, EVALUATION = "training", "evaluation"

@@ -11,10 +11,18 @@ from typing import ClassVar
 from logvggt_jax.errors import InputError
 
 
-class MissingFiles(InputError, FileNotFoundError):
+class CopyError(InputError):
+    """Something in a copy that is to be mended; `kind` is what a check counts it as."""
+
+    kind: ClassVar[str]
+
+    def __init_subclass__(cls, *, kind: str) -> None:
+        cls.kind = kind
+
+
+class MissingFiles(CopyError, FileNotFoundError, kind="missing file"):
     """Files or folders that are not there."""
 
-    kind: ClassVar[str] = "missing file"
     reasons: Mapping[Path, str] = MappingProxyType({})  # of a sequence's files: why each is needed, and the mend
 
 
@@ -33,43 +41,29 @@ def missing_file(path: str | Path) -> MissingFiles:
     return MissingFiles(f"{path}: no such file; fetch it again or remove the frame's other files")
 
 
-class BrokenPicture(InputError):
+class BrokenPicture(CopyError, kind="broken picture"):
     """A picture or depth file that is truncated, damaged, or of another type than the set's."""
 
-    kind: ClassVar[str] = "broken picture"
 
-
-class UnequalSizes(InputError):
+class UnequalSizes(CopyError, kind="unequal sizes"):
     """Pictures and depth whose sizes do not belong together."""
 
-    kind: ClassVar[str] = "unequal sizes"
 
-
-class UnequalCounts(InputError):
+class UnequalCounts(CopyError, kind="unequal counts"):
     """Pictures, depth or cameras that are not equal in number."""
 
-    kind: ClassVar[str] = "unequal counts"
 
-
-class AbsurdIntrinsics(InputError):
+class AbsurdIntrinsics(CopyError, kind="absurd intrinsics"):
     """Intrinsics that cannot belong to their picture."""
 
-    kind: ClassVar[str] = "absurd intrinsics"
 
-
-class BadPose(InputError):
+class BadPose(CopyError, kind="pose that is no rotation"):
     """A stored pose that is no rigid transform."""
 
-    kind: ClassVar[str] = "pose that is no rotation"
 
-
-class EmptySequence(InputError):
+class EmptySequence(CopyError, kind="empty sequence"):
     """A sequence without any frame that counts."""
 
-    kind: ClassVar[str] = "empty sequence"
 
-
-class EmptySplit(InputError, FileNotFoundError):
+class EmptySplit(CopyError, FileNotFoundError, kind="empty split"):
     """A split whose lists are there and name none of the sequences that this copy has."""
-
-    kind: ClassVar[str] = "empty split"

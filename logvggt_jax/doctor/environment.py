@@ -44,10 +44,21 @@ def _devices() -> Iterator[Finding]:
     kinds = ", ".join(sorted({device.device_kind for device in devices}))
     yield Finding("environment", "devices", f"{len(devices)} x {kinds}", note=f"platform {jax.default_backend()}")
     if jax.default_backend() == "cpu" and nvidia_gpu_present():
-        note = f"JAX computes on the CPU of a machine with an NVIDIA GPU: {_INSTALL}"
-        yield Finding("environment", "NVIDIA GPU", "not used", ok=False, note=note)
+        yield Finding("environment", "NVIDIA GPU", "not used", ok=False, note=_why_no_gpu())
     if jax.default_backend() == "gpu":
         yield _cudnn()
+
+
+def _why_no_gpu() -> str:
+    import jax
+
+    try:
+        jax.devices("cuda")
+    except RuntimeError as error:
+        # A back end that was installed and failed says why, a driver too old for example.
+        if "failed to initialize" in str(error):
+            return f"{' '.join(str(error).split()):.300}"
+    return f"JAX computes on the CPU of a machine with an NVIDIA GPU: {_INSTALL}"
 
 
 def _cudnn() -> Finding:

@@ -13,14 +13,16 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from logvggt_jax.doctor.finding import Finding
 
-# Seconds that a part may take: quick, and in full.
-LIMITS: Mapping[str, tuple[int, int]] = {
-    "environment": (30, 60),
-    "parity": (60, 120),
-    "inference": (90, 150),
-    "training": (200, 300),
-    "whole": (90, 150),
+# Seconds that each part is sure of, quick and in full: a minute and five minutes together. What one part does not use
+# is left to those after it.
+SHARES: Mapping[str, tuple[int, int]] = {
+    "environment": (10, 15),
+    "parity": (20, 35),
+    "inference": (30, 70),
+    "training": (0, 95),
+    "whole": (0, 85),
 }
+TOTAL = (60, 300)
 QUICK = ("environment", "parity", "inference")
 
 
@@ -43,23 +45,25 @@ def part_findings(part: str, *, tiny: bool, quick: bool) -> Iterator[Finding]:
     yield from module.examine(subject(tiny=tiny, quick=quick))
 
 
-def examine(parts: Sequence[str], *, tiny: bool, quick: bool, show: Callable[[Finding], None]) -> list[Finding]:
-    """All findings of some parts; `show` gets each as it comes.
+def examine(parts: Sequence[str], *, tiny: bool, quick: bool, show: Callable[[Finding], None]) -> bool:
+    """Runs some parts; `show` gets each finding as it comes. Whether nothing is wrong.
 
     A part that fails or takes too long is a finding of its own, and the others go on.
     """
-    findings: list[Finding] = []
-    for part in parts:
-        for finding in _in_own_process(part, tiny=tiny, quick=quick):
-            findings.append(finding)
+    sound, column = True, 0 if quick else 1
+    end = time.monotonic() + TOTAL[column]
+    for index, part in enumerate(parts):
+        limit = end - time.monotonic() - sum(SHARES[later][column] for later in parts[index + 1 :])
+        for finding in _in_own_process(part, limit, tiny=tiny, quick=quick):
+            sound &= finding.ok is not False
             show(finding)
-    return findings
+    return sound
 
 
-def _in_own_process(part: str, *, tiny: bool, quick: bool) -> Iterator[Finding]:
-    command = [sys.executable, "-m", "logvggt_jax", "doctor", "--part", part, "--in-process", "--json"]
+def _in_own_process(part: str, limit: float, *, tiny: bool, quick: bool) -> Iterator[Finding]:
+    command = [sys.executable, "-m", "logvggt_jax", "doctor", "--part", part, "--in-process", "--json", "-"]
     command += [option for option, given in (("--tiny", tiny), ("--quick", quick)) if given]
-    limit, started = LIMITS[part][0 if quick else 1], time.monotonic()
+    started = time.monotonic()
     with (
         tempfile.TemporaryFile("w+") as errors,
         subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True) as process,
@@ -70,11 +74,11 @@ def _in_own_process(part: str, *, tiny: bool, quick: bool) -> Iterator[Finding]:
         for line in process.stdout:
             with contextlib.suppress(ValueError, TypeError):  # what a library printed
                 yield Finding(**json.loads(line))
-        code, over = process.wait(), not late.is_alive()
+        code, over = process.wait(), time.monotonic() - started >= limit
         late.cancel()
         errors.seek(0)
         last = next((line.strip() for line in reversed(errors.readlines()) if line.strip()), "no message")
     if code != 0:
-        reason = f"stopped after its limit of {limit} s" if over else f"{last:.300}"
+        reason = f"stopped after its limit of {limit:.0f} s" if over else f"{last:.300}"
         yield Finding(part, "this part", "failed", ok=False, note=reason)
     yield Finding(part, "time", time.monotonic() - started, "s")

@@ -37,8 +37,8 @@ class Subject:
 def tiny_config(dtype: str = "float32") -> ModelConfig:
     """A model of about 0.2 M parameters that has every part."""
     return ModelConfig(
-        encoder=EncoderConfig(embed_dim=32, depth=2, num_heads=2, position_grid=4),
-        aggregator=AggregatorConfig(depth=5, num_heads=2, key_layers=(0, 1, 3, 4), layer_scale=0.5),
+        encoder=EncoderConfig(embed_dim=32, depth=1, num_heads=2, position_grid=4),
+        aggregator=AggregatorConfig(depth=4, num_heads=2, key_layers=(0, 1, 2, 3), layer_scale=0.5),
         camera_head=CameraHeadConfig(depth=1, num_heads=2, layer_scale=0.5),
         depth_head=DPTConfig(features=8, out_channels=(8, 8, 8, 8)),
         refinement=RefinementConfig(num_heads=2),

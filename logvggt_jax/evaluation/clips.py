@@ -14,21 +14,15 @@ from logvggt_jax.evaluation.scratch import scratch_array
 
 
 class ClipData(NamedTuple):
-    """Frames of a clip, numpy arrays; `images` and `depth` may be memory maps.
+    """Frames of a clip, numpy arrays; `images` and `depth` may be memory maps."""
 
-    Attributes:
-      images: [T, h, w, 3] uint8, what the network sees.
-      depth: [T, H, W] float32 true z-depth, 0 where invalid; None where no metric needs it. On the images' pixels or
-        the data set's, as the image rule says.
-      intrinsics: [T, 3, 3] float32, pixels of `depth`.
-      extrinsics: [T, 4, 4] float32, world-to-camera (OpenCV); NaN in sets without poses.
-      sfm_extrinsics: [T, 4, 4], a second set of true poses from structure from motion; None where there is none.
-    """
-
-    images: np.ndarray
+    images: np.ndarray  # [T, h, w, 3] uint8, what the network sees
+    # [T, H, W] float32 true z-depth, 0 where invalid; None where no metric needs it. On the images' pixels or the data
+    # set's, as the image rule says.
     depth: np.ndarray | None
-    intrinsics: np.ndarray
-    extrinsics: np.ndarray
+    intrinsics: np.ndarray  # [T, 3, 3] float32, pixels of `depth`
+    extrinsics: np.ndarray  # [T, 4, 4] float32, world-to-camera (OpenCV); NaN in sets without poses
+    # [T, 4, 4], a second set of true poses from structure from motion; None where there is none.
     sfm_extrinsics: np.ndarray | None = None
 
 

@@ -36,19 +36,12 @@ from logvggt_jax.streaming import PredictionError
 
 @dataclasses.dataclass(frozen=True)
 class Benchmark:
-    """A protocol and the data it finds.
+    """A protocol and the data it finds."""
 
-    Attributes:
-      protocol: frames, images, metrics.
-      dataset: None where the data set is missing.
-      split: the one that is evaluated.
-      missing: why `dataset` is None.
-    """
-
-    protocol: Protocol
-    dataset: Dataset | None
-    split: str
-    missing: str = ""
+    protocol: Protocol  # frames, images, metrics
+    dataset: Dataset | None  # None where the data set is missing
+    split: str  # the one that is evaluated
+    missing: str = ""  # why `dataset` is None
 
 
 @dataclasses.dataclass(frozen=True)

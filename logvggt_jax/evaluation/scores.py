@@ -37,20 +37,14 @@ SFM = "sfm/"
 
 @dataclasses.dataclass(frozen=True)
 class ClipTruth:
-    """Ground truth of one clip, prepared once for all methods.
+    """Ground truth of one clip, prepared once for all methods."""
 
-    Attributes:
-      clip: the clip.
-      indices: [N] flat indices into [T, H, W] of the pixels whose points are compared; the same for prediction and
-        truth. None where points are not measured.
-      points: [N, 3] in the data set's world.
-      normals: [N, 3].
-    """
-
-    clip: ClipData
+    clip: ClipData  # the clip
+    # [N] flat indices into [T, H, W] of the pixels whose points are compared; the same for prediction and truth. None
+    # where points are not measured.
     indices: np.ndarray | None = None
-    points: np.ndarray | None = None
-    normals: np.ndarray | None = None
+    points: np.ndarray | None = None  # [N, 3] in the data set's world
+    normals: np.ndarray | None = None  # [N, 3]
 
 
 @dataclasses.dataclass(frozen=True)

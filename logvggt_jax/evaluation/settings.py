@@ -14,38 +14,25 @@ from logvggt_jax.evaluation.protocols.clips import ClipSettings
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Run:
-    """What both kinds of run say.
+    """What both kinds of run say."""
 
-    Attributes:
-      title: of the report.
-      baselines: whether answers that need no learning are evaluated beside the model.
-      methods: rows of the model, names of `logvggt_jax.streaming.METHODS`; the first one is drawn.
-      references: limits of the methods `offline` and `chunks`.
-      variants: names of `logvggt_jax.evaluation.methods.variants.VARIANTS` that are evaluated beside the methods.
-    """
-
-    title: str
-    baselines: bool
+    title: str  # of the report
+    baselines: bool  # whether answers that need no learning are evaluated beside the model
+    # Rows of the model, names of `logvggt_jax.streaming.METHODS`; the first one is drawn.
     methods: tuple[str, ...] = ("windows", "offline", "chunks")
-    references: ReferenceConfig = ReferenceConfig()
+    references: ReferenceConfig = ReferenceConfig()  # limits of the methods `offline` and `chunks`
+    # Names of `logvggt_jax.evaluation.methods.variants.VARIANTS` that are evaluated beside the methods.
     variants: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ClipRun(Run):
-    """Clips of one data set, at one small size: configs/eval/rooms.py, seven_scenes.py, ablations.py.
+    """Clips of one data set, at one small size: configs/eval/rooms.py, seven_scenes.py, ablations.py."""
 
-    Attributes:
-      dataset: one of `logvggt_jax.data.DATASETS`.
-      split: `train`, `val`, `test` or `all`.
-      evaluation: clips and metrics.
-      rooms: options of procedural rooms, for `dataset` = `rooms` alone.
-    """
-
-    dataset: str
-    split: str
-    evaluation: ClipSettings
-    rooms: Mapping[str, Any] | None = None
+    dataset: str  # one of `logvggt_jax.data.DATASETS`
+    split: str  # `train`, `val`, `test` or `all`
+    evaluation: ClipSettings  # clips and metrics
+    rooms: Mapping[str, Any] | None = None  # options of procedural rooms, for `dataset` = `rooms` alone
 
     @property
     def max_sequences(self) -> int | None:
@@ -60,21 +47,14 @@ class ClipRun(Run):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PaperRun(Run):
-    """The paper's benchmarks on the data sets that are there: configs/eval/paper.py.
+    """The paper's benchmarks on the data sets that are there: configs/eval/paper.py."""
 
-    Attributes:
-      benchmarks: patterns of protocol names, see `logvggt_jax.evaluation.protocols.paper_protocols`.
-      protocol: what all benchmarks share.
-      max_sequences: only that many first sequences of each benchmark; None takes all. The tables say so.
-      figures: clips of each benchmark that are drawn, for the first method.
-      timings: sequences that are timed for the paper's tables of cost; None leaves them out.
-    """
-
-    benchmarks: tuple[str, ...]
-    protocol: ProtocolSettings
+    benchmarks: tuple[str, ...]  # patterns of protocol names, see `logvggt_jax.evaluation.protocols.paper_protocols`
+    protocol: ProtocolSettings  # what all benchmarks share
+    # Only that many first sequences of each benchmark; None takes all. The tables say so.
     max_sequences: int | None = None
-    figures: int = 1
-    timings: TimingConfig | None = None
+    figures: int = 1  # clips of each benchmark that are drawn, for the first method
+    timings: TimingConfig | None = None  # sequences that are timed for the paper's tables of cost; None leaves them out
 
     def __post_init__(self) -> None:
         if not self.benchmarks:

@@ -162,11 +162,14 @@ def resize_depth(depth: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 
 def _blocks(*columns: np.ndarray) -> Iterator[tuple[np.ndarray, ...]]:
+    """Columns [N] in pieces that fit the memory."""
     for start in range(0, len(columns[0]), _BLOCK):
         yield tuple(np.asarray(column[start : start + _BLOCK]) for column in columns)
 
 
 def _least_absolute_scale(prediction: np.ndarray, target: np.ndarray, iterations: int = 10) -> float:
+    """The scale that minimises Σ |scale · prediction − target| over pixels [N], by reweighted least squares."""
+
     def sums(terms: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]) -> tuple[np.float64, np.float64]:
         above, below = np.float64(0.0), np.float64(0.0)
         for predicted, true in _blocks(prediction, target):
@@ -188,11 +191,13 @@ def _least_absolute_scale(prediction: np.ndarray, target: np.ndarray, iterations
 
 
 def _median_scale(prediction: np.ndarray, target: np.ndarray) -> float:
+    """The ratio of the medians of pixels [N]."""
     # Python's own division raises for a prediction of zeros; the reference's gives infinity.
     return float(np.divide(lower_median(target), lower_median(prediction)))
 
 
 def _least_squares(prediction: np.ndarray, target: np.ndarray) -> tuple[float, float]:
+    """Scale and shift of least squares over pixels [N]; NaN where a prediction is not finite."""
     if not np.isfinite(prediction).all():
         return float("nan"), float("nan")
     design = np.stack([prediction, np.ones_like(prediction)], axis=1)
@@ -201,7 +206,7 @@ def _least_squares(prediction: np.ndarray, target: np.ndarray) -> tuple[float, f
 
 
 def _adam_scale_shift(prediction: np.ndarray, target: np.ndarray) -> tuple[float, float]:
-    """Follows the reference step by step, since it stops far from the optimum."""
+    """Scale and shift of pixels [N] by Adam, step by step as the reference, which stops far from the optimum."""
     rate, beta1, beta2, epsilon = 1e-4, 0.9, 0.999, 1e-8
     start = _median_scale(prediction, target)
     # Float32 as the reference: the start puts one residual at round-off, and its sign decides the first steps.

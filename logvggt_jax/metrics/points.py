@@ -107,6 +107,7 @@ def sample_indices(count: int, max_points: int | None, seed: int) -> np.ndarray:
 
 
 def _nearest(points: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distance [N] of each of `points` [N, 3] to the nearest of `others` [M, 3], and its index [N]."""
     try:
         from scipy.spatial import cKDTree
     except ImportError as error:
@@ -115,6 +116,7 @@ def _nearest(points: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _cloud(points: np.ndarray, name: str) -> np.ndarray:
+    """A cloud as float64 [N, 3]; ValueError for another shape, NotMeasurable where it is empty or not finite."""
     points = np.asarray(points, np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(f"{name} must be a cloud [N, 3], got shape {points.shape}")
@@ -127,6 +129,7 @@ def _cloud(points: np.ndarray, name: str) -> np.ndarray:
 
 
 def _normals_of(points: np.ndarray, normals: np.ndarray, name: str) -> np.ndarray:
+    """Normals as float64 [N, 3]; ValueError unless there is one for each point."""
     normals = np.asarray(normals, np.float64)
     if normals.shape != points.shape:
         raise ValueError(f"{name} must have the shape of its points {points.shape}, got {normals.shape}")

@@ -76,4 +76,5 @@ def _lower_median(values: jax.Array, valid: jax.Array) -> jax.Array:
 
 
 def _relative(extrinsics: jax.Array) -> jax.Array:
+    """Motion from frame j to frame i of extrinsics [B, T, 3, 4], as [B, i, j, 3, 4]."""
     return compose(extrinsics[:, :, None], invert(extrinsics)[:, None])

@@ -18,6 +18,7 @@ import numpy as np
 from jax.sharding import AxisType, Mesh
 
 from logvggt_jax.compile import device_bytes, out_of_device_memory
+from logvggt_jax.config import ModelConfig
 from logvggt_jax.errors import InputError, MissingPackage, one_line
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.operations import count_flops
@@ -69,7 +70,7 @@ def dry_run(config: TrainConfig, mesh: Mesh, say: Callable[[str], None] = print)
         for size in stage.sizes:
             clips = stage.batch_size // mesh.size
             name = f"{stage.name} {size[0]}x{size[1]}, {clips} x {stage.clip_length} frames a device"
-            operations = step_flops(config, (stage.batch_size, stage.clip_length, *size))
+            operations = step_flops(config.model, (stage.batch_size, stage.clip_length, *size))
             costs = step_costs(config, mesh, stage, size, clips)
             say(f"{name}: {operations / 1e12:.4g} TFLOP in all without recomputation; {_described(costs, limit)}")
         say(f"{stage.name}: {_largest_that_fits(config, mesh, stage, limit)}")
@@ -95,14 +96,14 @@ def described_mesh(topology: str) -> Mesh:
     return Mesh(np.array(devices), (DATA_AXIS,), axis_types=(AxisType.Auto,))
 
 
-def step_flops(config: TrainConfig, clips: tuple[int, ...]) -> float:
+def step_flops(config: ModelConfig, clips: tuple[int, ...]) -> float:
     """Operations of a step on clips [B, T, H, W] over all devices: forward and gradient, nothing computed twice."""
-    model = LogVGGT(dataclasses.replace(config.model, attention="xla"))
-    params, images = abstract_parameters(config.model), jax.ShapeDtypeStruct((*clips, 3), jnp.uint8)
+    model = LogVGGT(dataclasses.replace(config, attention="xla"))
+    params, images = abstract_parameters(config), jax.ShapeDtypeStruct((*clips, 3), jnp.uint8)
     forward = count_flops(lambda p, x: model.apply({"params": p}, x), params, images)
     encoder = count_flops(lambda p, x: model.windows.encode({"params": p}, x), params, images)
     # The gradient of a product is two of the kind; a frozen encoder has none.
-    return 3 * forward - 2 * encoder if config.model.encoder.frozen else 3 * forward
+    return 3 * forward - 2 * encoder if config.encoder.frozen else 3 * forward
 
 
 def step_costs(

@@ -12,24 +12,16 @@ MIN_SCALE, MAX_SCALE = 1e-6, 1e6
 
 
 class Targets(NamedTuple):
-    """Ground truth of a batch of clips in the units that the network is to predict.
+    """Ground truth of a batch of clips in the units that the network is to predict."""
 
-    Attributes:
-      pose_encoding: [B, T, 9] float32, encoding of `extrinsics` and the intrinsics.
-      extrinsics: [B, T, 4, 4] float32, world-to-camera, the world being the clip's first camera; lengths in
-        units of `scale`. Identity where `frame_valid` is False.
-      depth: [B, T, H, W] float32 z-depth in units of `scale`, 0 where invalid.
-      depth_valid: [B, T, H, W] bool.
-      frame_valid: [B, T] bool: a frame of the clip (not padding) with a known camera.
-      scale: [B] float32, mean distance of the clip's points from its first camera, in the input's unit.
-    """
-
-    pose_encoding: jax.Array
+    pose_encoding: jax.Array  # [B, T, 9] float32, encoding of `extrinsics` and the intrinsics
+    # [B, T, 4, 4] float32, world-to-camera, the world being the clip's first camera; lengths in units of `scale`.
+    # Identity where `frame_valid` is False.
     extrinsics: jax.Array
-    depth: jax.Array
-    depth_valid: jax.Array
-    frame_valid: jax.Array
-    scale: jax.Array
+    depth: jax.Array  # [B, T, H, W] float32 z-depth in units of `scale`, 0 where invalid
+    depth_valid: jax.Array  # [B, T, H, W] bool
+    frame_valid: jax.Array  # [B, T] bool: a frame of the clip (not padding) with a known camera
+    scale: jax.Array  # [B] float32, mean distance of the clip's points from its first camera, in the input's unit
 
 
 def normalize_clips(

@@ -8,23 +8,14 @@ import optax
 
 
 class TrainState(NamedTuple):
-    """State of a run; donated to every step.
+    """State of a run; donated to every step."""
 
-    Attributes:
-      step: int32 scalar, batches seen.
-      params: Parameter tree of the model, float32, the layers of deep stacks as one (`stack_layers`).
-      opt_state: The optimiser's.
-      skipped: int32 scalar, updates left out for a non-finite loss or gradient.
-      skipped_in_a_row: int32 scalar.
-      longest_skip: int32 scalar, the longest row so far.
-    """
-
-    step: jax.Array
-    params: Any
-    opt_state: Any
-    skipped: jax.Array
-    skipped_in_a_row: jax.Array
-    longest_skip: jax.Array
+    step: jax.Array  # int32 scalar, batches seen
+    params: Any  # Parameter tree of the model, float32, the layers of deep stacks as one (`stack_layers`)
+    opt_state: Any  # The optimiser's
+    skipped: jax.Array  # int32 scalar, updates left out for a non-finite loss or gradient
+    skipped_in_a_row: jax.Array  # int32 scalar
+    longest_skip: jax.Array  # int32 scalar, the longest row so far
 
 
 def initial_state(params: Any, optimizer: optax.GradientTransformation) -> TrainState:

@@ -71,14 +71,17 @@ def depth_losses(
 
 
 def _bounded(values: jax.Array) -> jax.Array:
+    """Values of any shape within ±`LIMIT`, 0 where they are not finite."""
     return jnp.clip(jnp.where(jnp.isfinite(values), values, 0.0), -LIMIT, LIMIT)
 
 
 def _shard_value(value: jax.Array) -> Mean:
+    """A scalar of one device as a term that is averaged over devices."""
     return Mean(value, jnp.ones_like(value))
 
 
 def _mean_below_quantile(values: jax.Array, valid: jax.Array, quantile: float | None) -> jax.Array:
+    """Scalar mean of the valid of `values` [B, T, H, W] below their quantile, as the released trainer filters."""
     values, valid = values.reshape(-1), valid.reshape(-1)
     count = valid.sum()
     if quantile is None:
@@ -100,6 +103,7 @@ def _mean_below_quantile(values: jax.Array, valid: jax.Array, quantile: float | 
 
 
 def _gradient_loss(error: jax.Array, valid: jax.Array) -> jax.Array:
+    """Scalar: differences between neighbouring pixels of `error` [B, T, H, W], averaged over scales."""
     total = jnp.zeros_like(error[0, 0, 0, 0])
     for stride in GRADIENT_SCALES:
         d, m = (array[..., ::stride, ::stride] for array in (error, valid))

@@ -9,20 +9,14 @@ from logvggt_jax.errors import InputError
 
 @dataclasses.dataclass(frozen=True)
 class Provenance:
-    """Kept in a model folder beside the sizes; None where it is not known.
+    """Kept in a model folder beside the sizes; None where it is not known."""
 
-    Attributes:
-      trained_for: `windows`, LoG-VGGT's windows with memory between them; or `vggt`, all frames at once, as public
-        VGGT weights are.
-      longer_edge: pixels of the longer edge of the largest images that they were trained on, a multiple of 14.
-      licence: of the weights, as their source names it.
-      source: file, hub repository or training run, in a few words.
-    """
-
+    # `windows`, LoG-VGGT's windows with memory between them; or `vggt`, all frames at once, as public VGGT weights are.
     trained_for: Literal["windows", "vggt"] | None = None
+    # Pixels of the longer edge of the largest images that they were trained on, a multiple of 14.
     longer_edge: int | None = None
-    licence: str | None = None
-    source: str | None = None
+    licence: str | None = None  # of the weights, as their source names it
+    source: str | None = None  # file, hub repository or training run, in a few words
 
     def __post_init__(self) -> None:
         require_counts(self, "longer_edge")

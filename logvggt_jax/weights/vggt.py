@@ -43,16 +43,11 @@ _SIZES = {
 
 @dataclasses.dataclass(frozen=True)
 class Rule:
-    """One tensor of the PyTorch state dict.
+    """One tensor of the PyTorch state dict."""
 
-    Attributes:
-      name: Its name there.
-      shape: Its shape there.
-      targets: The parameters made from it: path in our tree, and the change of layout.
-    """
-
-    name: str
-    shape: tuple[int, ...]
+    name: str  # Its name there
+    shape: tuple[int, ...]  # Its shape there
+    # The parameters made from it: path in our tree, and the change of layout.
     targets: tuple[tuple[ParamPath, Layout], ...]
 
 

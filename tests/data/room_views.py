@@ -40,6 +40,16 @@ def room_views(
     return [RoomView(pose, intrinsics, *view(pose, intrinsics, size)) for pose in poses]
 
 
+def frames_of(views: Sequence[RoomView]) -> Frames:
+    return Frames(
+        images=np.stack([each.picture for each in views]),
+        depth=np.stack([each.depth for each in views]).astype(np.float32),
+        intrinsics=np.stack([each.intrinsics for each in views]).astype(np.float32),
+        extrinsics=np.stack([each.extrinsics for each in views]).astype(np.float32),
+        metric=True,
+    )
+
+
 def pinhole_row(each: RoomView) -> list[float]:
     """fx, fy, cx, cy."""
     return [float(each.intrinsics[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2))]

@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from analytic_room import camera_to_world, pinhole, view
+from analytic_room import pinhole
+from room_views import frames_of, room_views
 
 from logvggt_jax.data.dataset import check_frames
 from logvggt_jax.frames import Frames
@@ -12,16 +13,7 @@ SIZE = (12, 16)
 
 @pytest.fixture
 def frames() -> Frames:
-    intrinsics = pinhole(SIZE, 12.0)
-    poses = [camera_to_world(index) for index in range(3)]
-    views = [view(pose, intrinsics, SIZE) for pose in poses]
-    return Frames(
-        images=np.stack([picture for picture, _ in views]),
-        depth=np.stack([depth for _, depth in views]).astype(np.float32),
-        intrinsics=np.stack([intrinsics] * 3).astype(np.float32),
-        extrinsics=np.linalg.inv(np.stack(poses)).astype(np.float32),
-        metric=True,
-    )
+    return frames_of(room_views(3, pinhole(SIZE, 12.0), SIZE))
 
 
 def test_frames_with_poses_pass_whether_or_not_poses_are_needed(frames: Frames):

@@ -15,9 +15,7 @@ def test_every_name_has_a_reader_of_that_name():
     expected = "co3dv2 blendedmvs arkitscenes wildrgbd scannet mvs_synth pointodyssey virtual_kitti spring hypersim"
     assert " ".join(DATASETS) == f"{expected} replica seven_scenes nrgbd sintel bonn kitti tum rooms"
     for name, reader in READERS.items():
-        assert reader.name == name
-        assert "all" in reader.splits
-        assert reader.title and reader.expects
+        assert reader.name == name and "all" in reader.splits and reader.title and reader.expects
 
 
 @pytest.mark.parametrize("name", [name for name, reader in READERS.items() if reader.needs_root])

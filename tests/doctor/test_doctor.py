@@ -6,6 +6,9 @@ import importlib.metadata
 import json
 import subprocess
 import sys
+from collections.abc import Iterator
+from importlib import resources
+from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -17,7 +20,7 @@ from logvggt_jax.doctor import environment, examination, parity
 from logvggt_jax.doctor.finding import Finding
 
 
-@pytest.mark.parametrize("part", [part for part in examination.LIMITS if part != "environment"])
+@pytest.mark.parametrize("part", [part for part in examination.SHARES if part != "environment"])
 def test_every_part_finds_a_cpu_sound(part: str) -> None:
     findings = list(examination.part_findings(part, tiny=True, quick=True))
     assert {finding.part for finding in findings} == {part}
@@ -34,12 +37,14 @@ def test_every_part_finds_a_cpu_sound(part: str) -> None:
 
 
 def test_a_machine_that_computes_otherwise_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    right = parity.outputs("float32")
-    wrong = {name: value * (1.001 if name == "depth" else 1.0) for name, value in right.items()}
-    monkeypatch.setattr(parity, "outputs", lambda dtype: wrong)
-    judged = {finding.what: finding.ok for finding in parity.examine()}
-    assert not judged["depth, float32"]
-    assert judged["pose_encodings, float32"]
+    with resources.files("logvggt_jax.doctor").joinpath(parity.RECORDED).open("rb") as file:
+        right = dict(np.load(file))
+    assert all(np.isfinite(value).all() for value in right.values())
+    for name in right:
+        wrong = {**right, name: right[name] + 1e-3 * (right[name] - right[name].mean())}
+        monkeypatch.setattr(parity, "outputs", lambda dtype, wrong=wrong: wrong)
+        judged = {finding.what: finding.ok for finding in parity.examine()}
+        assert [what for what, ok in judged.items() if not ok] == [f"{name}, float32"]
 
 
 def test_the_command_runs_parts_in_processes_of_their_own(capfd: pytest.CaptureFixture[str]) -> None:
@@ -51,18 +56,75 @@ def test_the_command_runs_parts_in_processes_of_their_own(capfd: pytest.CaptureF
     assert code == int(any(finding.ok is False for finding in findings))
 
 
-def test_a_part_that_fails_or_takes_too_long_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
+def stand_ins(monkeypatch: pytest.MonkeyPatch, programs: dict[str, str]) -> None:
+    """Parts whose processes run these programs instead."""
+
     def popen(command: list[str], **options: object) -> subprocess.Popen:
-        program = {"parity": "raise SystemExit('no luck')", "whole": "import time; time.sleep(60)"}
-        return real([sys.executable, "-c", program[command[5]]], **options)  # type: ignore[call-overload]
+        return real([sys.executable, "-c", programs[command[5]]], **options)  # type: ignore[call-overload]
 
     real = subprocess.Popen
     monkeypatch.setattr(examination.subprocess, "Popen", popen)
-    monkeypatch.setattr(examination, "LIMITS", {"parity": (30, 30), "whole": (1, 1)})
+
+
+FOUND = f"import time; print({Finding('whole', 'rate', 5.0).to_json()!r}, flush=True);"
+
+
+def test_a_part_that_fails_or_takes_too_long_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
+    stand_ins(monkeypatch, {"parity": "raise SystemExit('no luck')", "whole": FOUND + "time.sleep(60)"})
+    monkeypatch.setattr(examination, "TOTAL", (4, 4))
+    monkeypatch.setattr(examination, "SHARES", {"parity": (3, 3), "whole": (3, 3)})
     shown: list[Finding] = []
-    examination.examine(["parity", "whole"], tiny=True, quick=True, show=shown.append)
+    assert not examination.examine(["parity", "whole"], tiny=True, quick=True, show=shown.append)
     failed = {finding.part: finding.note for finding in shown if finding.ok is False}
-    assert failed == {"parity": "no luck", "whole": "stopped after its limit of 1 s"}
+    assert failed["parity"] == "no luck" or failed["parity"].startswith("stopped after")
+    assert failed["whole"].startswith("stopped after its limit of")
+    assert Finding("whole", "rate", 5.0) in shown, "what was found before the end counts"
+
+
+def test_time_that_one_part_leaves_is_the_next_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    limits: list[float] = []
+    monkeypatch.setattr(examination, "_in_own_process", lambda part, limit, **_: limits.append(limit) or iter(()))
+    for quick, (total, shares) in enumerate(zip(examination.TOTAL, zip(*examination.SHARES.values(), strict=True))):
+        assert sum(shares) == total
+        limits.clear()
+        examination.examine(list(examination.SHARES), tiny=True, quick=not quick, show=print)
+        assert limits == pytest.approx([total - sum(shares[i + 1 :]) for i in range(len(shares))], abs=1)
+
+
+def test_what_is_wrong_is_no_failure_of_its_part(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    def findings(*_: object, **__: object) -> Iterator[Finding]:
+        yield Finding("parity", "depth", 1.0, ok=False)
+        assert "depth" in capsys.readouterr().out, "shown as it comes"
+        yield Finding("parity", "pose", 0.0, ok=True)
+
+    monkeypatch.setattr(examination, "part_findings", findings)
+    assert main(["doctor", "--part", "parity", "--in-process"]) == 0, "the part ran to its end"
+
+
+def test_findings_are_written_beside_the_table(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
+) -> None:
+    found = Finding("whole", "rate", 5.0, "frames/s", ok=False)
+    monkeypatch.setattr(examination, "_in_own_process", lambda *_, **__: iter([found]))
+    assert main(["doctor", "--part", "whole", "--json", str(tmp_path / "found.jsonl")]) == 1
+    assert Finding(**json.loads((tmp_path / "found.jsonl").read_text())) == found
+    assert "5 frames/s  WRONG" in capsys.readouterr().out
+    assert main(["doctor", "--part", "whole", "--json", str(tmp_path / "none" / "found.jsonl")]) == 2
+
+
+def test_a_back_end_that_failed_says_why_the_gpu_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*kinds: str) -> list[jax.Device]:
+        if kinds:
+            raise RuntimeError("Backend 'cuda' failed to initialize: CUDA driver version is insufficient")
+        return real()
+
+    real = jax.devices
+    monkeypatch.setattr(environment, "nvidia_gpu_present", lambda: True)
+    monkeypatch.setattr(jax, "devices", refuse)
+    wrong = {finding.what: finding.note for finding in environment.examine() if finding.ok is False}
+    assert "driver version is insufficient" in wrong["NVIDIA GPU"]
 
 
 def test_builds_side_by_side_and_idle_gpus_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -85,10 +147,6 @@ def test_a_back_end_that_does_not_start_is_one_finding(monkeypatch: pytest.Monke
     last = list(environment.examine())[-1]
     assert (last.what, last.ok) == ("devices", False)
     assert "driver too old" in last.note
-
-
-def test_recorded_values_are_small_and_finite() -> None:
-    assert all(np.isfinite(value).all() for value in parity.outputs("float32").values())
 
 
 def test_an_unknown_part_is_named(capsys: pytest.CaptureFixture[str]) -> None:

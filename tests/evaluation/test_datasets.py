@@ -45,8 +45,7 @@ def test_data_sets_that_are_missing_or_broken_are_named(tmp_path: Path) -> None:
         SETTINGS, ["seven_scenes-reconstruction-10", "sintel-depth", "nrgbd-figures", "rooms-12"]
     )
     opened = {benchmark.protocol.dataset: benchmark for benchmark in open_benchmarks(protocols, tmp_path, SETTINGS)}
-    assert opened["seven_scenes"].split == "test"
-    assert isinstance(opened["rooms"].dataset, Rooms)
+    assert opened["seven_scenes"].split == "test" and isinstance(opened["rooms"].dataset, Rooms)
     assert opened["nrgbd"].missing == f"{tmp_path / 'nrgbd'}: no such folder"
     assert opened["sintel"].dataset is None
     assert opened["sintel"].missing.startswith("sintel, split all: ")
@@ -65,8 +64,7 @@ def test_no_data_set_at_all_is_an_error_and_rooms_need_none(tmp_path: Path) -> N
     with pytest.raises(InputError, match="no such folder; --data_root"):
         open_benchmarks(both, tmp_path / "none", SETTINGS)
     sintel, rooms = open_benchmarks(both, None, SETTINGS)
-    assert "no --data_root" in sintel.missing
-    assert rooms.dataset is not None
+    assert "no --data_root" in sintel.missing and rooms.dataset is not None
 
 
 def test_a_paper_run_counts_what_is_missing_in_its_tables(tmp_path: Path) -> None:

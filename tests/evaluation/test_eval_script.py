@@ -55,11 +55,8 @@ def test_an_evaluation_leaves_tables_json_and_figures(
 def test_what_cannot_be_used_is_one_line(arguments: list[str], message: str, tmp_path: Path) -> None:
     output = tmp_path / "out"
     result = run_eval("--config=configs/eval/rooms.py", "--checkpoint=c", f"--output={output}", *arguments)
-    assert result.returncode == 1
-    assert result.stderr.startswith("eval.py: ")
-    assert result.stderr.count("\n") == 1
-    assert message in result.stderr
-    assert not output.exists()
+    assert result.returncode == 1 and result.stderr.startswith("eval.py: ")
+    assert result.stderr.count("\n") == 1 and message in result.stderr and not output.exists()
 
 
 def test_a_bug_keeps_its_traceback(tmp_path: Path) -> None:
@@ -102,8 +99,7 @@ def test_real_frames_are_evaluated(
         (frames, method["name"]) for frames in (4, 6) for method in results["methods"]
     }
     depths = [entry["scale/abs_rel"] for entry in results["summary"] if entry["method"] != "static camera"]
-    assert len(depths) == 2 * 6
-    assert all(error > 0 for error in depths)
+    assert len(depths) == 2 * 6 and all(error > 0 for error in depths)
 
 
 @pytest.mark.slow

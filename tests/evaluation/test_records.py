@@ -34,8 +34,7 @@ def test_a_killed_evaluation_goes_on_where_it_stopped(rooms: Rooms, tmp_path: Pa
     assert len(calls) == 3 + 2, "two of four clips were left, and the third call had failed"
     assert resumed["summary"] == whole["summary"]
     again = run(rooms, [method], tmp_path / "killed")
-    assert len(calls) == 5
-    assert again["summary"] == whole["summary"]
+    assert len(calls) == 5 and again["summary"] == whole["summary"]
     for name in ("whole", "killed"):
         assert len(records(tmp_path / name)) == 4
 
@@ -46,8 +45,7 @@ def test_results_of_other_settings_or_parameters_are_not_taken_over(rooms: Rooms
         run(rooms, [dataclasses.replace(method, identity=identity)], tmp_path)
     assert len(calls) == 8
     run(rooms, [dataclasses.replace(method, identity="b")], tmp_path, dataclasses.replace(SETTINGS, seed=1))
-    assert len(calls) == 12
-    assert len(records(tmp_path)) == 4
+    assert len(calls) == 12 and len(records(tmp_path)) == 4
 
 
 def test_other_code_measures_again(rooms: Rooms, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -69,16 +67,14 @@ def test_the_prose_of_a_protocol_measures_nothing_again(
     ]
     monkeypatch.setattr("known_answers.benchmarks_of", lambda *_: reworded)
     results = run(rooms, [method], tmp_path)
-    assert len(calls) == 4
-    assert results["benchmarks"][0]["title"] == "new title"
+    assert len(calls) == 4 and results["benchmarks"][0]["title"] == "new title"
 
 
 def test_a_fresh_run_measures_all_again(rooms: Rooms, tmp_path: Path) -> None:
     method, calls = failing("", at_call=-1)
     for fresh in (False, True):
         run(rooms, [method], tmp_path, fresh=fresh)
-    assert len(calls) == 8
-    assert len(records(tmp_path)) == 4
+    assert len(calls) == 8 and len(records(tmp_path)) == 4
 
 
 def test_the_version_of_the_code_is_that_of_its_statements(tmp_path: Path) -> None:

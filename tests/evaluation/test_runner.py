@@ -23,26 +23,19 @@ from logvggt_jax.types import Frames
 
 def test_the_truth_in_another_world_and_unit_is_perfect(rooms: Rooms, tmp_path: Path) -> None:
     results = run(rooms, [oracle(all_frames(rooms)), static_camera()], tmp_path)
-    assert not results["skipped"]
-    assert not results["failures"]
+    assert not results["skipped"] and not results["failures"]
     perfect = [entry for entry in results["summary"] if entry["method"] == "oracle"]
     assert [entry["frames"] for entry in perfect] == [4, 6]
     for entry in perfect:
         for alignment in ("scale", "median"):
-            assert entry[f"{alignment}/abs_rel"] < 1e-6
-            assert entry[f"{alignment}/delta_1.25"] == 1.0
-        assert entry["ate"] < 1e-5
-        assert entry["rotation_error"] < 1e-3
-        assert entry["rra@5"] == entry["rta@30"] == 1.0
-        assert entry["acc_mean"] < 1e-5
-        assert entry["comp_mean"] < 1e-5
-        assert entry["nc_mean"] > 0.999
+            assert entry[f"{alignment}/abs_rel"] < 1e-6 and entry[f"{alignment}/delta_1.25"] == 1.0
+        assert entry["ate"] < 1e-5 and entry["rotation_error"] < 1e-3
+        assert entry["rra@5"] == entry["rta@30"] == 1.0 and entry["acc_mean"] < 1e-5
+        assert entry["comp_mean"] < 1e-5 and entry["nc_mean"] > 0.999
         assert entry["clips_depth"] == entry["clips_points"] == entry["clips"] == 2
     for entry in (entry for entry in results["summary"] if entry["method"] == "static camera"):
-        assert entry["ate_ratio"] == 1.0
-        assert entry["rotation_ratio"] == pytest.approx(1.0)
-        assert entry["auc@30"] == entry["rta@30"] == 0.0
-        assert "acc_mean" not in entry
+        assert entry["ate_ratio"] == 1.0 and entry["rotation_ratio"] == pytest.approx(1.0)
+        assert entry["auc@30"] == entry["rta@30"] == 0.0 and "acc_mean" not in entry
         assert "scale/abs_rel" not in entry
 
 
@@ -54,8 +47,7 @@ def test_results_are_written_as_json_and_the_same_twice(rooms: Rooms, tmp_path: 
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
     assert json.loads((tmp_path / "a" / "results.json").read_text()) == json.loads(json.dumps(first))
     lines = [json.loads(line) for line in (tmp_path / "a" / "clips.jsonl").read_text().splitlines()]
-    assert set(lines[0]) == {"environment"}
-    assert len(lines) == 1 + 2 * 2 * 2
+    assert set(lines[0]) == {"environment"} and len(lines) == 1 + 2 * 2 * 2
     assert lines[1]["indices"] == [0, 2, 4, 6]
 
 
@@ -71,8 +63,7 @@ def test_predictions_that_are_not_finite_are_counted_not_averaged(rooms: Rooms, 
     spoiled, whole = results["summary"]
     assert spoiled["clips"] == 2
     assert [spoiled[f"clips_{group}"] for group in ("depth", "pose", "trajectory", "points")] == [0, 0, 0, 0]
-    assert "ate" not in spoiled
-    assert whole["clips_depth"] == whole["clips_pose"] == 2
+    assert "ate" not in spoiled and whole["clips_depth"] == whole["clips_pose"] == 2
     reasons = {failure["metric"]: failure["reason"] for failure in results["failures"]}
     assert "depth of frame 2 is not finite" in reasons["depth"]
     assert "pose of frame 1 is not finite" in reasons["pose"]
@@ -156,8 +147,7 @@ def test_a_method_that_fails_on_a_clip_is_counted_and_tried_again(
     assert (first["clips_pose"], first["clips_measured"], first["clips"]) == (1, 1, 2)
     assert second["clips_pose"] == 2
     again = run(rooms, [method], tmp_path)
-    assert not again["failures"]
-    assert len(calls) == 5
+    assert not again["failures"] and len(calls) == 5
 
 
 def test_a_method_that_fails_everywhere_is_an_error(rooms: Rooms, tmp_path: Path) -> None:

@@ -13,10 +13,26 @@ from logvggt_jax.evaluation.methods.baselines import static_camera
 from logvggt_jax.evaluation.methods.method import Method
 from logvggt_jax.evaluation.protocols import PointsMeasure
 from logvggt_jax.evaluation.protocols.clips import clip_protocols
-from logvggt_jax.evaluation.scores import ClipScore, benchmark_score, clip_score, prepare_truth, valid_pixels
+from logvggt_jax.evaluation.scores import (
+    ClipScore,
+    ClipTruth,
+    benchmark_score,
+    clip_score,
+    prepare_truth,
+    valid_pixels,
+)
 from logvggt_jax.evaluation.scratch import scratch_array
 from logvggt_jax.metrics import depth_metrics
 from logvggt_jax.metrics.depth import pixel_errors, resize_depth
+from logvggt_jax.types import Frames
+
+PROTOCOL = clip_protocols("rooms", "test", SETTINGS)[0]
+
+
+def score_of(frames: Frames, truth: ClipTruth, **changes: np.ndarray) -> ClipScore:
+    """The oracle's score on these frames, its prediction changed."""
+    method = oracle(frames)
+    return clip_score(method, method.predict(frames.images)._replace(**changes), truth, PROTOCOL)
 
 
 def test_invalid_pixels_give_no_true_points(rooms: Rooms) -> None:
@@ -28,8 +44,7 @@ def test_invalid_pixels_give_no_true_points(rooms: Rooms) -> None:
     assert truth.indices is not None
     np.testing.assert_array_equal(truth.indices, np.flatnonzero(depth > 0))
     nothing = prepare_truth(clip_of(frames._replace(depth=np.zeros_like(depth))), PointsMeasure())
-    protocol = clip_protocols("rooms", "test", SETTINGS)[0]
-    score = clip_score(oracle(frames), oracle(frames).predict(frames.images), nothing, protocol)
+    score = score_of(frames, nothing)
     assert set(score.failures) == {"depth", "points"}
 
 
@@ -46,12 +61,9 @@ def test_only_the_middle_of_each_frame_is_compared(rooms: Rooms, max_points: int
 
 def test_one_frame_alone_gives_depth_and_points_and_names_the_rest(rooms: Rooms) -> None:
     frames = rooms.read(rooms.sequences[0], [5])
-    protocol = clip_protocols("rooms", "test", SETTINGS)[0]
-    truth = prepare_truth(clip_of(frames), protocol.points)
-    score = clip_score(oracle(frames), oracle(frames).predict(frames.images), truth, protocol)
+    score = score_of(frames, prepare_truth(clip_of(frames), PROTOCOL.points))
     assert set(score.failures) == {"pose", "trajectory"}
-    assert "at least 2 frames" in score.failures["pose"]
-    assert score.metrics["acc_mean"] < 1e-5
+    assert "at least 2 frames" in score.failures["pose"] and score.metrics["acc_mean"] < 1e-5
 
 
 def test_a_straight_true_trajectory_is_named(rooms: Rooms) -> None:
@@ -59,33 +71,28 @@ def test_a_straight_true_trajectory_is_named(rooms: Rooms) -> None:
     frames.extrinsics[:, :3, 3] = 0.0
     frames.extrinsics[:, :3, :3] = np.eye(3)
     frames.extrinsics[:, 0, 3] = np.arange(4)
-    protocol = clip_protocols("rooms", "test", SETTINGS)[0]
-    truth = prepare_truth(clip_of(frames), None)
-    score = clip_score(oracle(frames), oracle(frames).predict(frames.images), truth, protocol)
+    score = score_of(frames, prepare_truth(clip_of(frames), None))
     assert "neither stand still nor be straight" in score.failures["trajectory"]
     assert score.metrics["rra@30"] == 1.0
 
 
 def test_a_prediction_of_zeros_is_not_measurable(rooms: Rooms) -> None:
     frames = rooms.read(rooms.sequences[0], [0, 2, 4])
-    protocol = clip_protocols("rooms", "test", SETTINGS)[0]
-    flat = oracle(frames).predict(frames.images)._replace(depth=np.zeros_like(frames.depth))
-    score = clip_score(oracle(frames), flat, prepare_truth(clip_of(frames), protocol.points), protocol)
+    truth = prepare_truth(clip_of(frames), PROTOCOL.points)
+    score = score_of(frames, truth, depth=np.zeros_like(frames.depth))
     assert "cannot be aligned" in score.failures["depth"]
     assert not any(key.startswith("scale/") for key in score.metrics)
 
 
 def test_errors_against_a_second_set_of_poses_stand_beside_the_first(rooms: Rooms) -> None:
     frames = rooms.read(rooms.sequences[0], [0, 2, 4, 6])
-    protocol = clip_protocols("rooms", "test", SETTINGS)[0]
     shaken = frames.extrinsics.copy()
     shaken[2, :3, 3] += 0.5
     clip = clip_of(frames)._replace(sfm_extrinsics=shaken)
-    score = clip_score(oracle(frames), oracle(frames).predict(frames.images), prepare_truth(clip, None), protocol)
+    score = score_of(frames, prepare_truth(clip, None))
     assert score.metrics["ate"] < 1e-5 < 0.01 < score.metrics["sfm/ate"]
-    mean = benchmark_score(protocol, oracle(frames), [("a", score)], 1)
-    assert mean["sfm/ate"] == score.metrics["sfm/ate"]
-    assert mean["clips_sfm/trajectory"] == 1
+    mean = benchmark_score(PROTOCOL, oracle(frames), [("a", score)], 1)
+    assert mean["sfm/ate"] == score.metrics["sfm/ate"] and mean["clips_sfm/trajectory"] == 1
 
 
 def test_score_weighs_depth_by_pixels_and_poses_plainly() -> None:
@@ -96,18 +103,15 @@ def test_score_weighs_depth_by_pixels_and_poses_plainly() -> None:
         rotation = {"rotation_error": value, "identity_rotation_error": 2.0, "pairs": pixels}
         return ClipScore({**metrics, "valid_pixels": pixels, **poses, **rotation}, {})
 
-    protocol = clip_protocols("rooms", "test", SETTINGS)[0]
     method = Method("any", "", lambda images: static_camera().predict(images))
     scores = [("a/1", clip(0.1, 300)), ("a/2", clip(0.5, 100)), ("b/1", clip(0.8, 50))]
-    score = benchmark_score(protocol, method, scores[:2], 3)
-    assert score["scale/abs_rel"] == pytest.approx(0.2)
-    assert score["auc@30"] == pytest.approx(0.3)
+    score = benchmark_score(PROTOCOL, method, scores[:2], 3)
+    assert score["scale/abs_rel"] == pytest.approx(0.2) and score["auc@30"] == pytest.approx(0.3)
     assert score["rotation_ratio"] == pytest.approx(0.15)
     assert (score["clips_points"], score["clips_depth"], score["clips"]) == (0, 2, 3)
     # Pairs pooled in category a (0.2), then the mean with b.
-    pooled = benchmark_score(dataclasses.replace(protocol, pooled=True), method, scores, 3)
-    assert pooled["auc@30"] == pytest.approx((0.2 + 0.8) / 2)
-    assert pooled["categories"] == 2
+    pooled = benchmark_score(dataclasses.replace(PROTOCOL, pooled=True), method, scores, 3)
+    assert pooled["auc@30"] == pytest.approx((0.2 + 0.8) / 2) and pooled["categories"] == 2
 
 
 def test_depth_is_resized_to_the_truth_frame_by_frame() -> None:
@@ -137,8 +141,5 @@ def test_pixels_of_a_long_clip_lie_on_disk(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_a_bug_in_a_metric_is_not_called_unmeasurable(rooms: Rooms) -> None:
     frames = rooms.read(rooms.sequences[0], [0, 2, 4])
-    protocol = clip_protocols("rooms", "test", SETTINGS)[0]
-    wrong = oracle(frames).predict(frames.images)
-    wrong = wrong._replace(extrinsics=wrong.extrinsics[:2])
     with pytest.raises(ValueError, match="2 predicted poses, 3 true ones"):
-        clip_score(oracle(frames), wrong, prepare_truth(clip_of(frames), None), protocol)
+        score_of(frames, prepare_truth(clip_of(frames), None), extrinsics=frames.extrinsics[:2])

@@ -15,8 +15,7 @@ def test_large_arrays_lie_in_a_file_without_a_name(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     assert not isinstance(scratch_array((10, 10), np.float32), np.memmap)
     large = scratch_array((300, 2), np.float32)
-    assert isinstance(large, np.memmap)
-    assert not large.any()
+    assert isinstance(large, np.memmap) and not large.any()
     assert list(tmp_path.iterdir()) == [], "nothing is left behind, however the process ends"
     large[7] = 3.0
     assert large.sum() == 6.0

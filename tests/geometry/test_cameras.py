@@ -84,8 +84,7 @@ def test_pixel_centres_are_integers_and_depth_is_z() -> None:
 
 def test_a_point_in_the_cameras_plane_has_no_pixel() -> None:
     pixels, depth = project(np.array([[1.0, 1.0, 0.0]]), intrinsics())
-    assert depth[0] == 0.0
-    assert np.isnan(pixels).all()
+    assert depth[0] == 0.0 and np.isnan(pixels).all()
 
 
 def test_chosen_pixels_have_the_points_that_all_of_them_have() -> None:

@@ -51,8 +51,7 @@ def test_gradients_are_finite_at_the_identity_and_at_half_turns(angle: float) ->
     matrix = jnp.asarray(axis_angle([0, 0, 1], angle), jnp.float32)
     quaternion = jax.grad(lambda m: matrix_to_quaternion(m).sum())(matrix)
     rotation = jax.grad(lambda m: rotation_angle(m, jnp.eye(3)))(matrix)
-    assert np.isfinite(quaternion).all()
-    assert np.isfinite(rotation).all()
+    assert np.isfinite(quaternion).all() and np.isfinite(rotation).all()
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-5, 0.3, 3.0, np.pi])

@@ -36,8 +36,7 @@ def test_exact_correspondences_give_the_transform(count: int, size: float) -> No
 
 def test_a_mirrored_cloud_still_gives_a_rotation() -> None:
     found = umeyama(points(), points() * [1.0, 1.0, -1.0])
-    assert np.linalg.det(found.rotation) == pytest.approx(1.0)
-    assert found.scale > 0
+    assert np.linalg.det(found.rotation) == pytest.approx(1.0) and found.scale > 0
 
 
 def test_points_without_weight_have_no_influence() -> None:

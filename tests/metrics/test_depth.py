@@ -120,15 +120,13 @@ def test_invalid_target_pixels_do_not_count() -> None:
     prediction = target.copy()
     prediction[0, 0, 0] = 1e6
     errors = depth_metrics(prediction, target, alignment="metric")
-    assert errors["abs_rel"] == 0.0
-    assert errors["valid_pixels"] == 5
+    assert errors["abs_rel"] == 0.0 and errors["valid_pixels"] == 5
 
 
 @pytest.mark.parametrize("alignment", ["scale", "median", "scale_shift"])
 def test_a_prediction_of_zeros_has_no_scale_and_hits_nothing(alignment: str) -> None:
     errors = depth_metrics(np.zeros((1, 4, 5)), np.ones((1, 4, 5)), alignment=alignment)
-    assert np.isnan(errors["abs_rel"])
-    assert errors["delta_1.25"] == 0.0
+    assert np.isnan(errors["abs_rel"]) and errors["delta_1.25"] == 0.0
 
 
 def test_lower_median_takes_the_lower_of_two_middles() -> None:

@@ -126,15 +126,13 @@ def test_icp_turns_given_normals_with_the_points() -> None:
     angle = 0.03
     turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
     metrics = point_cloud_metrics(target @ turn.T, target, prediction_normals=normals @ turn.T, target_normals=normals)
-    assert metrics["acc_mean"] < 1e-6
-    assert metrics["nc_mean"] == pytest.approx(1.0, abs=1e-6)
+    assert metrics["acc_mean"] < 1e-6 and metrics["nc_mean"] == pytest.approx(1.0, abs=1e-6)
 
 
 def test_sampling_keeps_correspondence_and_repeats_with_its_seed() -> None:
     indices = sample_indices(1000, 100, seed=7)
     np.testing.assert_array_equal(indices, sample_indices(1000, 100, seed=7))
-    assert len(np.unique(indices)) == 100
-    assert (np.diff(indices) > 0).all()
+    assert len(np.unique(indices)) == 100 and (np.diff(indices) > 0).all()
     assert not np.array_equal(indices, sample_indices(1000, 100, seed=8))
     np.testing.assert_array_equal(sample_indices(50, 100, seed=7), np.arange(50))
     np.testing.assert_array_equal(sample_indices(50, None, seed=7), np.arange(50))

@@ -26,10 +26,11 @@ from logvggt_jax.weights.checkpoints import digests, load_model, read_provenance
 UNTIMED = ("time", "frames_per_second")
 
 
-@pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch, pixel_model: Any, pixel_params: Any) -> None:
-    """Runs use the model that compiles at once."""
-    _use(monkeypatch, pixel_model, pixel_params)
+@pytest.fixture(autouse=True)
+def quick(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, pixel_model: Any, pixel_params: Any) -> None:
+    """Runs use the model that compiles at once, but for the slow ones."""
+    if request.node.get_closest_marker("slow") is None:
+        _use(monkeypatch, pixel_model, pixel_params)
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +82,6 @@ def _same(a: Any, b: Any) -> None:
 
 # In the middle of a stage, and just after the next one has begun.
 @pytest.mark.parametrize("kill_at", [4, 5])
-@pytest.mark.usefixtures("quick")
 def test_killed_run_goes_on_to_the_same_numbers(
     run_config: TrainConfig, straight: tuple[TrainState, Path], tmp_path: Path, kill_at: int
 ) -> None:
@@ -93,7 +93,6 @@ def test_killed_run_goes_on_to_the_same_numbers(
     assert [entry["step"] for entry in _numbers(tmp_path)] == [1, 2, 3, 4, 5, 6]
 
 
-@pytest.mark.usefixtures("quick")
 def test_sigterm_saves_ends_cleanly_and_can_be_resumed(
     run_config: TrainConfig, straight: tuple[TrainState, Path], tmp_path: Path
 ) -> None:
@@ -101,8 +100,7 @@ def test_sigterm_saves_ends_cleanly_and_can_be_resumed(
     with pytest.MonkeyPatch.context() as patch:
         _at_step(patch, 1, lambda: os.kill(os.getpid(), signal.SIGTERM))
         stopped = train(run_config, tmp_path, mesh=data_mesh(2))
-    assert 1 <= int(stopped.step) <= 2
-    assert signal.getsignal(signal.SIGTERM) == before
+    assert 1 <= int(stopped.step) <= 2 and signal.getsignal(signal.SIGTERM) == before
     with RunCheckpoints(tmp_path, run_config) as checkpoints:
         assert checkpoints.steps == [int(stopped.step)]
     _same(train(run_config, tmp_path, mesh=data_mesh(2)), straight[0])
@@ -121,17 +119,14 @@ def test_second_ctrl_c_is_not_held_back() -> None:
         signal.signal(signal.SIGINT, before)
 
 
-@pytest.mark.usefixtures("quick")
 def test_number_of_devices_may_change(
     run_config: TrainConfig, straight: tuple[TrainState, Path], finished: Path
 ) -> None:
     state = train(run_config, finished, mesh=data_mesh(1), resume_step=4)
-    assert int(state.step) == 6
-    assert len(state.step.devices()) == 1
+    assert int(state.step) == 6 and len(state.step.devices()) == 1
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4), state.params, straight[0].params)
 
 
-@pytest.mark.usefixtures("quick")
 def test_data_that_do_not_fit_the_last_stage_are_an_error_before_the_first(
     run_config: TrainConfig, tmp_path: Path
 ) -> None:
@@ -142,7 +137,6 @@ def test_data_that_do_not_fit_the_last_stage_are_an_error_before_the_first(
     assert not _numbers(tmp_path)
 
 
-@pytest.mark.usefixtures("quick")
 def test_time_limit_ends_the_run_with_a_checkpoint(run_config: TrainConfig, tmp_path: Path) -> None:
     limited = dataclasses.replace(run_config, max_minutes=1e-9)
     # The limit belongs to a session, not to the run: each one gets a step further.
@@ -150,13 +144,11 @@ def test_time_limit_ends_the_run_with_a_checkpoint(run_config: TrainConfig, tmp_
     assert int(train(limited, tmp_path, mesh=data_mesh(1)).step) == 2
 
 
-@pytest.mark.usefixtures("quick")
 def test_finished_run_is_left_alone(run_config: TrainConfig, straight: tuple[TrainState, Path], finished: Path) -> None:
     _same(train(run_config, finished, mesh=data_mesh(2)), straight[0])
     assert _numbers(finished) == _numbers(straight[1])
 
 
-@pytest.mark.usefixtures("quick")
 def test_damaged_checkpoint_is_named_with_the_way_out(
     run_config: TrainConfig, straight: tuple[TrainState, Path], finished: Path
 ) -> None:
@@ -169,7 +161,6 @@ def test_damaged_checkpoint_is_named_with_the_way_out(
     _same(train(run_config, finished, mesh=data_mesh(2), resume_step=4), straight[0])
 
 
-@pytest.mark.usefixtures("quick")
 def test_changed_leaf_is_refused_by_its_digest(
     run_config: TrainConfig, straight: tuple[TrainState, Path], tmp_path: Path
 ) -> None:
@@ -184,20 +175,17 @@ def test_changed_leaf_is_refused_by_its_digest(
             checkpoints.restore(state)
 
 
-@pytest.mark.usefixtures("quick")
 def test_checkpoint_of_another_configuration_is_refused(run_config: TrainConfig, finished: Path) -> None:
     other = dataclasses.replace(run_config, loss=dataclasses.replace(run_config.loss, alpha=0.5))
     with pytest.raises(ValueError, match=r"was written with loss\.alpha=0\.2, the configuration says 0\.5"):
         train(other, finished, mesh=data_mesh(1))
 
 
-@pytest.mark.usefixtures("quick")
 def test_resume_step_that_does_not_exist_is_refused(run_config: TrainConfig, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="no checkpoint of step 5; there are none"):
         train(run_config, tmp_path, mesh=data_mesh(1), resume_step=5)
 
 
-@pytest.mark.usefixtures("quick")
 def test_endless_non_finite_updates_stop_the_run(
     run_config: TrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pixel_params: Any
 ) -> None:
@@ -207,7 +195,6 @@ def test_endless_non_finite_updates_stop_the_run(
         train(run_config, tmp_path, mesh=data_mesh(1))
 
 
-@pytest.mark.usefixtures("quick")
 def test_validation_reports_held_out_clips(run_config: TrainConfig, tmp_path: Path) -> None:
     source = SourceConfig(name="rooms", root=None, split="val", options=run_config.data.sources[0].options)
     validation = ValidationConfig(source=source, every=4, num_clips=4, clip_length=3, stride=2, size=(28, 42))
@@ -221,7 +208,6 @@ def test_validation_reports_held_out_clips(run_config: TrainConfig, tmp_path: Pa
         )
 
 
-@pytest.mark.usefixtures("quick")
 def test_a_run_goes_on_when_its_initial_weights_are_gone(
     run_config: TrainConfig, straight: tuple[TrainState, Path], finished: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -251,7 +237,6 @@ def test_real_model_trains_and_leaves_a_model_folder(run_config: TrainConfig, tm
     assert losses[-1] < losses[0]
 
 
-@pytest.mark.usefixtures("quick")
 def test_workers_may_change_when_a_run_goes_on(
     run_config: TrainConfig, straight: tuple[TrainState, Path], finished: Path
 ) -> None:

@@ -63,8 +63,7 @@ def test_nothing_valid_gives_zero_with_a_finite_gradient() -> None:
         return camera.value() + sum(term.value() for term in terms.values())
 
     value, gradients = jax.value_and_grad(loss, (0, 1, 2))(jnp.ones(shape), jnp.ones(shape), jnp.ones((1, 2, 4, 9)))
-    assert float(value) == 0.0
-    assert all(not np.asarray(gradient).any() for gradient in gradients)
+    assert float(value) == 0.0 and all(not np.asarray(gradient).any() for gradient in gradients)
 
 
 def test_invalid_pixels_have_no_influence() -> None:

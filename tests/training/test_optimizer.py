@@ -71,11 +71,8 @@ def test_weight_decay_falls_on_kernels_alone(
 def test_cosine_warms_up_peaks_and_ends_low(optimizer_config: OptimizerConfig) -> None:
     schedule = learning_rate_schedule(optimizer_config, _stages(60, 40))
     rates = np.array([float(schedule(step)) for step in range(101)])
-    assert rates[0] == 0.0
-    assert rates.argmax() == 25
-    assert rates[25] == pytest.approx(1e-2)
-    assert rates[100] == pytest.approx(1e-4)
-    assert (np.diff(rates[25:]) < 0).all()
+    assert rates[0] == 0.0 and rates.argmax() == 25 and rates[25] == pytest.approx(1e-2)
+    assert rates[100] == pytest.approx(1e-4) and (np.diff(rates[25:]) < 0).all()
 
 
 def test_linear_tail_stays_until_the_last_quarter(optimizer_config: OptimizerConfig) -> None:
@@ -83,14 +80,12 @@ def test_linear_tail_stays_until_the_last_quarter(optimizer_config: OptimizerCon
     schedule = learning_rate_schedule(config, _stages(100))
     rates = np.array([float(schedule(step)) for step in range(101)])
     np.testing.assert_allclose(rates[10:76], 1e-2, rtol=1e-6)
-    assert rates[5] == pytest.approx(5e-3)
-    assert rates[100] == pytest.approx(1e-4)
+    assert rates[5] == pytest.approx(5e-3) and rates[100] == pytest.approx(1e-4)
     np.testing.assert_allclose(np.diff(rates[75:]), (1e-4 - 1e-2) / 25, rtol=1e-3)
 
 
 def test_each_stage_can_have_its_own_schedule(optimizer_config: OptimizerConfig) -> None:
     config = dataclasses.replace(optimizer_config, restart_each_stage=True)
     schedule = learning_rate_schedule(config, _stages(40, 80))
-    assert float(schedule(10)) == pytest.approx(1e-2)
-    assert float(schedule(40)) == 0.0
+    assert float(schedule(10)) == pytest.approx(1e-2) and float(schedule(40)) == 0.0
     assert float(schedule(60)) == pytest.approx(1e-2)

@@ -55,8 +55,7 @@ def test_loss_is_the_mean_over_all_valid_pixels(
     pair = {key: np.concatenate([value[:1], value[7:]]) for key, value in clips.items()}
     both, _ = _gradients(pixel_model, loss_config, data_mesh(2), pixel_params, pair)
     mean = np.mean([metrics["loss/depth_error"] for metrics in alone])
-    assert abs(both["loss/depth_error"] - mean) > 1e-2 * mean
-    assert np.isfinite(whole["loss/total"])
+    assert abs(both["loss/depth_error"] - mean) > 1e-2 * mean and np.isfinite(whole["loss/total"])
 
 
 def test_total_is_the_weighted_sum_of_its_terms(
@@ -108,8 +107,7 @@ def test_steps_learn_and_are_traced_once(
         losses.append(float(metrics["loss/total"]))
     assert traces == 1
     assert jax.tree.map(lambda x: (x.shape, x.dtype, x.weak_type), state) == kinds
-    assert losses[-1] < losses[0]
-    assert int(state.step) == 6
+    assert losses[-1] < losses[0] and int(state.step) == 6
     np.testing.assert_array_equal(state.params["encoder"]["kernel"], pixel_params["encoder"]["kernel"])
 
 
@@ -149,11 +147,9 @@ def test_non_finite_updates_are_skipped_and_counted(
         state, metrics = step(state, bad)
     after = jax.device_get(state)
     jax.tree.map(np.testing.assert_array_equal, (after.params, after.opt_state), (before.params, before.opt_state))
-    assert float(metrics["skipped"]) == 3
-    assert int(after.skipped_in_a_row) == 3
+    assert float(metrics["skipped"]) == 3 and int(after.skipped_in_a_row) == 3
     state, metrics = step(state, good)
-    assert int(state.skipped_in_a_row) == 0
-    assert float(metrics["longest_skip"]) == 3
+    assert int(state.skipped_in_a_row) == 0 and float(metrics["longest_skip"]) == 3
     bias = np.asarray(state.params["camera_head"]["bias"])
     assert np.isfinite(bias).all()
     assert not np.array_equal(bias, before.params["camera_head"]["bias"])

@@ -16,16 +16,12 @@ _POINTS = 2000
 
 
 class Consistency(NamedTuple):
-    """How the depth of one frame agrees with another's.
+    """How the depth of one frame agrees with another's."""
 
-    Attributes:
-      difference: median over the compared pixels of |d - z| / d, where z is the depth carried over and d the depth
-        found there; NaN where no pixel was compared. Occluded pixels count, so that it is a median for a reason.
-      share: compared pixels over pixels with depth in the first frame, 0 to 1.
-    """
-
+    # Median over the compared pixels of |d - z| / d, where z is the depth carried over and d the depth found there; NaN
+    # where no pixel was compared. Occluded pixels count, so that it is a median for a reason.
     difference: float
-    share: float
+    share: float  # compared pixels over pixels with depth in the first frame, 0 to 1
 
 
 def depth_consistency(frames: Frames, first: int, second: int) -> Consistency:

@@ -13,17 +13,11 @@ _LINES, _EXAMPLES = 40, 3
 
 @dataclass(frozen=True)
 class Problem:
-    """Something to mend.
+    """Something to mend."""
 
-    Attributes:
-      kind: as counted, for example `missing file`.
-      sequence: where it was found.
-      message: one line that begins with the file and ends with the mend.
-    """
-
-    kind: str
-    sequence: str
-    message: str
+    kind: str  # as counted, for example `missing file`
+    sequence: str  # where it was found
+    message: str  # one line that begins with the file and ends with the mend
 
 
 @dataclass(frozen=True)
@@ -38,36 +32,22 @@ class DepthRange:
 
 @dataclass(frozen=True)
 class SequenceReport:
-    """One sequence.
+    """One sequence."""
 
-    Attributes:
-      name: as the data set has it.
-      num_frames: frames that count; 0 where they could not be listed.
-      dropped: frames that do not count, by reason (`no pose`).
-      has_poses: whether frames have finite poses.
-      decoded: frames whose files were opened without an error.
-      without_depth: decoded frames in which no pixel has depth.
-      image_size: (H, W) of the pictures handed out; None where none was decoded.
-      depth: None where no pixel of the decoded frames has depth.
-      consistency: median, over pairs of frames, of the median relative difference between the depth of one carried
-        into the other and the depth there (see `consistency`); None where no two frames saw the same.
-      compared_share: median share of pixels that were compared in these pairs.
-      examples: up to two decoded frames, for a picture.
-      problems: found here.
-    """
-
-    name: str
-    num_frames: int = 0
-    dropped: Mapping[str, int] | None = None
-    has_poses: bool = False
-    decoded: int = 0
-    without_depth: int = 0
-    image_size: tuple[int, int] | None = None
-    depth: DepthRange | None = None
+    name: str  # as the data set has it
+    num_frames: int = 0  # frames that count; 0 where they could not be listed
+    dropped: Mapping[str, int] | None = None  # frames that do not count, by reason (`no pose`)
+    has_poses: bool = False  # whether frames have finite poses
+    decoded: int = 0  # frames whose files were opened without an error
+    without_depth: int = 0  # decoded frames in which no pixel has depth
+    image_size: tuple[int, int] | None = None  # (H, W) of the pictures handed out; None where none was decoded
+    depth: DepthRange | None = None  # None where no pixel of the decoded frames has depth
+    # Median, over pairs of frames, of the median relative difference between the depth of one carried into the other
+    # and the depth there (see `consistency`); None where no two frames saw the same.
     consistency: float | None = None
-    compared_share: float | None = None
-    examples: Sequence[int] = ()
-    problems: Sequence[Problem] = ()
+    compared_share: float | None = None  # median share of pixels that were compared in these pairs
+    examples: Sequence[int] = ()  # up to two decoded frames, for a picture
+    problems: Sequence[Problem] = ()  # found here
 
 
 @dataclass(frozen=True)

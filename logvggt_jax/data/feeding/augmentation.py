@@ -13,29 +13,17 @@ _GREY_AXIS = np.array([[0.0, -1.0, 1.0], [1.0, 0.0, -1.0], [-1.0, 1.0, 0.0]]) / 
 
 @dataclass(frozen=True)
 class ColourAugmentation:
-    """Colour jitter, grey pictures and blur, each drawn on its own.
+    """Colour jitter, grey pictures and blur, each drawn on its own."""
 
-    Attributes:
-      shared: probability that one draw serves the whole clip; else every frame has its own.
-      jitter: probability of changed colours.
-      brightness: colours are multiplied by a factor from [1 - brightness, 1 + brightness].
-      contrast: so are their distances from the mean luma.
-      saturation: and their distances from grey.
-      hue: colours are turned about the grey axis by up to this part of a full turn, at most 0.5.
-      grey: probability of pictures without colour.
-      blur: probability of a Gaussian blur.
-      blur_sigma: its smallest and largest standard deviation in pixels.
-    """
-
-    shared: float
-    jitter: float
-    brightness: float
-    contrast: float
-    saturation: float
-    hue: float
-    grey: float
-    blur: float
-    blur_sigma: tuple[float, float]
+    shared: float  # probability that one draw serves the whole clip; else every frame has its own
+    jitter: float  # probability of changed colours
+    brightness: float  # colours are multiplied by a factor from [1 - brightness, 1 + brightness]
+    contrast: float  # so are their distances from the mean luma
+    saturation: float  # and their distances from grey
+    hue: float  # colours are turned about the grey axis by up to this part of a full turn, at most 0.5
+    grey: float  # probability of pictures without colour
+    blur: float  # probability of a Gaussian blur
+    blur_sigma: tuple[float, float]  # its smallest and largest standard deviation in pixels
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "blur_sigma", tuple(self.blur_sigma))

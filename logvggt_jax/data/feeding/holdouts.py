@@ -15,16 +15,12 @@ _SHOWN = 10
 
 @dataclass(frozen=True)
 class HoldOut:
-    """What of one data set is kept for evaluation; both rules apply where both are given.
+    """What of one data set is kept for evaluation; both rules apply where both are given."""
 
-    Attributes:
-      names: patterns with the wildcards of `fnmatch`. A sequence is held out if one matches its name or one part
-        of the name between slashes: `Scene20` holds out `Scene20/clone/Camera_0`.
-      split: a split of the same data set, all of whose sequences are held out.
-    """
-
+    # Patterns with the wildcards of `fnmatch`. A sequence is held out if one matches its name or one part of the name
+    # between slashes: `Scene20` holds out `Scene20/clone/Camera_0`.
     names: tuple[str, ...] = ()
-    split: str | None = None
+    split: str | None = None  # a split of the same data set, all of whose sequences are held out
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "names", tuple(self.names))

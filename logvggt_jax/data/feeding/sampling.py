@@ -21,37 +21,15 @@ class CovisibleDataset(Protocol):
         ...
 
 
-class Sampler(Protocol):
-    """Chooses the frames of a clip."""
-
-    @property
-    def requirement(self) -> str:
-        """What a sequence needs to hold a clip, for messages."""
-        ...
-
-    def fits(self, dataset: Dataset, sequence: str) -> bool:
-        """Whether a clip fits into the sequence."""
-        ...
-
-    def draw(self, dataset: Dataset, sequence: str, rng: np.random.Generator) -> np.ndarray:
-        """Frame indices [length] int64 of one clip."""
-        ...
-
-
 @dataclass(frozen=True)
 class ClipSampler:
-    """Clips of evenly spaced frames in time order, with random stride, start and direction.
+    """Clips of evenly spaced frames in time order, with random stride, start and direction."""
 
-    Attributes:
-      length: frames of a clip.
-      stride: smallest and largest distance between neighbouring frames; drawn uniformly from the strides with
-        which a clip fits into the sequence.
-      reverse: probability that a clip runs backwards in time.
-    """
-
-    length: int
+    length: int  # frames of a clip
+    # Smallest and largest distance between neighbouring frames; drawn uniformly from the strides with which a clip fits
+    # into the sequence.
     stride: tuple[int, int] = (1, 1)
-    reverse: float = 0.5
+    reverse: float = 0.5  # probability that a clip runs backwards in time
 
     def __post_init__(self) -> None:
         _check_length(self.length)
@@ -103,12 +81,9 @@ class CovisibilityWalk:
     The walk starts anywhere and goes on to a neighbour not yet visited, with a probability in proportion to its
     score. Where there is none it steps back to the last frame that still has one, so that every frame after the first
     sees something that an earlier one sees. Neighbourhood counts in both directions, with the larger score.
-
-    Attributes:
-      length: frames of a clip.
     """
 
-    length: int
+    length: int  # frames of a clip
 
     def __post_init__(self) -> None:
         _check_length(self.length)
@@ -164,6 +139,10 @@ class CovisibilityWalk:
             if len(part) >= self.length:
                 starts.extend(part)
         return sorted(starts)
+
+
+Sampler = ClipSampler | CovisibilityWalk
+"""Chooses the frames of a clip."""
 
 
 def sampler_for(dataset: Dataset, *, length: int, stride: tuple[int, int], reverse: float) -> Sampler:

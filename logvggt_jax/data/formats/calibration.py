@@ -14,6 +14,8 @@ OPENGL_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 _ROTATION_TOLERANCE = 0.01
 # Focal length over the longer edge: a full circle's fisheye is below, a telescope above.
 _FOCAL_RANGE = (0.1, 50.0)
+# Cameras of these sets have square pixels; 4:3 for 3:4 or 16:9 for 4:3 is a factor of 1.3 or more.
+_PIXEL_ASPECT = 1.2
 
 
 def numbers(text: str, where: str | Path, *, count: int | None = None) -> np.ndarray:
@@ -91,3 +93,23 @@ def check_intrinsics(intrinsics: np.ndarray, size: tuple[int, int], where: str |
             f"{where}: intrinsics fx={fx:g} fy={fy:g} cx={cx:g} cy={cy:g} cannot belong to a picture of "
             f"{width} x {height}: fetch the calibration again"
         )
+
+
+def relative(intrinsics: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Intrinsics [3, 3] in pixels of a picture of `size` (H, W) as those of a picture of one pixel."""
+    return scaled(intrinsics, 1 / size[1], 1 / size[0])
+
+
+def in_pixels(intrinsics: np.ndarray, size: tuple[int, int], picture: Path) -> np.ndarray:
+    """Intrinsics [3, 3] of a picture of one pixel as those of `picture`, which has `size` (H, W).
+
+    Raises InputError naming `picture` where its pixels would be far from square: it was turned or cropped.
+    """
+    matrix = scaled(intrinsics, size[1], size[0])
+    aspect = matrix[0, 0] / matrix[1, 1]
+    if not 1 / _PIXEL_ASPECT < aspect < _PIXEL_ASPECT:
+        raise InputError(
+            f"{picture}: a picture of {size[1]} x {size[0]} does not have the shape of its calibration (fx / fy would "
+            f"be {aspect:.3g}, expected about 1): fetch both again"
+        )
+    return matrix

@@ -22,11 +22,10 @@ import numpy as np
 
 from logvggt_jax.data.dataset import TRAINING, About
 from logvggt_jax.data.errors import UnequalSizes
-from logvggt_jax.data.formats.calibration import numbers, pinhole
+from logvggt_jax.data.formats.calibration import in_pixels, numbers, pinhole, relative
 from logvggt_jax.data.formats.image import read_depth, read_rgb
 from logvggt_jax.data.formats.pose_track import PoseTrack
 from logvggt_jax.data.formats.quarter_turns import turned_extrinsics, turned_intrinsics, turns_to_upright
-from logvggt_jax.data.formats.relative_intrinsics import in_pixels, relative
 from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.data.readers.folder_dataset import NO_POSES, Dropped, FolderDataset, FrameRecord
 from logvggt_jax.errors import InputError

@@ -19,8 +19,8 @@ import numpy as np
 
 from logvggt_jax.data.dataset import EVALUATION, TRAINING, About
 from logvggt_jax.data.errors import EmptySplit, MissingFiles, UnequalSizes, missing_files
+from logvggt_jax.data.formats.calibration import in_pixels, relative
 from logvggt_jax.data.formats.image import read_depth, read_rgb
-from logvggt_jax.data.formats.relative_intrinsics import in_pixels, relative
 from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.data.formats.split_lists import sequences_present
 from logvggt_jax.data.readers.co3d_annotations import FrameAnnotation, frame_annotations, quality_scores

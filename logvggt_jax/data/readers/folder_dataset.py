@@ -31,27 +31,16 @@ _GAPS = (30, 10, 5, 2, 1)
 
 @dataclass(frozen=True)
 class FrameRecord:
-    """One frame before its pictures are opened.
+    """One frame before its pictures are opened."""
 
-    Attributes:
-      name: unique in its sequence.
-      image: colour picture.
-      depth: depth in the set's own encoding.
-      intrinsics: [3, 3] float64, pixels as the set's reader needs them (its `_read_frame` decides).
-      extrinsics: [4, 4] float64, world-to-camera, rigid; NaN in sets without poses.
-      companion: a third file that the frame needs, such as a mask of valid depth or its calibration.
-      depth_scale: factor on the stored depth, where frames differ.
-      quarter_turns: counter-clockwise quarter turns from the stored picture to the one handed out.
-    """
-
-    name: str
-    image: Path
-    depth: Path
-    intrinsics: np.ndarray
-    extrinsics: np.ndarray
-    companion: Path | None = None
-    depth_scale: float = 1.0
-    quarter_turns: int = 0
+    name: str  # unique in its sequence
+    image: Path  # colour picture
+    depth: Path  # depth in the set's own encoding
+    intrinsics: np.ndarray  # [3, 3] float64, pixels as the set's reader needs them (its `_read_frame` decides)
+    extrinsics: np.ndarray  # [4, 4] float64, world-to-camera, rigid; NaN in sets without poses
+    companion: Path | None = None  # a third file that the frame needs, such as a mask of valid depth or its calibration
+    depth_scale: float = 1.0  # factor on the stored depth, where frames differ
+    quarter_turns: int = 0  # counter-clockwise quarter turns from the stored picture to the one handed out
 
 
 _FIELDS = tuple(field.name for field in fields(FrameRecord))

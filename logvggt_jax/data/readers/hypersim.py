@@ -148,17 +148,11 @@ class HyperSim(FolderDataset):
 
 @dataclass(frozen=True)
 class _Camera:
-    """What the camera table says of a scene.
+    """What the camera table says of a scene."""
 
-    Attributes:
-      intrinsics: [3, 3], from points of the turned camera to the picture's plane, -1 to 1 across and down.
-      rotation: [3, 3], from the stored camera with OpenCV axes to the turned one.
-      skew: pixels, at the table's picture width.
-    """
-
-    intrinsics: np.ndarray
-    rotation: np.ndarray
-    skew: float
+    intrinsics: np.ndarray  # [3, 3], from points of the turned camera to the picture's plane, -1 to 1 across and down
+    rotation: np.ndarray  # [3, 3], from the stored camera with OpenCV axes to the turned one
+    skew: float  # pixels, at the table's picture width
 
 
 def _table_lines(files: SourceFiles, path: Path) -> dict[str, list[str]]:

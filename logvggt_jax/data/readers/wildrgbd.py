@@ -16,10 +16,9 @@ import numpy as np
 
 from logvggt_jax.data.dataset import TRAINING, About
 from logvggt_jax.data.errors import missing_files
-from logvggt_jax.data.formats.calibration import numbers, world_to_camera
+from logvggt_jax.data.formats.calibration import in_pixels, numbers, relative, world_to_camera
 from logvggt_jax.data.formats.image import read_depth, read_rgb
 from logvggt_jax.data.formats.numbered_files import numbered_frames
-from logvggt_jax.data.formats.relative_intrinsics import in_pixels, relative
 from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.data.formats.split_lists import sequences_present
 from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame

@@ -31,24 +31,15 @@ class Textures:
 
     wave_k(p) = sin(frequency[k] . p + phase[k]). The mixing weight between the two colours is
     1/2 + 1/2 (pattern_weight * clip(wave_4 wave_5 / edge) + (1 - pattern_weight) * mean(wave_0 … wave_3)).
-
-    Attributes:
-      colour: [2, 3, S], RGB in [0, 1].
-      frequency: [WAVES, 3, S], radians a metre.
-      phase: [WAVES, S].
-      pattern_weight: [S].
-      edge: [S], softness of the pattern's edges; 1 is a sine wave, small values are sharp.
-      pattern_frequency: [S], radians a metre, of the finer of the pattern's waves.
-      shade: [4, S], brightness as an affine function of p: shade[:3] . p + shade[3].
     """
 
-    colour: np.ndarray
-    frequency: np.ndarray
-    phase: np.ndarray
-    pattern_weight: np.ndarray
-    edge: np.ndarray
-    pattern_frequency: np.ndarray
-    shade: np.ndarray
+    colour: np.ndarray  # [2, 3, S], RGB in [0, 1]
+    frequency: np.ndarray  # [WAVES, 3, S], radians a metre
+    phase: np.ndarray  # [WAVES, S]
+    pattern_weight: np.ndarray  # [S]
+    edge: np.ndarray  # [S], softness of the pattern's edges; 1 is a sine wave, small values are sharp
+    pattern_frequency: np.ndarray  # [S], radians a metre, of the finer of the pattern's waves
+    shade: np.ndarray  # [4, S], brightness as an affine function of p: shade[:3] . p + shade[3].
 
 
 @dataclass(frozen=True)

@@ -14,22 +14,14 @@ class Trajectory:
     """A closed camera path: position, yaw, pitch and roll as sums of harmonics of one phase.
 
     The world is OpenCV-like: x right, y down, z forward, metres, origin in the middle of the room.
-
-    Attributes:
-      centre: [3] float64 mean position.
-      amplitude: [3, HARMONICS] float64 metres.
-      phase: [3, HARMONICS] float64 radians.
-      heading: yaw at phase 0, radians.
-      turns: full turns of the yaw in one period: -1, 0 or 1.
-      swing: [3, 2] float64, amplitude and phase in radians of the harmonic part of yaw, pitch and roll.
     """
 
-    centre: np.ndarray
-    amplitude: np.ndarray
-    phase: np.ndarray
-    heading: float
-    turns: int
-    swing: np.ndarray
+    centre: np.ndarray  # [3] float64 mean position
+    amplitude: np.ndarray  # [3, HARMONICS] float64 metres
+    phase: np.ndarray  # [3, HARMONICS] float64 radians
+    heading: float  # yaw at phase 0, radians
+    turns: int  # full turns of the yaw in one period: -1, 0 or 1
+    swing: np.ndarray  # [3, 2] float64, amplitude and phase in radians of the harmonic part of yaw, pitch and roll
 
     def facing_north(self) -> Trajectory:
         """The same path, looking about the wall at +z: the yaw swings by 60 degrees to either side."""

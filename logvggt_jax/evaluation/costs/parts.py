@@ -23,19 +23,12 @@ PARTS = ("encoder", "backbone", "dense head", "GCCR", "camera head")
 
 @dataclasses.dataclass(frozen=True)
 class Part:
-    """A program that a sequence runs `calls` times.
+    """A program that a sequence runs `calls` times."""
 
-    Attributes:
-      name: one of `PARTS`; several programs may have one name.
-      function: of the variables and `arguments`.
-      arguments: abstract ones, `jax.ShapeDtypeStruct` and pytrees of them, with a batch of one.
-      calls: in the whole sequence.
-    """
-
-    name: str
-    function: Callable[..., Any]
-    arguments: tuple[Any, ...]
-    calls: int
+    name: str  # one of `PARTS`; several programs may have one name
+    function: Callable[..., Any]  # of the variables and `arguments`
+    arguments: tuple[Any, ...]  # abstract ones, `jax.ShapeDtypeStruct` and pytrees of them, with a batch of one
+    calls: int  # in the whole sequence
 
 
 @dataclasses.dataclass(frozen=True)

@@ -32,15 +32,10 @@ _MODES = ("full", "gccr_online")
 
 @dataclasses.dataclass(frozen=True)
 class TimingConfig:
-    """The sequences that are timed.
+    """The sequences that are timed."""
 
-    Attributes:
-      lengths: frames of each; none of them times nothing.
-      rounds: times that each is run, after once that does not count.
-    """
-
-    lengths: tuple[int, ...] = (100, 200, 500, 1000)
-    rounds: int = 3
+    lengths: tuple[int, ...] = (100, 200, 500, 1000)  # frames of each; none of them times nothing
+    rounds: int = 3  # times that each is run, after once that does not count
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "lengths", tuple(sorted(self.lengths)))

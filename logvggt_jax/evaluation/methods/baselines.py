@@ -15,19 +15,12 @@ from logvggt_jax.model.logvggt import LogVGGT
 
 @dataclasses.dataclass(frozen=True)
 class DepthStatistics:
-    """What the depth baselines know.
+    """What the depth baselines know."""
 
-    Attributes:
-      mean_depth: mean over all valid pixels.
-      mean_map: [H, W] mean over the valid frames of each pixel; `mean_depth` where none is valid.
-      intrinsics: [3, 3] mean, pixels of [H, W].
-      source: the frames that these are means of, in words.
-    """
-
-    mean_depth: float
-    mean_map: np.ndarray
-    intrinsics: np.ndarray
-    source: str
+    mean_depth: float  # mean over all valid pixels
+    mean_map: np.ndarray  # [H, W] mean over the valid frames of each pixel; `mean_depth` where none is valid
+    intrinsics: np.ndarray  # [3, 3] mean, pixels of [H, W]
+    source: str  # the frames that these are means of, in words
 
 
 def depth_statistics(

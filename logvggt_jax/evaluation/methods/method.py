@@ -19,32 +19,20 @@ from logvggt_jax.weights.checkpoints import digests, load_model
 
 
 class ClipPrediction(NamedTuple):
-    """Prediction of one clip, numpy arrays (depth may be a memory map); any unit of length, any world.
+    """Prediction of one clip, numpy arrays (depth may be a memory map); any unit of length, any world."""
 
-    Attributes:
-      depth: [T, H, W] z-depth; None if the method does not predict any.
-      extrinsics: [T, 3, 4] or [T, 4, 4], world-to-camera (OpenCV).
-      intrinsics: [T, 3, 3], pixels of the clip's images; None with `depth`.
-    """
-
-    depth: np.ndarray | None
-    extrinsics: np.ndarray
-    intrinsics: np.ndarray | None
+    depth: np.ndarray | None  # [T, H, W] z-depth; None if the method does not predict any
+    extrinsics: np.ndarray  # [T, 3, 4] or [T, 4, 4], world-to-camera (OpenCV)
+    intrinsics: np.ndarray | None  # [T, 3, 3], pixels of the clip's images; None with `depth`
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """A model that rows are made of.
+    """A model that rows are made of."""
 
-    Attributes:
-      model: the model.
-      variables: {"params": …}, on the device.
-      digest: of the parameters.
-    """
-
-    model: LogVGGT
-    variables: Variables
-    digest: str
+    model: LogVGGT  # the model
+    variables: Variables  # {"params": …}, on the device
+    digest: str  # of the parameters
 
     @classmethod
     def load(cls, path: str | Path) -> Checkpoint:
@@ -55,31 +43,22 @@ class Checkpoint:
 
 @dataclasses.dataclass(frozen=True)
 class Method:
-    """A row of the table.
+    """A row of the table."""
 
-    Attributes:
-      name: label of the row.
-      knows: what the method was given besides the images, in words, for the reader of the table.
-      predict: images [T, H, W, 3] uint8, a memory map where they are many, to the clip's prediction; raises
-        PredictionError where it has none.
-      identity: what decides the predictions of given images besides the code, as JSON values: sizes, parameters,
-        settings. What it does not name is taken for unchanged by a later run.
-      start: opens the predictor behind `predict`, to be timed; None for what has none.
-      depth: whether depth is measured.
-      pose: whether poses are measured.
-      points: whether the point cloud is measured.
-      static: the camera never moves by construction; its ATE is then the trajectory's RMS radius, since no
-        similarity exists.
-    """
-
-    name: str
-    knows: str
+    name: str  # label of the row
+    knows: str  # what the method was given besides the images, in words, for the reader of the table
+    # Images [T, H, W, 3] uint8, a memory map where they are many, to the clip's prediction; raises PredictionError
+    # where it has none.
     predict: Callable[[np.ndarray], ClipPrediction]
+    # What decides the predictions of given images besides the code, as JSON values: sizes, parameters, settings. What
+    # it does not name is taken for unchanged by a later run.
     identity: Any = None
+    # Opens the predictor behind `predict`, to be timed; None for what has none.
     start: Callable[[], Predictor] | None = None
-    depth: bool = True
-    pose: bool = True
-    points: bool = True
+    depth: bool = True  # whether depth is measured
+    pose: bool = True  # whether poses are measured
+    points: bool = True  # whether the point cloud is measured
+    # The camera never moves by construction; its ATE is then the trajectory's RMS radius, since no similarity exists.
     static: bool = False
 
 

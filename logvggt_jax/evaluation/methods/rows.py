@@ -11,18 +11,13 @@ from logvggt_jax.streaming import METHODS, ChunkPlan, OfflineSettings
 
 @dataclasses.dataclass(frozen=True)
 class ReferenceConfig:
-    """Limits of the reference rows (`references` in configs/eval).
+    """Limits of the reference rows (`references` in configs/eval)."""
 
-    Attributes:
-      max_frames: longest clip that VGGT offline takes, whose memory and time grow with the square of the frames;
-        longer ones count as failed for it. None for no limit.
-      chunk_size: frames of a chunk.
-      chunk_overlap: frames that neighbouring chunks share.
-    """
-
+    # Longest clip that VGGT offline takes, whose memory and time grow with the square of the frames; longer ones count
+    # as failed for it. None for no limit.
     max_frames: int | None = 200
-    chunk_size: int = 60
-    chunk_overlap: int = 30
+    chunk_size: int = 60  # frames of a chunk
+    chunk_overlap: int = 30  # frames that neighbouring chunks share
 
     def __post_init__(self) -> None:
         self.offline()

@@ -16,19 +16,12 @@ from logvggt_jax.streaming import StreamSession
 
 @dataclasses.dataclass(frozen=True)
 class Variant:
-    """What differs from the full model: cross-window attention, and one refinement over all frames at the end.
+    """What differs from the full model: cross-window attention, and one refinement over all frames at the end."""
 
-    Attributes:
-      label: of the row.
-      windows: fields of `WindowConfig`.
-      refinement: fields of `RefinementConfig`.
-      online: refinement after every window.
-    """
-
-    label: str
-    windows: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    refinement: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    online: bool = False
+    label: str  # of the row
+    windows: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # fields of `WindowConfig`
+    refinement: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # fields of `RefinementConfig`
+    online: bool = False  # refinement after every window
 
     def config(self, base: ModelConfig, *, context: int | None = None) -> ModelConfig:
         """A checkpoint's configuration `base`, changed.

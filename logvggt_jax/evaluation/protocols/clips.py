@@ -11,29 +11,18 @@ from logvggt_jax.evaluation.protocols.protocol import DepthMeasure, PointsMeasur
 
 @dataclasses.dataclass(frozen=True)
 class ClipSettings:
-    """Which clips are cut and how they are compared (`evaluation` in configs/eval/rooms.py and its like).
+    """Which clips are cut and how they are compared (`evaluation` in configs/eval/rooms.py and its like)."""
 
-    Attributes:
-      image_size: (H, W) of the model's input, multiples of 14; frames are resized and cropped to it.
-      clip_lengths: frames of a clip.
-      stride: frames of the sequence from one frame of a clip to the next.
-      clips_per_sequence: clips with evenly spaced starts in each sequence.
-      max_sequences: only that many first sequences; None takes all.
-      max_points: points compared in each clip, drawn at random, the same for prediction and truth; None takes all.
-      icp_threshold: metres, of the ICP before the point metrics; None leaves it out.
-      seed: of the drawn points.
-      figures: clips of each length that are drawn, for the first method.
-    """
-
-    image_size: tuple[int, int]
-    clip_lengths: tuple[int, ...]
-    stride: int = 1
-    clips_per_sequence: int = 1
-    max_sequences: int | None = None
+    image_size: tuple[int, int]  # (H, W) of the model's input, multiples of 14; frames are resized and cropped to it
+    clip_lengths: tuple[int, ...]  # frames of a clip
+    stride: int = 1  # frames of the sequence from one frame of a clip to the next
+    clips_per_sequence: int = 1  # clips with evenly spaced starts in each sequence
+    max_sequences: int | None = None  # only that many first sequences; None takes all
+    # Points compared in each clip, drawn at random, the same for prediction and truth; None takes all.
     max_points: int | None = 20_000
-    icp_threshold: float | None = 0.1
-    seed: int = 0
-    figures: int = 1
+    icp_threshold: float | None = 0.1  # metres, of the ICP before the point metrics; None leaves it out
+    seed: int = 0  # of the drawn points
+    figures: int = 1  # clips of each length that are drawn, for the first method
 
     def __post_init__(self) -> None:
         if any(side < 14 or side % 14 for side in self.image_size):

@@ -13,72 +13,45 @@ from logvggt_jax.evaluation.protocols.images import ImageRule
 
 @dataclasses.dataclass(frozen=True)
 class DepthMeasure:
-    """Depth errors of a clip, pooled over its valid pixels.
+    """Depth errors of a clip, pooled over its valid pixels."""
 
-    Attributes:
-      max_depth: metres; true depth from here on is not valid. None for no bound.
-      clip: metres; bound put on the aligned prediction. None for none.
-      alignments: all are computed; `scale` (one scale a clip) is what the paper's tables are compared with.
-    """
-
-    max_depth: float | None = None
-    clip: float | None = None
+    max_depth: float | None = None  # metres; true depth from here on is not valid. None for no bound.
+    clip: float | None = None  # metres; bound put on the aligned prediction. None for none.
+    # All are computed; `scale` (one scale a clip) is what the paper's tables are compared with.
     alignments: tuple[str, ...] = ("scale", "median")
 
 
 @dataclasses.dataclass(frozen=True)
 class PointsMeasure:
-    """Accuracy, completeness and normal consistency of the cloud of all frames.
+    """Accuracy, completeness and normal consistency of the cloud of all frames."""
 
-    Attributes:
-      crop: pixels; only the middle crop x crop pixels of each frame count. None for all.
-      max_points: points compared, drawn at random, the same for prediction and truth; None for all.
-      icp_threshold: metres; None leaves the ICP out.
-      seed: of the drawn points.
-    """
-
-    crop: int | None = None
+    crop: int | None = None  # pixels; only the middle crop x crop pixels of each frame count. None for all.
+    # Points compared, drawn at random, the same for prediction and truth; None for all.
     max_points: int | None = 1_000_000
-    icp_threshold: float | None = 0.1
-    seed: int = 0
+    icp_threshold: float | None = 0.1  # metres; None leaves the ICP out
+    seed: int = 0  # of the drawn points
 
 
 @dataclasses.dataclass(frozen=True)
 class Protocol:
-    """A benchmark.
+    """A benchmark."""
 
-    Attributes:
-      name: unique, fit for a file name.
-      title: for tables.
-      dataset: one of `logvggt_jax.data.DATASETS`.
-      splits: the first of these that the folder has is evaluated.
-      frames: clips of a sequence.
-      images: what the network sees.
-      depth: None where depth is not measured.
-      points: None where the cloud is not measured.
-      poses: whether relative poses (RRA, RTA, AUC) are measured.
-      trajectory: whether ATE is measured.
-      sequences: pattern that the whole name of a sequence must match.
-      expected: sequences that the complete benchmark has, None where it depends on the split's list.
-      pooled: pairs of poses are pooled over the sequences of a category (the name's first part), and the mean is
-        over categories; otherwise it is over sequences.
-      decisions: what the paper leaves open, as decided here; printed with the results.
-    """
-
-    name: str
-    title: str
-    dataset: str
-    splits: tuple[str, ...]
-    frames: FrameSelection
-    images: ImageRule
-    depth: DepthMeasure | None = None
-    points: PointsMeasure | None = None
-    poses: bool = False
-    trajectory: bool = False
-    sequences: str = r".*"
-    expected: int | None = None
+    name: str  # unique, fit for a file name
+    title: str  # for tables
+    dataset: str  # one of `logvggt_jax.data.DATASETS`
+    splits: tuple[str, ...]  # the first of these that the folder has is evaluated
+    frames: FrameSelection  # clips of a sequence
+    images: ImageRule  # what the network sees
+    depth: DepthMeasure | None = None  # None where depth is not measured
+    points: PointsMeasure | None = None  # None where the cloud is not measured
+    poses: bool = False  # whether relative poses (RRA, RTA, AUC) are measured
+    trajectory: bool = False  # whether ATE is measured
+    sequences: str = r".*"  # pattern that the whole name of a sequence must match
+    expected: int | None = None  # sequences that the complete benchmark has, None where it depends on the split's list
+    # Pairs of poses are pooled over the sequences of a category (the name's first part), and the mean is over
+    # categories; otherwise it is over sequences.
     pooled: bool = False
-    decisions: tuple[str, ...] = ()
+    decisions: tuple[str, ...] = ()  # what the paper leaves open, as decided here; printed with the results
 
     def __post_init__(self) -> None:
         if self.points is not None and not self.images.keeps_grid:
@@ -110,22 +83,15 @@ class Protocol:
 
 @dataclasses.dataclass(frozen=True)
 class ProtocolSettings:
-    """What all benchmarks of the paper share (`protocol` in configs/eval/paper.py).
+    """What all benchmarks of the paper share (`protocol` in configs/eval/paper.py)."""
 
-    Attributes:
-      longer_edge: pixels of the network's images, a multiple of 14; 518 is the paper's. The middle crop of
-        reconstruction scales with it.
-      max_points: of `PointsMeasure`.
-      icp_threshold: of `PointsMeasure`.
-      seed: of drawn frames and points.
-      rooms: options of procedural rooms.
-    """
-
+    # Pixels of the network's images, a multiple of 14; 518 is the paper's. The middle crop of reconstruction scales
+    # with it.
     longer_edge: int = 518
-    max_points: int | None = 1_000_000
-    icp_threshold: float | None = 0.1
-    seed: int = 0
-    rooms: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    max_points: int | None = 1_000_000  # of `PointsMeasure`
+    icp_threshold: float | None = 0.1  # of `PointsMeasure`
+    seed: int = 0  # of drawn frames and points
+    rooms: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # options of procedural rooms
 
     def __post_init__(self) -> None:
         if self.longer_edge < 28 or self.longer_edge % 14:

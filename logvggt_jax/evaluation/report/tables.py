@@ -90,7 +90,7 @@ def benchmark_tables(results: Mapping[str, Any]) -> list[Table]:
                 continue
             columns = [column for column in section.columns if column.group in asked]
             shown = [entry for entry in entries if any(_count(entry, group) for group in asked)]
-            header = ["method", *(_arrow(column) for column in columns), "clips"]
+            headings = [f"{column.heading} {'↑' if column.more_is_better else '↓'}" for column in columns]
             bests = [_best(shown, column) for column in columns]
             rows = [
                 [
@@ -103,7 +103,7 @@ def benchmark_tables(results: Mapping[str, Any]) -> list[Table]:
                 ]
                 for entry in shown
             ]
-            made.append(Table(f"{section.title}, {benchmark['title']}", header, rows))
+            made.append(Table(f"{section.title}, {benchmark['title']}", ["method", *headings, "clips"], rows))
     return made
 
 
@@ -113,8 +113,9 @@ def coverage_table(results: Mapping[str, Any]) -> Table:
     rows = []
     for benchmark in results["benchmarks"]:
         used = benchmark["frames_used"]
-        measured = max((e["clips_measured"] for e in _entries(results, benchmark["name"])), default=0)
-        state = _state(benchmark, measured)
+        measured = max(
+            (e["clips_measured"] for e in results["summary"] if e["benchmark"] == benchmark["name"]), default=0
+        )
         rows.append(
             [
                 benchmark["name"],
@@ -123,7 +124,7 @@ def coverage_table(results: Mapping[str, Any]) -> Table:
                 f"{measured}/{benchmark['planned']}",
                 "all" if benchmark["wanted"] is None else str(benchmark["wanted"]),
                 "-" if used is None else (str(used[0]) if used[0] == used[1] else f"{used[0]} to {used[1]}"),
-                state,
+                _state(benchmark, measured),
             ]
         )
     return Table("Benchmarks", header, rows)
@@ -138,20 +139,12 @@ def _state(benchmark: Mapping[str, Any], measured: int) -> str:
     return "complete, some sequences shorter" if short else "complete"
 
 
-def _entries(results: Mapping[str, Any], name: str) -> list[dict[str, Any]]:
-    return [entry for entry in results["summary"] if entry["benchmark"] == name]
-
-
 def _asked(entry: Mapping[str, Any], group: str) -> bool:
     return f"clips_{group}" in entry
 
 
 def _count(entry: Mapping[str, Any], group: str) -> int:
     return int(entry.get(f"clips_{group}", 0))
-
-
-def _arrow(column: Column) -> str:
-    return f"{column.heading} {'↑' if column.more_is_better else '↓'}"
 
 
 def _best(entries: Sequence[Mapping[str, Any]], column: Column) -> float | None:

@@ -4,7 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from analytic_room import camera_to_world, disagreement, pinhole, view
+from analytic_room import disagreement, pinhole
+from room_views import frames_of, room_views
 
 from logvggt_jax.data import open_dataset
 from logvggt_jax.data.checks.consistency import depth_consistency, visible_shares
@@ -15,16 +16,7 @@ SIZE = (48, 64)
 
 @pytest.fixture
 def room() -> Frames:
-    intrinsics = pinhole(SIZE, 40.0)
-    poses = np.stack([camera_to_world(index) for index in (0, 4)])
-    views = [view(pose, intrinsics, SIZE) for pose in poses]
-    return Frames(
-        images=np.stack([picture for picture, _ in views]),
-        depth=np.stack([depth for _, depth in views]).astype(np.float32),
-        intrinsics=np.stack([intrinsics] * 2).astype(np.float32),
-        extrinsics=np.linalg.inv(poses).astype(np.float32),
-        metric=True,
-    )
+    return frames_of(room_views(5, pinhole(SIZE, 40.0), SIZE)[::4])
 
 
 def test_true_cameras_agree_and_the_figure_is_the_independent_one(room: Frames):
@@ -51,8 +43,7 @@ def test_pixels_without_depth_are_not_compared(room: Frames):
     assert depth_consistency(room, 0, 1).share < 1
     room.depth[1] = 0
     difference, share = depth_consistency(room, 0, 1)
-    assert np.isnan(difference) and share == 0
-    assert depth_consistency(room, 1, 0).share == 0
+    assert np.isnan(difference) and share == 0 and depth_consistency(room, 1, 0).share == 0
 
 
 def test_visible_shares_say_which_cameras_see_the_frame(room: Frames):
@@ -74,5 +65,4 @@ def test_real_frames_have_the_figure_that_their_description_gives(seven_scenes_d
         right.append(metres * depth_consistency(frames, 0, 1).difference)
         swapped = frames._replace(extrinsics=np.linalg.inv(frames.extrinsics))
         wrong.append(metres * depth_consistency(swapped, 0, 1).difference)
-    assert 0.006 < np.median(right) < 0.014
-    assert 0.14 < np.median(wrong) < 0.57
+    assert 0.006 < np.median(right) < 0.014 and 0.14 < np.median(wrong) < 0.57

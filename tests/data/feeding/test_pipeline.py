@@ -82,6 +82,13 @@ class Flaky(Numbered):
         return super().read(sequence, indices)
 
 
+class Gone(Numbered):
+    """Like `Numbered`; nothing can be read."""
+
+    def read(self, sequence: str, indices) -> Frames:
+        raise MissingFiles(f"{sequence}.png: no such file")
+
+
 def batches(datasets=None, **changes):
     options = {"clip_length": 3, "batch_size": 4, "sizes": [(14, 28)], "seed": 5, "stride": (1, 3), **changes}
     return training_batches(datasets or {"numbered": Numbered(8)}, **options)
@@ -291,8 +298,7 @@ def test_replaced_clips_are_the_same_after_resuming_and_for_any_number_of_worker
     for workers in (0, 2):
         with batches(**options, worker_count=workers) as iterator:
             iterator.set_state(state)
-            assert clips(iterator, 5) == expected
-            assert iterator.broken.get_state() == total
+            assert clips(iterator, 5) == expected and iterator.broken.get_state() == total
 
 
 def test_too_many_broken_clips_end_the_run_with_their_names():
@@ -306,10 +312,6 @@ def test_too_many_broken_clips_end_the_run_with_their_names():
 
 
 def test_a_set_that_cannot_be_read_at_all_ends_the_run():
-    class Gone(Numbered):
-        def read(self, sequence: str, indices) -> Frames:
-            raise MissingFiles(f"{sequence}.png: no such file")
-
     with (
         batches({"gone": Gone(8)}, max_broken=0.9) as iterator,
         pytest.raises(ValueError, match=r"gone, pictures for 14 x 28: 16 clips in a row are broken: s\d.png"),
@@ -352,10 +354,6 @@ def test_a_shape_of_which_all_is_broken_is_replaced_by_the_other_shapes_of_its_s
 
 
 def test_a_set_of_which_all_is_broken_is_replaced_by_the_others_until_too_many_are():
-    class Gone(Numbered):
-        def read(self, sequence: str, indices) -> Frames:
-            raise MissingFiles(f"{sequence}.png: no such file")
-
     options = {"datasets": {"gone": Gone(3), "numbered": Numbered(8)}, "weights": {"gone": 0.1, "numbered": 0.9}}
     with batches(**options, max_broken=0.2) as iterator:
         assert {clip[0] for clip in clips(iterator, 10)} == set(range(8))

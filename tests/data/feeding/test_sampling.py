@@ -25,8 +25,7 @@ def test_clips_are_evenly_spaced_and_inside(length, low, extra, surplus, reverse
     assert clip.shape == (length,) and clip.min() >= 0 and clip.max() < num_frames
     steps = np.diff(clip)
     if length > 1:
-        assert (steps == steps[0]).all()
-        assert low <= abs(steps[0]) <= low + extra
+        assert (steps == steps[0]).all() and low <= abs(steps[0]) <= low + extra
         assert reverse == 0.5 or (steps[0] < 0) == (reverse == 1.0)
     assert np.array_equal(clip, sampler.indices(num_frames, example_rng(3, index)))
 

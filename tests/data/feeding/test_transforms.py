@@ -162,8 +162,7 @@ def test_resampled_pictures_follow_their_cameras(seed: int):
     # Two border pixels see a cut-off filter; half a grey level is 1/160.
     inner = (slice(None), slice(2, -2), slice(2, -2))
     difference = (fitted.images[..., :2] / 80 - 1.5 - expected[..., :2])[inner]
-    assert np.abs(difference).max() < 1.2 / 80
-    assert np.abs(difference.mean()) < 0.3 / 80
+    assert np.abs(difference).max() < 1.2 / 80 and np.abs(difference.mean()) < 0.3 / 80
     # Nearest depth is at most half an original pixel off.
     source_pixel = 1 / frames.intrinsics[0, 0, 0]
     assert np.abs(fitted.depth - 3 - expected[..., 0]).max() < 0.51 * source_pixel + 0.01 * pixel

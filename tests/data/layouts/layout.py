@@ -48,7 +48,6 @@ class Layout:
       picture_error: mean, in levels.
       unit: lengths handed out for a metre.
       damages: what is done to a copy, each with what the error then says.
-      lose_intrinsics: makes the intrinsics of one frame not finite, where a frame has its own.
       poses: `matrix` where the files can hold any matrix, `rigid` where only rigid poses, `none`.
     """
 
@@ -66,5 +65,4 @@ class Layout:
     picture_error: float = 0.0
     unit: float = 1.0
     damages: Sequence[tuple[str, Damage]] = ()
-    lose_intrinsics: Damage | None = None
     poses: str = "matrix"

@@ -76,5 +76,4 @@ LAYOUT = Layout(
             lambda root: write_pose(root / FILES[2], SWAP, c_x=960.0, c_y=540.0),
         ),
     ),
-    lose_intrinsics=lambda root: write_pose(root / FILES[2], SWAP, f_x=float("inf")),
 )

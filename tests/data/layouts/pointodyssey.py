@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from room_views import INTRINSICS, RoomView, write_image
+from room_views import RoomView, write_image
 
 from layouts.layout import VIEWS, Layout, changed, removed
 from logvggt_jax.data.readers.pointodyssey import PointOdyssey
@@ -99,8 +99,5 @@ LAYOUT = Layout(
             r"rgb_00000\.jpg: intrinsics fx=-55",
             lambda root: write_cameras(root / SCENE, intrinsics=np.stack([np.diag([-55.0, 55, 1])] * 4)),
         ),
-    ),
-    lose_intrinsics=lambda root: write_cameras(
-        root / SCENE, intrinsics=np.stack([INTRINSICS, INTRINSICS, INTRINSICS * np.nan, INTRINSICS])
     ),
 )

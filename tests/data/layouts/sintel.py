@@ -63,5 +63,4 @@ LAYOUT = Layout(
         (r"frame_0002\.png: intrinsics", lambda root: write_camera(root / CAMERA_FILE, np.eye(4), INTRINSICS.T)),
         ("training/final: no such folder", lambda root: (root / "training/final").rename(root / "training/albedo")),
     ),
-    lose_intrinsics=lambda root: write_camera(root / CAMERA_FILE, np.eye(4), np.full((3, 3), np.nan)),
 )

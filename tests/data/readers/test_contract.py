@@ -194,13 +194,6 @@ def test_what_is_wrong_with_a_copy_is_named(layout: Layout, tmp_path: Path, plac
     assert named(error, str(tmp_path))
 
 
-@pytest.mark.parametrize("layout", [name for name in NAMES if layout_of(name).lose_intrinsics], indirect=True)
-def test_frames_without_finite_intrinsics_do_not_count(layout: Layout, tmp_path: Path):
-    layout.write(tmp_path, layout.views)
-    layout.lose_intrinsics(tmp_path)
-    assert opened(layout, tmp_path).dropped_frames(layout.sequence) == {"no intrinsics": 1}
-
-
 @every_set
 def test_sequences_and_frames_that_are_not_there_are_refused(layout: Layout, tmp_path: Path):
     layout.write(tmp_path, layout.views)

@@ -41,8 +41,7 @@ def test_the_gathered_form_comes_back(tmp_path: Path, suffix: str):
     write_calibration(tmp_path)
     kitti = KITTI(tmp_path, "val")
     name = f"{DRIVE}/image_gathered{suffix}"
-    assert kitti.sequences == (name,)
-    assert kitti.frame_names(name) == LAYOUT.names
+    assert kitti.sequences == (name,) and kitti.frame_names(name) == LAYOUT.names
     check_views(kitti.read(name, range(4)), SPARSE, picture_error=0, depth_error=LAYOUT.depth_error, poses=False)
     with pytest.raises(FileNotFoundError, match="no sequences of KITTI depth"):
         KITTI(tmp_path, "train")

@@ -125,8 +125,7 @@ def test_a_file_that_is_no_index_is_made_anew(root: Path, reads: Counter[str], w
     assert names(root) == ALL
     assert len(warnings_of) == 1 and "made anew" in warnings_of[0] and str(index_file(root)) in warnings_of[0]
     reads.clear()
-    assert names(root) == ALL
-    assert not reads and len(warnings_of) == 1
+    assert names(root) == ALL and not reads and len(warnings_of) == 1
 
 
 @pytest.mark.parametrize("damage", [b"", b"not an archive", None])
@@ -136,8 +135,7 @@ def test_a_damaged_listing_is_made_anew(root: Path, reads: Counter[str], warning
         (payload,) = connection.execute("SELECT payload FROM listings WHERE key = 'frames room0'").fetchone()
         broken = payload[:300] + b"\xff\x00\xff" + payload[303:] if damage is None else damage
         connection.execute("UPDATE listings SET payload = ? WHERE key = 'frames room0'", (broken,))
-    assert names(root) == ALL
-    assert len(warnings_of) == 1 and "made anew" in warnings_of[0]
+    assert names(root) == ALL and len(warnings_of) == 1 and "made anew" in warnings_of[0]
     reads.clear()
     assert names(root) == ALL and not reads
 

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from logvggt_jax.data import open_dataset
+from logvggt_jax.data.checks.consistency import depth_consistency
 from logvggt_jax.data.dataset import check_frames
 from logvggt_jax.data.readers.seven_scenes import SevenScenes
-from logvggt_jax.geometry import project, unproject
+from logvggt_jax.geometry import unproject
 
 SHIFT = np.array([-0.025, 0.0, 0.0])
 # A slanted wall n . x = d, in the world, in front of all cameras.
@@ -174,15 +175,7 @@ def test_real_frames_agree_with_each_other(seven_scenes_dir: Path, gap: int, bou
     for first in range(40, 900, 140):
         frames = scenes.read("redkitchen/seq-01", [first, first + gap])
         check_frames(frames, "redkitchen")
-        depth, intrinsics, extrinsics = (
-            a.astype(np.float64) for a in (frames.depth, frames.intrinsics, frames.extrinsics)
-        )
-        points = unproject(depth[0], intrinsics[0], extrinsics[0])[depth[0] > 0]
-        pixels, z = project(points, intrinsics[1], extrinsics[1])
-        u, v = np.rint(pixels).astype(int).T
-        inside = (z > 0) & (u >= 0) & (u < 640) & (v >= 0) & (v < 480)
-        there = depth[1][v[inside], u[inside]]
-        errors.append(np.median(np.abs(there - z[inside])[there > 0]))
-        shares.append((there > 0).sum() / len(z))
-    assert np.median(errors) < bound
-    assert np.median(shares) > overlap
+        relative, share = depth_consistency(frames, 0, 1)
+        errors.append(relative * np.median(frames.depth[1][frames.depth[1] > 0]))
+        shares.append(share)
+    assert np.median(errors) < bound and np.median(shares) > overlap

@@ -61,8 +61,7 @@ def test_depth_lies_on_surfaces_and_nothing_stands_before_it(style: str):
         centres = camera_centres(frames.extrinsics.astype(np.float64))[:, None, None]
         to_walls = (room.half_size - np.abs(points)).min(-1)
         to_furniture = room.clearance(points.reshape(-1, 3)).reshape(to_walls.shape)
-        assert to_walls.min() > -1e-4
-        assert np.minimum(np.abs(to_walls), to_furniture).max() < 1e-3
+        assert to_walls.min() > -1e-4 and np.minimum(np.abs(to_walls), to_furniture).max() < 1e-3
         assert (to_furniture < 1e-3).mean() > 0.005
         for fraction in (0.2, 0.5, 0.8, 0.95, 0.99):
             between = (centres + fraction * (points - centres)).reshape(-1, 3)
@@ -79,8 +78,7 @@ def test_warped_depth_agrees_within_one_percent(style: str):
             error = np.abs(frames.depth[target].ravel()[seen] - z) / z
             assert len(seen) > 0.1 * frames.depth[0].size
             # Pixels hidden in the target are among `seen`, so the median is over nearly all co-visible ones.
-            assert np.median(error) < 0.01
-            assert (error < 0.05).mean() > 0.8
+            assert np.median(error) < 0.01 and (error < 0.05).mean() > 0.8
 
 
 def test_pixels_are_given_to_the_surface_that_their_points_lie_on():
@@ -131,8 +129,7 @@ def test_textures_stay_on_surfaces_when_the_camera_moves():
         colours = frames.images.reshape(12, -1, 3).astype(np.float64)
         moved = np.abs(colours[0][here] - colours[6][there]).mean(1)[visible]
         unmoved = np.abs(colours[0] - colours[6]).mean(1)
-        assert np.median(moved) < 0.5 * np.median(unmoved)
-        assert frames.images.std((1, 2)).min() > 5
+        assert np.median(moved) < 0.5 * np.median(unmoved) and frames.images.std((1, 2)).min() > 5
 
 
 @pytest.mark.parametrize("style", STYLES)
@@ -154,8 +151,7 @@ def test_paths_are_smooth_closed_and_half_of_them_turn_all_the_way_round():
         np.testing.assert_allclose(extrinsics[96:], extrinsics[:97], atol=2e-6)
         steps = np.linalg.norm(np.diff(camera_centres(extrinsics), axis=0), axis=1)
         angles = np.rad2deg(rotation_angle(extrinsics[1:, :3, :3], extrinsics[:-1, :3, :3]))
-        assert 0.005 < steps.mean() < 0.15 and steps.max() < 0.25
-        assert angles.max() < 8
+        assert 0.005 < steps.mean() < 0.15 and steps.max() < 0.25 and angles.max() < 8
         assert (intrinsics[:, :2, 2] == [64, 48]).all()
         turning += np.rad2deg(rotation_angle(extrinsics[:, :3, :3], extrinsics[:1, :3, :3])).max() > 165
     assert 10 <= turning <= 30

@@ -66,8 +66,7 @@ def test_gccr_is_below_a_hundredth_of_vggt_1b() -> None:
     for part in parts:
         counts[part.name] += part.calls * count_flops(part.function, variables, *part.arguments)
     # Two passes a frame of 24 frame and 24 global blocks, see the estimate of 2.5 + 0.9 TFLOP.
-    assert 3.0e15 < counts["backbone"] < 4.5e15
-    assert 0 < counts["GCCR"] < 0.01 * counts["backbone"]
+    assert 3.0e15 < counts["backbone"] < 4.5e15 and 0 < counts["GCCR"] < 0.01 * counts["backbone"]
 
 
 def test_timing_compiles_once_and_counts_calls() -> None:
@@ -79,10 +78,8 @@ def test_timing_compiles_once_and_counts_calls() -> None:
 
     shapes = (jax.ShapeDtypeStruct((8, 8), jnp.float32), jax.ShapeDtypeStruct((8, 8), bool))
     result = time_part(Part("GCCR", function, shapes, 7), jnp.eye(8), rounds=3, least_seconds=0.001)
-    assert traced == [(8, 8)]
-    assert result.calls == 7
-    assert 0 < result.fastest <= result.median <= result.slowest
-    assert result.compilation > 0
+    assert traced == [(8, 8)] and result.calls == 7
+    assert 0 < result.fastest <= result.median <= result.slowest and result.compilation > 0
 
 
 def test_measures_are_positive() -> None:

@@ -34,16 +34,14 @@ def test_rows_differ_by_method_parameters_and_limits(small_config: ModelConfig) 
         return [str(row.identity) for row in rows]
 
     first = identities("a", LIMITS)
-    assert len(set(first)) == len(METHODS)
-    assert not set(first) & set(identities("b", LIMITS))
+    assert len(set(first)) == len(METHODS) and not set(first) & set(identities("b", LIMITS))
     same = [a == b for a, b in zip(first, identities("a", ReferenceConfig(6, 6, 2)), strict=True)]
     assert same == [name != "chunks" for name in METHODS]
 
 
 def test_a_clip_beyond_the_limit_is_refused(small_config: ModelConfig) -> None:
-    (row,) = model_rows(
-        Checkpoint(LogVGGT(small_config), {"params": {}}, ""), ("offline",), ReferenceConfig(max_frames=5)
-    )
+    checkpoint = Checkpoint(LogVGGT(small_config), {"params": {}}, "")
+    (row,) = model_rows(checkpoint, ("offline",), ReferenceConfig(max_frames=5))
     with pytest.raises(PredictionError, match="6 frames exceeds max_frames=5"):
         row.predict(IMAGES)
 

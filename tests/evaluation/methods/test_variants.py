@@ -77,8 +77,7 @@ def test_the_checkpoint_is_ablated_from_the_full_model(small_config: ModelConfig
     settings = dataclasses.replace(small_config.refinement, enabled=False, period=50, context=8)
     base = dataclasses.replace(small_config, refinement=settings, windows=WindowConfig(6, 3, cross_window=False))
     full = VARIANTS["full"].config(base)
-    assert full.windows == WindowConfig(6, 3)
-    assert full.refinement == small_config.refinement
+    assert full.windows == WindowConfig(6, 3) and full.refinement == small_config.refinement
     assert VARIANTS["gccr_online"].config(base, context=6).refinement.period == 3
     assert VARIANTS["gccr_every_50"].config(base).refinement.period == 50
 

@@ -72,8 +72,7 @@ def test_images_are_multiples_of_fourteen_and_as_announced(rule: Any, source: tu
     assert made.images.dtype == np.uint8
     assert made.images.shape[1] % 14 == made.images.shape[2] % 14 == 0
     if not isinstance(rule, Fit):
-        assert made.images.shape[1:3] == rule.size(source)
-        assert max(made.images.shape[1:3]) <= 70
+        assert made.images.shape[1:3] == rule.size(source) and max(made.images.shape[1:3]) <= 70
     kept = made.depth.shape == made.images.shape[:3]
     assert kept if rule.keeps_grid else made.depth.shape == (2, *source)
 
@@ -96,10 +95,8 @@ def test_whole_pictures_keep_their_mean_colour_and_their_borders() -> None:
     picture = np.zeros((60, 80, 3), np.uint8)
     picture[:, 40:] = 200
     made = WholePicture(42)(frames(60, 80)._replace(images=picture[None])).images[0]
-    assert made.shape == (28, 42, 3)
-    assert abs(float(made.mean()) - 100.0) < 1.0
-    assert (made[:, :18] < 20).all()
-    assert (made[:, 24:] > 180).all()
+    assert made.shape == (28, 42, 3) and abs(float(made.mean()) - 100.0) < 1.0
+    assert (made[:, :18] < 20).all() and (made[:, 24:] > 180).all()
 
 
 def test_a_principal_point_outside_the_picture_is_named() -> None:

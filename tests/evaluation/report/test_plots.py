@@ -74,8 +74,7 @@ def test_efficiency_shows_rates_and_parts(tmp_path: Path) -> None:
         return int(((abs(red - 140) < 8) & (abs(green - 86) < 8) & (abs(blue - 75) < 8)).sum())
 
     one, two = brown_pixels("one.png", 1.0), brown_pixels("two.png", 2.0)
-    assert one > 5000
-    assert 1.8 < two / one < 2.2
+    assert one > 5000 and 1.8 < two / one < 2.2
 
 
 def test_both_clouds_are_drawn_in_their_colours_and_the_nearest_points_in_front(tmp_path: Path) -> None:
