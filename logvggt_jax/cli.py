@@ -349,9 +349,10 @@ def _parser() -> argparse.ArgumentParser:
         "what this machine has, whether the model computes right on it, and how fast",
         "logvggt doctor --quick",
         details=" Parts run one after the other, each in a process of its own, five minutes in all and one with "
-        "--quick: environment (versions, devices, builds that do not belong together), parity (a small network against recorded values), "
-        "inference (kernels, memory, time and utilisation of a step), training (the same for the training step), "
-        "whole (from files to files). On a CPU the model is a tiny one. Exit code 0: nothing wrong, 1: something is.",
+        "--quick: environment (versions, devices, builds that do not belong together), parity (a small network "
+        "against recorded values), inference (kernels, memory, time and utilisation of a step), training (the same "
+        "for the training step), whole (from files to files). On a CPU the model is a tiny one. Exit code 0: nothing "
+        "wrong, 1: something is.",
     )
     sub.add_argument("--quick", action="store_true", help="environment, parity and inference alone, in a minute")
     sub.add_argument("--part", action="append", metavar="NAME", help="this part alone; may be given several times")

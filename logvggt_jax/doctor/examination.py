@@ -17,10 +17,10 @@ from logvggt_jax.doctor.finding import Finding
 # is left to those after it.
 SHARES: Mapping[str, tuple[int, int]] = {
     "environment": (10, 15),
-    "parity": (20, 35),
+    "parity": (20, 50),
     "inference": (30, 70),
     "training": (0, 95),
-    "whole": (0, 85),
+    "whole": (0, 70),
 }
 TOTAL = (60, 300)
 QUICK = ("environment", "parity", "inference")

@@ -15,7 +15,8 @@ from logvggt_jax.model.logvggt import LogVGGT
 
 RECORDED = "parity.npz"
 FRAMES, IMAGE_SIZE = 7, (28, 42)
-# Largest norm of the difference over that of the reference without its mean: a depth map is mostly its mean. Rounding alone is 1e-6 in float32 and 1e-2 in bfloat16.
+# Largest norm of the difference over that of the reference without its mean (a depth map is mostly its mean). Rounding
+# alone is about 1e-6 in float32 and 1e-2 in bfloat16.
 # Accelerators sum products in another order than the CPU on which the values were recorded.
 _BOUNDS = {"cpu": {"float32": 1e-5, "bfloat16": 3e-2}, "accelerator": {"float32": 1e-4, "bfloat16": 3e-2}}
 _OUTPUTS = ("pose_encodings", "depth", "depth_confidence", "camera_tokens", "register_tokens")

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from logvggt_jax.errors import InputError
 from logvggt_jax.training import loop
 from logvggt_jax.training.checkpoints import Position, RunCheckpoints
 from logvggt_jax.training.config import SourceConfig, TrainConfig, ValidationConfig
@@ -193,6 +194,31 @@ def test_endless_non_finite_updates_stop_the_run(
     monkeypatch.setattr(loop, "initial_parameters", lambda *_, **__: jax.tree.map(jnp.array, broken))
     with pytest.raises(NonFiniteTraining, match="step 2: 2 updates in a row had a non-finite loss or gradient"):
         train(run_config, tmp_path, mesh=data_mesh(1))
+
+
+@pytest.mark.parametrize("reason", ["RESOURCE_EXHAUSTED: Out of memory while trying to allocate", "INTERNAL: broken"])
+def test_a_step_that_does_not_fit_says_what_it_needs_and_what_lowers_it(
+    reason: str, run_config: TrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compiled = loop._Run._program
+
+    def refuse(*_: object) -> None:
+        raise jax.errors.JaxRuntimeError(reason)
+
+    monkeypatch.setattr(loop._Run, "_program", lambda run, *given: compiled(run, *given) and refuse)
+    monkeypatch.setattr(loop, "device_bytes", lambda device: 3 * 2**30)
+    if reason.startswith("INTERNAL"):
+        with pytest.raises(jax.errors.JaxRuntimeError, match="broken"):
+            train(run_config, tmp_path, mesh=data_mesh(2))
+        return
+    stage = run_config.stages[0]
+    message = (
+        rf"stage '{stage.name}' does not fit the memory of cpu, 3\.0 GiB, where the largest step needs [\d.]+ GiB: "
+        rf"lower stages\.{stage.name}\.batch_size={stage.batch_size} \({stage.batch_size // 2} clips a device\)"
+        rf" or clip_length={stage.clip_length}, .*--dry_run"
+    )
+    with pytest.raises(InputError, match=message):
+        train(run_config, tmp_path, mesh=data_mesh(2))
 
 
 def test_validation_reports_held_out_clips(run_config: TrainConfig, tmp_path: Path) -> None:
