@@ -3,13 +3,15 @@
     python train.py --config=configs/tiny.py --workdir=runs/tiny
 
 Run the same command again to go on after an interruption. On several machines start it on each of them with
---distributed. Any field of the configuration can be changed on the command line:
+--distributed. With --dry_run nothing is trained: the step of every stage and size is compiled, and what it needs is
+printed. Any field of the configuration can be changed on the command line:
 --config.optimizer.learning_rate=5e-4.
 """
 
 from __future__ import annotations
 
 import os
+import platform
 import sys
 import traceback
 from collections.abc import Sequence
@@ -23,6 +25,7 @@ from ml_collections import config_flags
 from logvggt_jax.compile import check_devices, enable_compilation_cache
 from logvggt_jax.errors import InputError, one_line
 from logvggt_jax.training.config import TrainConfig
+from logvggt_jax.training.dry_run import described_mesh, dry_run
 from logvggt_jax.training.loop import NonFiniteTraining, train
 from logvggt_jax.training.processes import join_processes
 from logvggt_jax.training.sharding import data_mesh, use_cpu_cores
@@ -38,6 +41,10 @@ _DISTRIBUTED = flags.DEFINE_bool(
 _COORDINATOR = flags.DEFINE_string("coordinator", None, "host:port of process 0, where the cluster does not say.")
 _NUM_PROCESSES = flags.DEFINE_integer("num_processes", None, "Processes of the run, where the cluster does not say.")
 _PROCESS_ID = flags.DEFINE_integer("process_id", None, "Of this process, from 0, where the cluster does not say.")
+_DRY_RUN = flags.DEFINE_bool("dry_run", False, "Say what every step needs and how many clips fit; train nothing.")
+_DESCRIBED = flags.DEFINE_string(
+    "described", None, "TPU slice to compile for instead of the devices at hand, such as v5p:2x2x4; with --dry_run."
+)
 _CACHE = flags.DEFINE_string(
     "compilation_cache", None, "Folder that keeps compiled programs, `none` for none; by default the user's cache."
 )
@@ -56,18 +63,23 @@ def main(arguments: Sequence[str]) -> None:
                 coordinator=_COORDINATOR.value, num_processes=_NUM_PROCESSES.value, process_id=_PROCESS_ID.value
             )
         check_devices()
+        if _DRY_RUN.value:
+            dry_run(config, described_mesh(_DESCRIBED.value) if _DESCRIBED.value else data_mesh())
+            return
         train(config, Path(_WORKDIR.value), mesh=data_mesh(), resume_step=_RESUME_STEP.value)
     except Exception as error:
+        # JAX counts processes with the help of a back end, which may be what does not start.
+        several = jax.distributed.is_initialized()
         # What a user can mend is one line (-v 1 shows where it arose); anything else is a fault of ours.
         if isinstance(error, InputError | NonFiniteTraining) and flags.FLAGS.verbosity <= 0:
             message = f"train.py: {one_line(error)}"
-        elif jax.process_count() > 1:
+        elif several:
             message = traceback.format_exc()
         else:
             raise
-        if jax.process_count() > 1:
+        if several:
             # At once: the others wait for this process's share of a step, and it would wait for them at the exit.
-            print(f"process {jax.process_index()}: {message}", file=sys.stderr, flush=True)
+            print(f"process {os.getpid()} on {platform.node()}: {message}", file=sys.stderr, flush=True)
             os._exit(1)
         sys.exit(message)
 
@@ -99,5 +111,10 @@ def parse_flags(arguments: list[str]) -> list[str]:
 
 
 if __name__ == "__main__":
-    flags.mark_flags_as_required(["config", "workdir"])
+    flags.mark_flag_as_required("config")
+    flags.register_multi_flags_validator(
+        ["workdir", "dry_run", "described"],
+        lambda given: given["dry_run"] or (given["workdir"] is not None and given["described"] is None),
+        "a run needs --workdir; --described goes with --dry_run",
+    )
     app.run(main, flags_parser=parse_flags)

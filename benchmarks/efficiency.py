@@ -160,15 +160,16 @@ def print_tables(console: Console, report: dict[str, Any]) -> None:
             title=f"Parts of {report['part_frames']} frames, {mode}",
         )
         for part in parts:
-            achieved = part["flops"] / part["seconds"] / report["matmul_flops_per_second"] if part["seconds"] else 0.0
+            # A part that the mode does not have takes no time.
+            achieved = part["flops"] / part["seconds"] / report["matmul_flops_per_second"] if part["seconds"] else None
             table.add_row(
                 part["name"],
                 f"{part['seconds'] * 1e3:,.1f}",
                 f"{part['seconds'] / total:.2%}",
                 f"{part['flops'] / report['part_frames'] / 1e9:.4f}",
                 f"{part['flops'] / operations:.3%}",
-                f"{achieved:.1%}",
-                f"{part['temporary_bytes'] / MIB:.1f}",
+                "-" if achieved is None else f"{achieved:.1%}",
+                "-" if part["temporary_bytes"] is None else f"{part['temporary_bytes'] / MIB:.1f}",
                 f"{part['compilation_seconds']:.1f}",
             )
         table.add_row("all", f"{total * 1e3:,.1f}", "", f"{operations / report['part_frames'] / 1e9:.4f}", style="bold")
@@ -227,7 +228,9 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
                 "name": name,
                 "seconds": sum(t.calls * t.median for t in times if t.name == name),
                 "compilation_seconds": sum(t.compilation for t in times if t.name == name),
-                "temporary_bytes": max((t.temporary_bytes for t in times if t.name == name), default=0),
+                "temporary_bytes": max(
+                    (t.temporary_bytes for t in times if t.name == name and t.temporary_bytes is not None), default=None
+                ),
                 "flops": flops[mode][longest][name],
             }
             for name in PARTS

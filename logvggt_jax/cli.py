@@ -49,8 +49,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _convert(options: argparse.Namespace) -> None:
+    from logvggt_jax.compile import check_devices
     from logvggt_jax.weights.checkpoints import convert
 
+    check_devices()
     report = convert(options.source, options.output, point_head=options.point_head)
     for title, names in (("skipped", report.skipped), ("initialised", report.initialised)):
         for name in names:
@@ -137,9 +139,11 @@ def _view(options: argparse.Namespace) -> None:
 def _info(options: argparse.Namespace) -> None:
     from rich.console import Console
 
+    from logvggt_jax.compile import check_devices
     from logvggt_jax.weights.checkpoints import load_model, read_provenance
     from logvggt_jax.weights.summary import model_summary, provenance_lines
 
+    check_devices()
     model, variables = load_model(options.checkpoint)
     console = Console()
     console.print(model_summary(model.config, variables["params"]))

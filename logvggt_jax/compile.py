@@ -40,6 +40,20 @@ def check_devices() -> None:
         )
 
 
+def out_of_device_memory(error: jax.errors.JaxRuntimeError) -> bool:
+    """Whether this is what the back end raises where a program or an array does not fit the device."""
+    return "RESOURCE_EXHAUSTED" in str(error)
+
+
+def device_bytes(device: jax.Device) -> int | None:
+    """Bytes that programs may use on a device; None where it does not say (CPUs, devices that are described alone)."""
+    try:
+        statistics = device.memory_stats()
+    except jax.errors.JaxRuntimeError:
+        return None
+    return (statistics or {}).get("bytes_limit")
+
+
 def default_cache_folder() -> Path:
     """`logvggt/xla` in the user's cache folder (`XDG_CACHE_HOME`, else `~/.cache`)."""
     return user_cache_folder("xla")

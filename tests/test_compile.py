@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import jax
 import pytest
 
 from logvggt_jax import compile as module
 from logvggt_jax.errors import InputError
+
+ROOT = Path(__file__).parents[1]
 
 
 def test_a_platform_that_does_not_start_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -28,3 +35,23 @@ def test_an_idle_gpu_draws_a_warning(monkeypatch: pytest.MonkeyPatch, asked: str
             module.check_devices()
     else:
         module.check_devices()
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["-m", "logvggt_jax", "convert", "nowhere", "--output", "OUT"],
+        ["train.py", "--config=configs/tiny.py", "--workdir=OUT"],
+        ["eval.py", "--config=configs/eval/rooms.py", "--checkpoint=nowhere", "--output=OUT"],
+    ],
+    ids=["logvggt", "train.py", "eval.py"],
+)
+def test_entry_points_say_that_devices_do_not_start(arguments: list[str], tmp_path: Path) -> None:
+    # Nowhere is a device of this kind, whatever the machine has.
+    environment = {**os.environ, "JAX_PLATFORMS": "rocm"}
+    command = [sys.executable, *(argument.replace("OUT", str(tmp_path / "out")) for argument in arguments)]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode != 0
+    assert "JAX_PLATFORMS=rocm" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "out").exists()

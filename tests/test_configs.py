@@ -9,18 +9,17 @@ import sys
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import pytest
 
 from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.data.feeding.holdouts import PUBLISHED
 from logvggt_jax.data.rooms.rooms import Rooms
-from logvggt_jax.model.parameters import stack_layers
 from logvggt_jax.training.config import TrainConfig
-from logvggt_jax.training.optimizer import learning_rate_schedule, make_optimizer
+from logvggt_jax.training.dry_run import abstract_clips
+from logvggt_jax.training.optimizer import learning_rate_schedule
+from logvggt_jax.training.program import abstract_parameters, make_program
 from logvggt_jax.training.sharding import check_batch_size, data_mesh
 from logvggt_jax.training.state import TrainState, initial_state
-from logvggt_jax.training.step import make_loss_terms, make_train_step
 
 ROOT = Path(__file__).parents[1]
 
@@ -69,26 +68,11 @@ def test_h20_is_the_papers_training(monkeypatch: pytest.MonkeyPatch) -> None:
         check_batch_size(stage, data_mesh(16))
 
 
-def _abstract_clips(batch: int, frames: int, size: tuple[int, int]) -> dict[str, jax.ShapeDtypeStruct]:
-    return {
-        "images": jax.ShapeDtypeStruct((batch, frames, *size, 3), jnp.uint8),
-        "depth": jax.ShapeDtypeStruct((batch, frames, *size), jnp.float32),
-        "intrinsics": jax.ShapeDtypeStruct((batch, frames, 3, 3), jnp.float32),
-        "extrinsics": jax.ShapeDtypeStruct((batch, frames, 4, 4), jnp.float32),
-    }
-
-
 def _abstract_run(config: TrainConfig, num_devices: int) -> tuple[TrainState, jax.stages.Wrapped]:
     """A run's first state without values, and its step."""
-    # Parameters do not depend on the form of attention, and tracing cuDNN's asks for a GPU.
-    model = LogVGGT(dataclasses.replace(config.model, attention="xla"))
-    images = jax.ShapeDtypeStruct((1, 1, 14, 14, 3), jnp.uint8)
-    params = jax.eval_shape(lambda: stack_layers(model.init(jax.random.key(0), images))["params"])
-    optimizer = make_optimizer(config.optimizer, params, frozen=("encoder",))
-    state = jax.eval_shape(functools.partial(initial_state, optimizer=optimizer), params)
-    schedule = learning_rate_schedule(config.optimizer, config.stages)
-    terms = make_loss_terms(LogVGGT(config.model), config.loss)
-    return state, make_train_step(terms, config.loss, optimizer, schedule, data_mesh(num_devices))
+    params = abstract_parameters(config.model)
+    optimizer, step = make_program(LogVGGT(config.model), config, params, data_mesh(num_devices))
+    return jax.eval_shape(functools.partial(initial_state, optimizer=optimizer), params), step
 
 
 def _shallow(config: TrainConfig) -> TrainConfig:
@@ -160,7 +144,7 @@ def _check_step(
     config = dataclasses.replace(config, model=dataclasses.replace(config.model, attention=attention))
     state, step = _abstract_run(config, 16)
     stage = config.stages[stage_index]
-    traced = step.trace(state, _abstract_clips(stage.batch_size, stage.clip_length, size))
+    traced = step.trace(state, abstract_clips(stage.batch_size, stage.clip_length, size))
     after, metrics = traced.out_info
     assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(lambda x: (x.shape, x.dtype), state)
     assert all(value.shape == () for value in metrics.values())

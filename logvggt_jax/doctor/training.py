@@ -12,10 +12,10 @@ import numpy as np
 
 from logvggt_jax.doctor.finding import Finding
 from logvggt_jax.doctor.subject import Subject, random_variables
-from logvggt_jax.evaluation.costs.operations import count_flops
 from logvggt_jax.evaluation.costs.parts import matmul_flops_per_second
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.model.parameters import stack_layers
+from logvggt_jax.operations import count_flops
 from logvggt_jax.training.config import LossConfig, OptimizerConfig
 from logvggt_jax.training.optimizer import make_optimizer
 from logvggt_jax.training.sharding import data_mesh, replicated, split

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 from rich.console import Console
 
+from logvggt_jax.compile import out_of_device_memory
 from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.errors import InputError
 from logvggt_jax.evaluation.clips import load_clip
@@ -229,7 +230,7 @@ def _predicted(method: Method, truth: ClipTruth, protocol: Protocol) -> tuple[Cl
     except (PredictionError, MemoryError) as error:
         return None, ClipScore({}, {PREDICTION: str(error) or "out of memory"})
     except jax.errors.JaxRuntimeError as error:
-        if "RESOURCE_EXHAUSTED" not in str(error):
+        if not out_of_device_memory(error):
             raise
         return None, ClipScore({}, {PREDICTION: f"out of memory on the device: {str(error).splitlines()[0]}"})
     return prediction, clip_score(method, prediction, truth, protocol)

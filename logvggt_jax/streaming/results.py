@@ -10,6 +10,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from logvggt_jax.compile import out_of_device_memory
 from logvggt_jax.errors import InputError
 from logvggt_jax.geometry import decode_poses
 
@@ -103,7 +104,7 @@ def device_memory(what: str, mend: str) -> Iterator[None]:
     try:
         yield
     except jax.errors.JaxRuntimeError as error:
-        if "RESOURCE_EXHAUSTED" not in str(error):
+        if not out_of_device_memory(error):
             raise
         reason = str(error).splitlines()[0]
         device = jax.devices()[0].device_kind

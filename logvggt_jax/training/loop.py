@@ -1,17 +1,21 @@
 """The training loop: stages, logging, validation, checkpoints, and a clean end whatever ends it."""
 
+import contextlib
 import functools
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import jax
 from jax.sharding import Mesh
 from rich.console import Console
 
+from logvggt_jax.compile import device_bytes, out_of_device_memory
 from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.data.feeding.batches import BatchIterator
+from logvggt_jax.errors import InputError, one_line
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.model.parameters import stack_layers
 from logvggt_jax.training.batches import open_sources, stage_batches
@@ -21,16 +25,17 @@ from logvggt_jax.training.device_batches import DeviceBatches
 from logvggt_jax.training.initialization import initial_parameters
 from logvggt_jax.training.interruption import StopRequest
 from logvggt_jax.training.metrics_log import MetricsLog
-from logvggt_jax.training.optimizer import learning_rate_schedule, make_optimizer
 from logvggt_jax.training.processes import ASK_EVERY, any_process, check_agreement
+from logvggt_jax.training.program import make_program
 from logvggt_jax.training.progress import Speedometer, duration, progress_line
 from logvggt_jax.training.sharding import check_batch_size, replicated
 from logvggt_jax.training.state import TrainState, initial_state
-from logvggt_jax.training.step import Batch, Metrics, make_loss_terms, make_train_step
+from logvggt_jax.training.step import Batch, Metrics
 from logvggt_jax.training.validation import Validation
 
 # Steps handed to the device before the oldest has to be finished: enough to hide the host's work.
 STEPS_IN_FLIGHT = 2
+GIB = 2**30
 
 
 class NonFiniteTraining(RuntimeError):
@@ -75,11 +80,7 @@ class _Run:
         # Shapes alone: a run that goes on needs no initial weights.
         # Deep stacks are trained as one loop over stacked layers: their step compiles once and updates few arrays.
         self.shapes = jax.eval_shape(lambda: stack_layers(initial_parameters(config.model, seed=config.seed)))
-        frozen = ("encoder",) if config.model.encoder.frozen else ()
-        self.optimizer = make_optimizer(config.optimizer, self.shapes, frozen=frozen)
-        schedule = learning_rate_schedule(config.optimizer, config.stages)
-        terms = make_loss_terms(model, config.loss)
-        self.step = make_train_step(terms, config.loss, self.optimizer, schedule, mesh)
+        self.optimizer, self.step = make_program(model, config, self.shapes, mesh)
         self.programs: dict[tuple[int, ...], jax.stages.Compiled] = {}
         self.validation = None if config.validation is None else Validation(model, config.validation, mesh)
         self.checkpoints = RunCheckpoints(workdir, config)
@@ -119,7 +120,7 @@ class _Run:
             check_agreement(f"stage {stage.name!r}: the data", {**source.get_state(), "broken": None})
             left.append((index, stage, end, source))
         for index, stage, end, source in left:
-            with source, DeviceBatches(source, self.mesh) as batches:
+            with source, DeviceBatches(source, self.mesh) as batches, self._device_memory(stage):
                 step, ended = self._train_stage(index, stage, batches, step, end, log, stop)
             if ended:
                 break
@@ -171,6 +172,30 @@ class _Run:
             log.say(f"{stage.name}: step compiled in {time.perf_counter() - started:.0f} s")
             self.speed.restart()
         return self.programs[shape]
+
+    @contextlib.contextmanager
+    def _device_memory(self, stage: StageConfig) -> Iterator[None]:
+        """Turns a device's being out of memory into one line: what a step needs, and what lowers it."""
+        try:
+            yield
+        except jax.errors.JaxRuntimeError as error:
+            if not out_of_device_memory(error):
+                raise
+            raise InputError(
+                f"stage {stage.name!r} does not fit the memory of {self._memory()}: lower stages.{stage.name}."
+                f"batch_size={stage.batch_size} ({stage.batch_size // self.mesh.size} clips a device) or clip_length="
+                f"{stage.clip_length}, or train on more devices; --dry_run says what fits ({one_line(error):.200})"
+            ) from error
+
+    def _memory(self) -> str:
+        """A device, its memory, and what the largest step compiled so far needs of it."""
+        device = self.mesh.devices.flat[0]
+        limit, text = device_bytes(device), str(device.device_kind)
+        if limit is not None:
+            text += f", {limit / GIB:.1f} GiB"
+        known: list[Any] = [program.memory_analysis() for program in self.programs.values()]
+        needs = [memory.argument_size_in_bytes + memory.temp_size_in_bytes for memory in known if memory is not None]
+        return text + (f", where the largest step needs {max(needs) / GIB:.1f} GiB" if needs else "")
 
     def _log(self, step: int, stage: StageConfig, metrics: Metrics, broken_clips: int, log: MetricsLog) -> None:
         values = {name: float(value) for name, value in jax.device_get(metrics).items()}

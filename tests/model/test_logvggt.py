@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from logvggt_jax import DPTConfig, LogVGGT, ModelConfig
-from logvggt_jax.evaluation.costs.operations import count_flops
 from logvggt_jax.model.parameters import in_compute_type, run, stack_layers, unstack_layers
 from logvggt_jax.model.windows import Windows
+from logvggt_jax.operations import count_flops
 
 FRAMES = 6
 

@@ -12,11 +12,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from logvggt_jax.evaluation.costs.operations import count_flops
 from logvggt_jax.model.aggregator import WindowTokens
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.model.refinement import num_triggers
 from logvggt_jax.model.windows import num_windows
+from logvggt_jax.operations import count_flops
 
 PARTS = ("encoder", "backbone", "dense head", "GCCR", "camera head")
 
@@ -33,7 +33,10 @@ class Part:
 
 @dataclasses.dataclass(frozen=True)
 class PartTime:
-    """Seconds of a part: to compile it, and of one call (median and extremes of the rounds)."""
+    """Seconds of a part: to compile it, and of one call (median and extremes of the rounds).
+
+    `temporary_bytes` is None where the compiler does not say.
+    """
 
     name: str
     calls: int
@@ -41,7 +44,7 @@ class PartTime:
     median: float
     fastest: float
     slowest: float
-    temporary_bytes: int
+    temporary_bytes: int | None
 
 
 @functools.lru_cache(maxsize=8)
@@ -149,7 +152,7 @@ def time_part(part: Part, variables: Any, *, rounds: int = 3, least_seconds: flo
         median=statistics.median(seconds),
         fastest=min(seconds),
         slowest=max(seconds),
-        temporary_bytes=0 if memory is None else int(memory.temp_size_in_bytes),
+        temporary_bytes=None if memory is None else int(memory.temp_size_in_bytes),
     )
 
 

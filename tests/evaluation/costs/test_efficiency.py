@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import pytest
 
 from logvggt_jax import LogVGGT, ModelConfig
-from logvggt_jax.evaluation.costs.operations import count_flops
 from logvggt_jax.evaluation.costs.parts import (
     Part,
     abstract_variables,
@@ -19,6 +18,7 @@ from logvggt_jax.evaluation.costs.parts import (
     sequence_parts,
     time_part,
 )
+from logvggt_jax.operations import count_flops
 
 ROOT = Path(__file__).parents[2]
 TINY_SIZE = (56, 70)

@@ -15,11 +15,11 @@ def count_flops(function: Callable[..., Any], *arguments: Any) -> float:
 
     All else of a network (norms, activations, softmax) is a few parts in a thousand and limited by memory, not by
     operations; utilisation is stated without it. A loop counts as often as it runs, whatever the depth of nesting, a
-    condition as its dearest branch. Nothing is compiled and nothing is run.
+    condition as its dearest branch, the body of a `shard_map` once for every device. Nothing is compiled and nothing is
+    run.
 
     Args:
-      function: what `jax.jit` takes. Kernels whose inside JAX does not know (cuDNN) count nothing: give a model with
-        `attention="xla"`.
+      function: what `jax.jit` takes. Kernels (cuDNN, Pallas) count nothing: give a model with `attention="xla"`.
       *arguments: arrays or `jax.ShapeDtypeStruct`, or pytrees of them.
 
     Raises:
@@ -40,12 +40,14 @@ def _flops(jaxpr: core.Jaxpr) -> float:
             total += parameters["length"] * _flops(parameters["jaxpr"].jaxpr)
         elif name == "cond":
             total += max(_flops(branch.jaxpr) for branch in parameters["branches"])
+        elif name == "shard_map":
+            total += parameters["mesh"].size * _flops(parameters["jaxpr"])
         elif name == "while":
             raise ValueError(
                 f"count_flops: the number of trips of a loop is not fixed: {equation.source_info.name_stack}"
             )
-        else:
-            # jit, checkpoint, shard_map and rules of differentiation: what they hold runs once.
+        elif name != "pallas_call":  # whose program is that of one block
+            # jit, checkpoint and rules of differentiation: what they hold runs once.
             total += sum(map(_flops, core.jaxprs_in_params(parameters)))
     return total
 
@@ -59,5 +61,7 @@ def _product_flops(equation: Any) -> float:
 def _convolution_flops(equation: Any) -> float:
     kernel = equation.invars[1].aval.shape
     features = kernel[equation.params["dimension_numbers"].rhs_spec[0]]
-    # A value of the output sums over all of the kernel but its output features.
-    return 2.0 * math.prod(equation.outvars[0].aval.shape) * math.prod(kernel) / features
+    # A value of the output sums over all of the kernel but its output features. Of a dilated input most values are
+    # zeros between the others, with which nothing has to be multiplied.
+    products = math.prod(kernel) / features / math.prod(equation.params["lhs_dilation"])
+    return 2.0 * math.prod(equation.outvars[0].aval.shape) * products

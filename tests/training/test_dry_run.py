@@ -1,0 +1,128 @@
+"""What a dry run says of a run: what a step needs, what its devices exchange, how many clips fit; and nothing more."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import importlib.util
+from pathlib import Path
+
+import jax
+import pytest
+
+from logvggt_jax.errors import InputError, MissingPackage
+from logvggt_jax.training import dry_run as module
+from logvggt_jax.training.config import TrainConfig
+from logvggt_jax.training.dry_run import StepCosts, abstract_clips, collectives, dry_run, step_costs, step_flops
+from logvggt_jax.training.sharding import data_mesh
+
+ROOT = Path(__file__).parents[2]
+SIZE = (28, 42)
+
+
+@pytest.fixture
+def config(monkeypatch: pytest.MonkeyPatch) -> TrainConfig:
+    """`configs/tiny.py` with one stage of few small frames."""
+    monkeypatch.syspath_prepend(str(ROOT))
+    tiny = TrainConfig.from_dict(importlib.import_module("configs.tiny").get_config().to_dict())
+    stage = dataclasses.replace(tiny.stages[0], clip_length=2, batch_size=4, sizes=(SIZE,))
+    encoder = dataclasses.replace(tiny.model.encoder, depth=1, frozen=True)
+    return dataclasses.replace(tiny, stages=(stage,), model=dataclasses.replace(tiny.model, encoder=encoder))
+
+
+def test_a_step_is_described_and_nothing_is_allocated(config: TrainConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    found: list[StepCosts | None] = []
+    monkeypatch.setattr(module, "step_costs", lambda *given: found.append(step_costs(*given)) or found[-1])
+    lines: list[str] = []
+    before = len(jax.live_arrays())
+    dry_run(config, data_mesh(2), lines.append)
+    assert len(jax.live_arrays()) <= before
+    assert "2 x cpu, memory not known" in lines[0]
+    assert "28x42, 2 x 2 frames a device" in lines[1]
+    for word in ("TFLOP", "arguments", "temporaries", "all-reduce", "compiled in"):
+        assert word in lines[1]
+    assert "is not known" in lines[2], "a CPU does not say how much memory a program may use"
+
+    (costs,) = found
+    assert costs is not None
+    params = module.abstract_parameters(config.model)
+    size = {name: sum(4 * leaf.size for leaf in jax.tree.leaves(tree)) for name, tree in params.items()}
+    trained = sum(size.values()) - size["encoder"]
+    exchanged = sum(total for _, total in costs.collectives.values())
+    # A compiler may leave out sums of what is zero everywhere: of the frozen encoder, of a bias before a softmax.
+    assert 0.99 * trained <= exchanged < 1.05 * sum(size.values()) + 10_000
+    assert costs.arguments > sum(size.values()) + 2 * trained, "parameters, two moments, a batch"
+
+
+def test_operations_grow_with_the_clips_alone(config: TrainConfig) -> None:
+    assert step_flops(config, (4, 2, *SIZE)) == pytest.approx(4 * step_flops(config, (1, 2, *SIZE)), rel=1e-3)
+    encoder = dataclasses.replace(config.model.encoder, frozen=False)
+    thawed = dataclasses.replace(config, model=dataclasses.replace(config.model, encoder=encoder))
+    assert step_flops(thawed, (1, 2, *SIZE)) > step_flops(config, (1, 2, *SIZE))
+
+
+@pytest.mark.parametrize(
+    ("limit", "answer"), [(45, "4 is the largest of 1, 2, 4, 8 clips"), (5, "none of 1, 2, 4, 8 clips"), (1000, "8 is")]
+)
+def test_the_largest_that_fits_is_searched(
+    config: TrainConfig, limit: int, answer: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tried: list[int] = []
+
+    def costs(config: TrainConfig, mesh: object, stage: object, size: object, clips: int) -> StepCosts:
+        tried.append(clips)
+        return StepCosts(5, 10 * clips, {}, 0.0)
+
+    monkeypatch.setattr(module, "step_costs", costs)
+    monkeypatch.setattr(module, "device_bytes", lambda device: limit)
+    lines: list[str] = []
+    dry_run(config, data_mesh(2), lines.append)
+    assert answer in lines[-1]
+    assert tried == [2, *[clips for clips in (1, 2, 4, 8) if clips == 1 or 5 + 10 * (clips // 2) <= limit]]
+    assert ("which do not fit" in lines[1]) == (limit < 25)
+
+
+def test_what_the_compiler_refuses_does_not_fit(config: TrainConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Ran out of memory in memory space hbm")
+
+    monkeypatch.setattr(jax.stages.Lowered, "compile", refuse)
+    assert step_costs(config, data_mesh(1), config.stages[0], SIZE, 1) is None
+
+
+def test_collectives_are_read_from_the_program() -> None:
+    program = """
+      %all-reduce.1 = (f32[10,2]{1,0}, bf16[3]{0}) all-reduce(%a, %b), replica_groups={{0,1}}
+      %all-reduce-start = f32[] all-reduce-start(%c)
+      %all-reduce-done = f32[] all-reduce-done(%all-reduce-start)
+      ROOT %g = pred[7]{0} all-gather(%d)
+    """
+    assert collectives(program) == {"all-reduce": (2, 80 + 6 + 4), "all-gather": (1, 7)}
+
+
+def test_batches_have_to_split_over_the_devices(config: TrainConfig) -> None:
+    with pytest.raises(InputError, match="batch_size=4 does not split over 3 devices"):
+        dry_run(config, data_mesh(3))
+
+
+def test_clips_have_the_shapes_of_a_batch() -> None:
+    batch = abstract_clips(2, 3, SIZE)
+    assert {name: value.shape[:2] for name, value in batch.items()} == dict.fromkeys(batch, (2, 3))
+
+
+def test_an_unknown_slice_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    from jax.experimental import topologies
+
+    def refuse(**_: object) -> None:
+        raise RuntimeError("INVALID_ARGUMENT:\nunknown topology")
+
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
+    monkeypatch.setattr(topologies, "get_topology_desc", refuse)
+    with pytest.raises(InputError, match=r"--described=v9:1x1: no such TPU slice.*v5p:2x2x4.*unknown topology"):
+        module.described_mesh("v9:1x1")
+
+
+def test_without_libtpu_no_slice_can_be_described(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(MissingPackage, match="pip install libtpu"):
+        module.described_mesh("v5p:2x2x4")
