@@ -16,11 +16,11 @@ from logvggt_jax.doctor.finding import Finding
 # Seconds that each part is sure of, quick and in full: a minute and five minutes together. What one part does not use
 # is left to those after it.
 SHARES: Mapping[str, tuple[int, int]] = {
-    "environment": (10, 15),
-    "parity": (20, 50),
-    "inference": (30, 70),
-    "training": (0, 95),
-    "whole": (0, 70),
+    "environment": (10, 10),
+    "parity": (20, 40),
+    "inference": (30, 50),
+    "training": (0, 140),
+    "whole": (0, 60),
 }
 TOTAL = (60, 300)
 QUICK = ("environment", "parity", "inference")

@@ -17,6 +17,8 @@ RECORDED = "parity.npz"
 FRAMES, IMAGE_SIZE = 7, (28, 42)
 # Largest norm of the difference over that of the reference without its mean (a depth map is mostly its mean). Rounding
 # alone is about 1e-6 in float32 and 1e-2 in bfloat16.
+# Dense maps vary little in this network, so that bfloat16's rounding is a few parts in a hundred of it: 0.029 on a CPU.
+_DENSE_BFLOAT16 = 1e-1
 # Accelerators sum products in another order than the CPU on which the values were recorded.
 _BOUNDS = {"cpu": {"float32": 1e-5, "bfloat16": 3e-2}, "accelerator": {"float32": 1e-4, "bfloat16": 3e-2}}
 _OUTPUTS = ("pose_encodings", "depth", "depth_confidence", "camera_tokens", "register_tokens")
@@ -39,5 +41,6 @@ def examine() -> Iterator[Finding]:
     for dtype, bound in _BOUNDS["cpu" if jax.default_backend() == "cpu" else "accelerator"].items():
         found = outputs(dtype)
         for name, expected in recorded.items():
+            at_most = _DENSE_BFLOAT16 if dtype == "bfloat16" and name.startswith("depth") else bound
             error = float(np.linalg.norm(found[name] - expected) / np.linalg.norm(expected - expected.mean()))
-            yield Finding("parity", f"{name}, {dtype}", error, ok=bool(error <= bound), note=f"at most {bound:g}")
+            yield Finding("parity", f"{name}, {dtype}", error, ok=bool(error <= at_most), note=f"at most {at_most:g}")

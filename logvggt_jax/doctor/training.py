@@ -25,7 +25,7 @@ from logvggt_jax.training.step import make_loss_terms, make_train_step
 # As configs/h20.py has them; what they are changes no time.
 _LOSS = LossConfig("log_vggt", 1.0, 1.0, 1.0, 1.0, 0.5, 0.6, 0.2)
 # No other number of clips is begun that would end later than this.
-_SECONDS = 70.0
+_SECONDS = 110.0
 _OPTIMIZER = OptimizerConfig(5e-5, 0.0, "cosine", 0.05, False, 0.9, 0.95, 0.05, False, 1.0)
 
 
