@@ -65,8 +65,10 @@ def random_variables(model: LogVGGT, *, scale: float = 0.02) -> dict[str, Any]:
     def cut(path: tuple[Any, ...], leaf: jax.ShapeDtypeStruct) -> np.ndarray:
         nonlocal offset
         size = math.prod(leaf.shape)
-        values = np.resize(np.roll(block, -offset) if size < _BLOCK else block, size).reshape(leaf.shape)
-        offset = (offset + size) % _BLOCK
+        # A view of the block where it is long enough: thousands of small parameters cost no memory of their own.
+        start = offset if offset + size <= _BLOCK else 0
+        values = (block[start : start + size] if size <= _BLOCK else np.resize(block, size)).reshape(leaf.shape)
+        offset = (start + size) % _BLOCK
         return values + np.float32(1.0) if path[-1].key == "scale" else values
 
     return jax.tree_util.tree_map_with_path(cut, shapes)
