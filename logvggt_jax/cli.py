@@ -63,6 +63,7 @@ def _convert(options: argparse.Namespace) -> None:
 
 def _reconstruct(options: argparse.Namespace) -> None:
     from logvggt_jax.compile import check_devices, enable_compilation_cache
+    from logvggt_jax.model.parameters import in_compute_type
     from logvggt_jax.reconstruction.method import choose_method
     from logvggt_jax.reconstruction.point_cloud import PointFilter
     from logvggt_jax.reconstruction.reconstruct import LONGER_EDGE, check_request, reconstruct
@@ -87,6 +88,8 @@ def _reconstruct(options: argparse.Namespace) -> None:
     method = choose_method(provenance, None if options.mode == "auto" else options.mode)
     settings = _settings(options, method)
     model, variables = from_pretrained(options.checkpoint, dtype=options.dtype)
+    # Here rather than in the stream alone, so that nothing keeps the float32 parameters on the device.
+    variables = in_compute_type(variables, model.config)
     result = reconstruct(
         options.source,
         options.output,

@@ -14,6 +14,7 @@ from logvggt_jax.evaluation.progress import track
 from logvggt_jax.evaluation.records import record_key
 from logvggt_jax.evaluation.scratch import scratch_array
 from logvggt_jax.model.logvggt import LogVGGT, Variables
+from logvggt_jax.model.parameters import in_compute_type
 from logvggt_jax.streaming import Predictor, open_predictor
 from logvggt_jax.weights.checkpoints import digests, load_model
 
@@ -31,14 +32,15 @@ class Checkpoint:
     """A model that rows are made of."""
 
     model: LogVGGT  # the model
-    variables: Variables  # {"params": …}, on the device
+    variables: Variables  # {"params": …}, on the device, in the compute type: rows open a predictor for every clip
     digest: str  # of the parameters
 
     @classmethod
     def load(cls, path: str | Path) -> Checkpoint:
         """The model of a folder; errors as of `logvggt_jax.weights.load_model`."""
         model, variables = load_model(path)
-        return cls(model, jax.device_put(variables), record_key(digests(variables["params"])))
+        digest = record_key(digests(variables["params"]))
+        return cls(model, jax.device_put(in_compute_type(variables, model.config)), digest)
 
 
 @dataclasses.dataclass(frozen=True)
