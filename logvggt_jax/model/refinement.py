@@ -7,6 +7,7 @@ only one: `LogVGGT.apply` loops over it, streams call it when it is due, and ope
 from __future__ import annotations
 
 import dataclasses
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +31,20 @@ def trigger_range(trigger: int, num_frames: int, period: int | None) -> tuple[in
     return trigger * period, min((trigger + 1) * period, num_frames)
 
 
+class Span(NamedTuple):
+    """The frames [start, stop) that a trigger takes, of sequences of unequal length.
+
+    Attributes:
+      start: int32 scalar.
+      stop: int32 scalar.
+      lengths: int32 [B], the sequences' numbers of frames.
+    """
+
+    start: jax.Array
+    stop: jax.Array
+    lengths: jax.Array
+
+
 @dataclasses.dataclass(frozen=True)
 class Refinement:
     """GCCR and camera head over the compact tokens of sequences; pure functions of parameters and arrays."""
@@ -44,31 +59,27 @@ class Refinement:
         camera_tokens: jax.Array,
         registers: RegisterKeys | None,
         refined: jax.Array,
-        lengths: jax.Array,
-        start: jax.Array | int,
-        stop: jax.Array | int,
+        span: Span,
         *,
         size: int,
     ) -> tuple[jax.Array, jax.Array]:
-        """One trigger: frames [start, stop) are refined and get their poses.
+        """One trigger: the frames of a span are refined and get their poses.
 
-        What lies at or beyond `stop`, or an item's own length, means nothing and is seen by none.
+        What lies at or beyond the span's stop, or an item's own length, means nothing and is seen by none.
 
         Args:
           variables: {"params": …}.
           camera_tokens: [B, N, 2C], N at least start + size.
           registers: of N frames, see `project_registers`; None where GCCR is off.
-          refined: [B, N, 2C], the refined tokens of frames before `start`.
-          lengths: int32 [B], the items' numbers of frames.
-          start: first frame of the span.
-          stop: frame after its last, at most start + size.
-          size: static.
+          refined: [B, N, 2C], the refined tokens of frames before the span.
+          span: the frames.
+          size: static, at least the span's length.
 
         Returns:
-          `refined` with the span's tokens in their place, and pose encodings [B, size, R, 9] of frames from `start`.
+          `refined` with the span's tokens in their place, and pose encodings [B, size, R, 9] from the span's start.
         """
-        refined = self.refine_span(variables, camera_tokens, registers, refined, lengths, start, stop, size=size)
-        return refined, self.decode_span(variables, refined, lengths, start, stop, size=size)
+        refined = self.refine_span(variables, camera_tokens, registers, refined, span, size=size)
+        return refined, self.decode_span(variables, refined, span, size=size)
 
     def refine_span(
         self,
@@ -76,57 +87,46 @@ class Refinement:
         camera_tokens: jax.Array,
         registers: RegisterKeys | None,
         refined: jax.Array,
-        lengths: jax.Array,
-        start: jax.Array | int,
-        stop: jax.Array | int,
+        span: Span,
         *,
         size: int,
     ) -> jax.Array:
         """GCCR's half of `fire`."""
-        fresh = jax.lax.dynamic_slice_in_dim(camera_tokens, start, size, axis=1)
+        fresh = jax.lax.dynamic_slice_in_dim(camera_tokens, span.start, size, axis=1)
         if registers is not None:
-            fresh = self.attend_registers(variables, fresh, registers, jnp.minimum(lengths, stop))
-        return jax.lax.dynamic_update_slice_in_dim(refined, fresh, start, axis=1)
+            fresh = self.attend_registers(variables, fresh, registers, jnp.minimum(span.lengths, span.stop))
+        return jax.lax.dynamic_update_slice_in_dim(refined, fresh, span.start, axis=1)
 
-    def decode_span(
-        self,
-        variables: Variables,
-        refined: jax.Array,
-        lengths: jax.Array,
-        start: jax.Array | int,
-        stop: jax.Array | int,
-        *,
-        size: int,
-    ) -> jax.Array:
+    def decode_span(self, variables: Variables, refined: jax.Array, span: Span, *, size: int) -> jax.Array:
         """The camera head's half of `fire`: over all frames so far, or group by group with a limited context."""
         group = self.config.windows.stride
         if self.config.refinement.context is None:
-            decoded = self.decode_cameras(variables, refined, jnp.minimum(lengths, stop))
-            return jax.lax.dynamic_slice_in_dim(decoded, start, size, axis=1)
+            decoded = self.decode_cameras(variables, refined, jnp.minimum(span.lengths, span.stop))
+            return jax.lax.dynamic_slice_in_dim(decoded, span.start, size, axis=1)
 
         def one_group(first: jax.Array) -> jax.Array:
-            return self._decode_group(variables, refined, lengths, first, jnp.minimum(first + group, stop))
+            last = jnp.minimum(first + group, span.stop)
+            return self._decode_group(variables, refined, Span(first, last, span.lengths))
 
-        decoded = jax.lax.map(one_group, start + group * jnp.arange(-(-size // group)))
+        decoded = jax.lax.map(one_group, span.start + group * jnp.arange(-(-size // group)))
         decoded = jnp.moveaxis(decoded, 0, 1)
         return decoded.reshape(decoded.shape[0], -1, *decoded.shape[3:])[:, :size]
 
-    def _decode_group(
-        self, variables: Variables, refined: jax.Array, lengths: jax.Array, start: jax.Array, stop: jax.Array
-    ) -> jax.Array:
-        """Pose encodings [B, s, R, 9] of frames start … stop − 1, at most s of them.
+    def _decode_group(self, variables: Variables, refined: jax.Array, span: Span) -> jax.Array:
+        """Pose encodings [B, s, R, 9] of the frames of a span of at most s.
 
-        The trunk sees frame 0 and the `context` frames up to `stop`, or to the item's own end if that comes first.
+        The trunk sees frame 0 and the `context` frames up to the span's stop, or to the item's own end if that comes
+        first.
         """
         context = self.config.refinement.context
         assert context is not None  # decode_span has looked
-        ends = jnp.minimum(stop, lengths)[:, None]
+        ends = jnp.minimum(span.stop, span.lengths)[:, None]
         oldest = jnp.maximum(ends - context, 0)
         recent = jnp.take_along_axis(refined, (oldest + jnp.arange(context))[..., None], axis=1, mode="clip")
         # Frame 0 has a place of its own, the last one, only where the recent frames do not include it.
         tokens = jnp.concatenate([recent, refined[:, :1]], axis=1)
         encodings = self.decode_cameras(variables, tokens, jnp.minimum(ends[:, 0], context + 1))
-        places = jnp.clip(start + jnp.arange(self.config.windows.stride) - oldest, 0, context)
+        places = jnp.clip(span.start + jnp.arange(self.config.windows.stride) - oldest, 0, context)
         return jnp.take_along_axis(encodings, places[..., None, None], axis=1)
 
     # All triggers.
@@ -167,8 +167,8 @@ class Refinement:
         )
 
         def one_trigger(refined: jax.Array, start: jax.Array) -> tuple[jax.Array, jax.Array]:
-            stop = jnp.minimum(start + size, num_frames)
-            return self.fire(variables, camera_tokens, registers, refined, lengths, start, stop, size=size)
+            span = Span(start, jnp.minimum(start + size, num_frames), lengths)
+            return self.fire(variables, camera_tokens, registers, refined, span, size=size)
 
         _, encodings = jax.lax.scan(one_trigger, camera_tokens, size * jnp.arange(triggers))
         encodings = jnp.moveaxis(encodings, 0, 1)

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 from logvggt_jax.model.aggregator import WindowTokens
 from logvggt_jax.model.logvggt import LogVGGT
-from logvggt_jax.model.refinement import num_triggers
+from logvggt_jax.model.refinement import Span, num_triggers
 from logvggt_jax.model.windows import num_windows
 from logvggt_jax.operations import count_flops
 
@@ -101,16 +101,16 @@ def _refinement_parts(model: LogVGGT, num_frames: int) -> list[Part]:
     variables = abstract_variables(model)
     tokens = jax.ShapeDtypeStruct((1, count, width), jnp.float32)
     scalar, lengths = jax.ShapeDtypeStruct((), jnp.int32), jax.ShapeDtypeStruct((1,), jnp.int32)
-    span = (lengths, scalar, scalar)
+    span = Span(scalar, scalar, lengths)  # type: ignore[arg-type]
     parts = []
     if settings.enabled:
         register_tokens = jax.ShapeDtypeStruct((1, count, model.config.aggregator.num_registers, width), jnp.float32)
         registers = jax.eval_shape(model.refinement.project_registers, variables, register_tokens)
         refine = functools.partial(model.refinement.refine_span, size=size)
         parts.append(Part("GCCR", model.refinement.project_registers, (register_tokens,), 1))
-        parts.append(Part("GCCR", refine, (tokens, registers, tokens, *span), triggers))
+        parts.append(Part("GCCR", refine, (tokens, registers, tokens, span), triggers))
     decode = functools.partial(model.refinement.decode_span, size=size)
-    return [*parts, Part("camera head", decode, (tokens, *span), triggers)]
+    return [*parts, Part("camera head", decode, (tokens, span), triggers)]
 
 
 def flops_by_part(model: LogVGGT, num_frames: int, image_size: tuple[int, int]) -> dict[str, float]:
