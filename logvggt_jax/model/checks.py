@@ -23,9 +23,15 @@ def check_images(images: jax.Array, patch_size: int, name: str = "images") -> No
     shape = tuple(images.shape)
     if len(shape) != 5 or shape[-1] != 3 or 0 in shape:
         raise ValueError(f"{name} must have shape [B, T, H, W, 3] with T >= 1, got {shape}")
-    if shape[2] % patch_size or shape[3] % patch_size:
+    check_pixels(images, patch_size, name)
+
+
+def check_pixels(images: Any, patch_size: int, name: str) -> None:
+    """Raises ValueError unless images [..., H, W, 3] are uint8 or floating point, H and W multiples of a patch."""
+    height, width = images.shape[-3:-1]
+    if height % patch_size or width % patch_size:
         raise ValueError(
-            f"{name} have height {shape[2]} and width {shape[3]}, which must be multiples of {patch_size}; "
+            f"{name} have height {height} and width {width}, which must be multiples of {patch_size}; "
             "logvggt_jax.preprocess resizes frames of any size"
         )
     if images.dtype != jnp.uint8 and not jnp.issubdtype(images.dtype, jnp.floating):

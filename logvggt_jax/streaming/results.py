@@ -13,6 +13,7 @@ import numpy as np
 from logvggt_jax.compile import out_of_device_memory
 from logvggt_jax.errors import InputError
 from logvggt_jax.geometry import decode_poses
+from logvggt_jax.model.checks import check_pixels
 
 
 class PredictionError(InputError):
@@ -84,13 +85,7 @@ def checked_frames(
     shape = frames.shape
     if len(shape) != 4 or shape[-1] != 3 or 0 in shape:
         raise ValueError(f"frames must have shape [n, H, W, 3] or [H, W, 3], got {shape}")
-    if shape[1] % patch_size or shape[2] % patch_size:
-        raise ValueError(
-            f"frames of {shape[1]} x {shape[2]} pixels: height and width must be multiples of {patch_size}; "
-            "logvggt_jax.preprocess resizes frames of any size"
-        )
-    if frames.dtype != np.uint8 and not np.issubdtype(frames.dtype, np.floating):
-        raise ValueError(f"frames must be uint8 or floating point in [0, 1], got dtype {frames.dtype}")
+    check_pixels(frames, patch_size, "frames")
     if before is not None and (before.shape != shape[1:] or before.dtype != frames.dtype):
         raise ValueError(
             f"frames of a stream must be alike: {before.dtype} {before.shape} before, now {frames.dtype} {shape[1:]}"
