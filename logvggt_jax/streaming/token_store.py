@@ -76,7 +76,7 @@ class TokenStore:
         self.camera, self.refined, self.registers = _grown(buffers, room=wanted - self.capacity)
 
     def trim(self) -> None:
-        """Gives back the room beyond the last frame, in steps of the first capacity: what reads all runs once."""
+        """Gives back the room beyond the last frame, in steps of the first capacity."""
         room = -(-self.count // self._first_capacity) * self._first_capacity
         buffers = (self.camera, self.refined, self.registers)
         self.camera, self.refined, self.registers = jax.tree.map(lambda x: x[:, :room], buffers)

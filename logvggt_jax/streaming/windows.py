@@ -17,6 +17,7 @@ from logvggt_jax.config import RefinementConfig
 from logvggt_jax.model.gccr import RegisterKeys
 from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.model.parameters import in_compute_type
+from logvggt_jax.model.refinement import Span
 from logvggt_jax.model.windows import WindowState
 from logvggt_jax.streaming.results import Cameras, FrameResult, checked_frames, decoded_cameras, device_memory
 from logvggt_jax.streaming.token_store import TokenStore
@@ -54,15 +55,12 @@ def _fire(
     camera_tokens: jax.Array,
     registers: RegisterKeys | None,
     refined: jax.Array,
-    start: jax.Array,
-    stop: jax.Array,
+    span: Span,
     *,
     size: int,
 ) -> tuple[jax.Array, jax.Array]:
-    """One trigger: refined tokens with frames [start, stop) added, and pose encodings [size, 9] from `start`."""
-    refined, encodings = model.refinement.fire(
-        variables, camera_tokens, registers, refined, stop[None], start, stop, size=size
-    )
+    """One trigger: refined tokens with the span's frames added, and pose encodings [size, 9] from its start."""
+    refined, encodings = model.refinement.fire(variables, camera_tokens, registers, refined, span, size=size)
     return refined, encodings[0, :, -1]
 
 
@@ -150,7 +148,8 @@ class StreamSession:
         self._state: WindowState | None = None
         self._flights: deque[_Flight] = deque()
         self._newest: np.ndarray | None = None
-        self._received = self._steps = 0
+        self._image_size = (1, 1)  # (H, W), known with the first frame
+        self._received = 0
         # Frames whose pose some trigger has taken, whether it is here or still on its way.
         self._refined = 0
         self._encodings = np.zeros((0, 9), np.float32)
@@ -202,7 +201,7 @@ class StreamSession:
         with self._memory():
             if self._state is None:
                 self._begin()
-            if self._pending or self._steps == 0:
+            if self._pending or self._store.count == 0:
                 self._one_step()
             assert self._state is not None  # set by _begin
             self._take_off(_finish(self._windows, self._variables, self._state))
@@ -212,8 +211,7 @@ class StreamSession:
     def cameras(self, *, provisional: bool = False) -> Cameras:
         """Cameras of the frames whose pose is final; with `provisional` of all frames handed out."""
         encodings = self._all_encodings(provisional=provisional)
-        size = self._image_size if len(encodings) else (1, 1)
-        return decoded_cameras(encodings, size, final=len(self._encodings))
+        return decoded_cameras(encodings, self._image_size, final=len(self._encodings))
 
     def cameras_with(self, refinement: RefinementConfig) -> Cameras:
         """Cameras of all frames of a closed stream, as another mode of refinement gives them.
@@ -234,7 +232,7 @@ class StreamSession:
         return decoded_cameras(np.asarray(encodings)[: store.count], self._image_size, final=store.count)
 
     def _memory(self) -> AbstractContextManager[None]:
-        height, width = getattr(self, "_image_size", (0, 0))
+        height, width = self._image_size
         frames = self._model.config.windows.size
         return device_memory(f"a window of {frames} frames of {height} x {width} pixels", "take smaller frames")
 
@@ -278,7 +276,6 @@ class StreamSession:
         frames, mask = self._take(self._model.config.windows.stride)
         assert self._state is not None
         self._state, out = _step(self._windows, self._variables, self._state, frames, mask)
-        self._steps += 1
         self._take_off(out)
 
     def _take_off(self, output: WindowOutput) -> None:
@@ -303,6 +300,9 @@ class StreamSession:
             if not due and not last:
                 break
             stop = self._refined + period if due and period is not None else count
+            if period is None:
+                # What reads all frames runs once: at their number, not at the buffers' size.
+                self._store.trim()
             self._store.refined, encodings = self._trigger(self._refined, stop)
             poses.append((encodings, stop - self._refined))
             self._refined = stop
@@ -313,8 +313,6 @@ class StreamSession:
         store, period = self._store, self._model.config.refinement.period
         if period is not None:
             store.reserve(start + period)
-        elif self._closed:
-            store.trim()
         assert store.camera is not None and store.refined is not None
         return _fire(
             self._model,
@@ -322,8 +320,7 @@ class StreamSession:
             store.camera,
             store.registers,
             store.refined,
-            jnp.int32(start),
-            jnp.int32(stop),
+            Span(jnp.int32(start), jnp.int32(stop), jnp.full(1, stop, jnp.int32)),
             size=store.capacity if period is None else period,
         )
 
