@@ -20,8 +20,10 @@ from typing import Any
 import cv2
 import numpy as np
 
+from logvggt_jax import LogVGGT
 from logvggt_jax.geometry import encode_poses
-from logvggt_jax.reconstruction.reconstruct import reconstruct_with
+from logvggt_jax.reconstruction import reconstruct
+from logvggt_jax.streaming import METHODS, Method, WindowSettings
 from logvggt_jax.streaming.results import Cameras, FrameResult, decoded_cameras
 
 SIZE = (392, 518)
@@ -145,8 +147,15 @@ def main() -> None:
         size = write_sequence(folder, options.frames)
         print(f"{options.frames} files of 640 x 480 pixels, {size:.0f} kB each, to {SIZE[0]} x {SIZE[1]}")
         started, used = time.perf_counter(), time.process_time()
-        result = reconstruct_with(
-            lambda: predictor, folder, Path(scratch) / "out", workers=options.workers, progress=False
+        METHODS["clock"] = Method(lambda *_: predictor, WindowSettings, "windows", "a clock in the device's place")
+        result = reconstruct(
+            folder,
+            Path(scratch) / "out",
+            model=LogVGGT(),
+            variables={},
+            method="clock",
+            workers=options.workers,
+            progress=False,
         )
         seconds, used = time.perf_counter() - started, time.process_time() - used
         assert result.num_frames == options.frames and result.seconds is not None

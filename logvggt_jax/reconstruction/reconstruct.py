@@ -115,36 +115,6 @@ def reconstruct(
       OutputExists: `output` exists.
       InputError: bad source or parameters, or a sequence that the method cannot predict; nothing is left behind.
     """
-    return reconstruct_with(
-        lambda: open_predictor(method, model, variables, settings),
-        source_path,
-        output,
-        longer_edge=longer_edge,
-        stride=stride,
-        max_frames=max_frames,
-        point_filter=point_filter,
-        num_previews=num_previews,
-        overwrite=overwrite,
-        progress=progress,
-        workers=workers,
-    )
-
-
-def reconstruct_with(
-    start: Callable[[], Predictor],
-    source_path: str | Path,
-    output: str | Path,
-    *,
-    longer_edge: int = LONGER_EDGE,
-    stride: int = 1,
-    max_frames: int | None = None,
-    point_filter: PointFilter | None = None,
-    num_previews: int = 8,
-    overwrite: bool = False,
-    progress: bool = True,
-    workers: int | None = None,
-) -> Reconstruction:
-    """As `reconstruct`, with the predictor that `start` opens."""
     if num_previews < 0:
         raise InputError(f"num_previews must not be negative, got {num_previews}")
     source = check_request(
@@ -160,7 +130,7 @@ def reconstruct_with(
         task = bars.add_task("Depth and cameras", total=source.expected_frames)
         started = time.monotonic()
         selection = PointSelection(point_filter or PointFilter(), source.expected_frames)
-        predictor = start()
+        predictor = open_predictor(method, model, variables, settings)
         sequence = _stream(
             source, folder, predictor, pool, selection, longer_edge=longer_edge, advance=lambda: bars.advance(task)
         )

@@ -6,7 +6,7 @@ number is a number of the code that users run. A new method is a file of this fo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -66,7 +66,7 @@ class Method(NamedTuple):
     summary: str
 
 
-METHODS: Mapping[str, Method] = {
+METHODS: dict[str, Method] = {
     "windows": Method(
         StreamSession.from_settings,
         WindowSettings,

@@ -6,6 +6,7 @@ import importlib
 import threading
 import weakref
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,10 +20,11 @@ from logvggt_jax.reconstruction.cameras_file import read_cameras
 from logvggt_jax.reconstruction.depth_files import read_depth
 from logvggt_jax.reconstruction.exporters.tum import read_trajectory
 from logvggt_jax.reconstruction.point_cloud import PointFilter, count_points
-from logvggt_jax.reconstruction.reconstruct import reconstruct, reconstruct_with
+from logvggt_jax.reconstruction.reconstruct import reconstruct
 from logvggt_jax.reconstruction.result import Reconstruction
 from logvggt_jax.reconstruction.room_sequence import write_room_sequence
 from logvggt_jax.reconstruction.sources import open_source
+from logvggt_jax.streaming import METHODS, Method, WindowSettings
 from logvggt_jax.streaming.chunks import ChunkPlan
 from logvggt_jax.streaming.offline import predict_plain
 from logvggt_jax.streaming.results import Cameras, FrameResult, decoded_cameras
@@ -250,6 +252,15 @@ class Recorder:
         return decoded_cameras(encodings, (28, 42), final=self.num_frames)
 
 
+def reconstruct_recorded(predictor: Recorder, source: Path, output: Path, **options: Any) -> Reconstruction:
+    """A reconstruction by a method whose predictor this is."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(METHODS, "recorder", Method(lambda *_: predictor, WindowSettings, "windows", "records"))
+        return reconstruct(
+            source, output, model=LogVGGT(), variables={}, method="recorder", longer_edge=LONGER_EDGE, **options
+        )
+
+
 @pytest.fixture
 def walk(room: Path, tmp_path: Path) -> Path:
     """Forty frames of a folder."""
@@ -266,14 +277,8 @@ def test_the_number_of_workers_changes_no_byte(walk: Path, tmp_path: Path) -> No
     written = {}
     for workers in (1, 4):
         predictor = Recorder()
-        result = reconstruct_with(
-            lambda p=predictor: p,
-            walk,
-            tmp_path / f"{workers}",
-            longer_edge=LONGER_EDGE,
-            point_filter=thinned,
-            progress=False,
-            workers=workers,
+        result = reconstruct_recorded(
+            predictor, walk, tmp_path / f"{workers}", point_filter=thinned, progress=False, workers=workers
         )
         assert predictor.threads == {threading.get_ident()}
         files = sorted(path for path in result.folder.rglob("*") if path.is_file())
@@ -299,7 +304,7 @@ def test_a_full_disk_stops_the_run_with_its_own_error(
     monkeypatch.setattr(reconstruct_module, written, failing)
     predictor = Recorder()
     with pytest.raises(DiskError, match=r"003\.\w+: No space left"):
-        reconstruct_with(lambda: predictor, walk, tmp_path / "out", longer_edge=LONGER_EDGE, progress=False, workers=1)
+        reconstruct_recorded(predictor, walk, tmp_path / "out", progress=False, workers=1)
     assert predictor.num_frames < 30
     assert [entry.name for entry in tmp_path.iterdir()] == ["walk"]
 
@@ -309,7 +314,7 @@ def test_one_bar_on_standard_error_if_that_is_a_terminal(
     walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, terminal: str
 ) -> None:
     monkeypatch.setenv("TTY_COMPATIBLE", terminal)
-    reconstruct_with(Recorder, walk, tmp_path / "out", longer_edge=LONGER_EDGE, workers=2)
+    reconstruct_recorded(Recorder(), walk, tmp_path / "out", workers=2)
     shown = capsys.readouterr()
     assert shown.out == ""
     if terminal == "0":
@@ -334,7 +339,7 @@ def test_each_frame_is_resized_once_and_few_are_alive(
         return image, transform
 
     monkeypatch.setattr(reconstruct_module, "resize", watched)
-    reconstruct_with(Recorder, walk, tmp_path / "out", longer_edge=LONGER_EDGE, progress=False, workers=2)
+    reconstruct_recorded(Recorder(), walk, tmp_path / "out", progress=False, workers=2)
     assert len(made) == 40
     # Six ahead, two in the predictor, one in either worker.
     assert max(alive) <= 10
