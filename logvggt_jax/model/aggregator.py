@@ -118,30 +118,35 @@ class Aggregator(nn.Module):
             if self.remat:
                 by_parameters = jax.checkpoint(by_parameters, prevent_cse=False)
 
-        key_tokens, layer = [], 0
-        while layer < sizes.depth:
-            # Layers whose output is handed out, or that read a memory, stand between the loops.
-            stop = next(n for n in range(layer, sizes.depth) if n in outlets or memory.at(n) is not None)
-            if stacks is not None and stop > layer:
-                x, _ = jax.lax.scan(
-                    lambda x, params: (by_parameters(params, x)[1], None),
-                    x,
-                    jax.tree.map(lambda stack, a=layer, b=stop: stack[a:b], stacks),
-                )
-                layer = stop
-            read = memory.at(layer)
+        def single(
+            layer: int, x: jax.Array, read: LayerMemory | None
+        ) -> tuple[jax.Array, jax.Array, LayerMemory | None]:
+            if stacks is not None:
+                return by_parameters(jax.tree.map(lambda stack: stack[layer], stacks), x, read)
+            return one_layer(block(name=f"frame_block_{layer}"), block(name=f"global_block_{layer}"), x, read)
+
+        def plain(first: int, stop: int, x: jax.Array) -> jax.Array:
+            """Layers first … stop − 1, which read no memory and hand nothing out."""
             if stacks is None:
-                blocks = block(name=f"frame_block_{layer}"), block(name=f"global_block_{layer}")
-                frame_out, x, left = one_layer(*blocks, x, read)
-            else:
-                frame_out, x, left = by_parameters(jax.tree.map(lambda stack, i=layer: stack[i], stacks), x, read)
+                for layer in range(first, stop):
+                    _, x, _ = single(layer, x, None)
+            elif first < stop:
+                some = jax.tree.map(lambda stack: stack[first:stop], stacks)
+                x, _ = jax.lax.scan(lambda x, params: (by_parameters(params, x)[1], None), x, some)
+            return x
+
+        key_tokens, first = [], 0
+        for layer in range(sizes.depth):
+            read = memory.at(layer)
+            if read is None and layer not in outlets:
+                continue
+            frame_out, x, left = single(layer, plain(first, layer, x), read)
+            first = layer + 1
             if left is not None:
                 memory = memory.updated(layer, left)
-            if layer in outlets:
-                both = jnp.concatenate([frame_out, x], axis=-1)
+            both = jnp.concatenate([frame_out, x], axis=-1)
             if layer in sizes.key_layers:
                 key_tokens.append(both.astype(config.dtype))
-            layer += 1
         return WindowTokens(jnp.stack(key_tokens, axis=1), both[:, :, :num_special]), memory
 
     def _special_tokens(self, starts_sequence: jax.Array, batch: int, frames: int, width: int) -> jax.Array:
