@@ -67,15 +67,12 @@ def _reconstruct(options: argparse.Namespace) -> None:
     from logvggt_jax.reconstruction.method import choose_method
     from logvggt_jax.reconstruction.point_cloud import PointFilter
     from logvggt_jax.reconstruction.reconstruct import LONGER_EDGE, check_request, reconstruct
+    from logvggt_jax.reconstruction.sources import open_source
     from logvggt_jax.weights.checkpoints import from_pretrained, read_provenance
 
-    selection = {
-        "stride": options.stride,
-        "max_frames": options.max_frames,
-        "overwrite": options.overwrite,
-    }
     # Before the model: a misspelt path should not have to wait for gigabytes of weights.
-    check_request(options.source, options.output, longer_edge=options.longer_edge, **selection)
+    source = open_source(options.source, stride=options.stride, max_frames=options.max_frames)
+    check_request(source, options.output, longer_edge=options.longer_edge, overwrite=options.overwrite)
     check_devices()
     enable_compilation_cache(options.compilation_cache)
     point_filter = PointFilter(
@@ -91,7 +88,7 @@ def _reconstruct(options: argparse.Namespace) -> None:
     # Here rather than in the stream alone, so that nothing keeps the float32 parameters on the device.
     variables = in_compute_type(variables, model.config)
     result = reconstruct(
-        options.source,
+        source,
         options.output,
         model=model,
         variables=variables,
@@ -100,7 +97,7 @@ def _reconstruct(options: argparse.Namespace) -> None:
         longer_edge=options.longer_edge or provenance.longer_edge or LONGER_EDGE,
         point_filter=point_filter,
         num_previews=options.previews,
-        **selection,
+        overwrite=options.overwrite,
     )
     print(result.summary())
 

@@ -2,8 +2,10 @@
 
 import ctypes
 import gc
+import inspect
 import os
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -52,6 +54,24 @@ def _programs_go_with_their_file() -> Iterator[None]:
     gc.collect()
     if sys.platform == "linux":
         ctypes.CDLL(None).malloc_trim(0)
+
+
+@pytest.fixture
+def abandoned_reads(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """For tests that damage what Orbax reads: when one read fails it drops the others, and each complains of that
+    whenever it ends. They end here, not in the middle of a later test."""
+    monkeypatch.setattr(sys, "unraisablehook", lambda _: None)
+    yield
+    end = time.monotonic() + 10
+    gc.collect()
+    while _reads_are_alive() and time.monotonic() < end:
+        time.sleep(0.05)
+        gc.collect()
+
+
+def _reads_are_alive() -> bool:
+    coroutines = (each for each in gc.get_objects() if inspect.iscoroutine(each))
+    return any("orbax" in coroutine.cr_code.co_filename for coroutine in coroutines)
 
 
 def _shared(*parts: str) -> Path:

@@ -14,7 +14,7 @@ from PIL import Image
 from logvggt_jax.data.rooms.rooms import Rooms
 from logvggt_jax.doctor.finding import Finding
 from logvggt_jax.doctor.subject import Subject, random_variables
-from logvggt_jax.reconstruction import reconstruct
+from logvggt_jax.reconstruction import open_source, reconstruct
 
 _RENDERED = 4  # distinct frames, shown in turn: rendering is not what is measured
 
@@ -36,12 +36,11 @@ def examine(subject: Subject) -> Iterator[Finding]:
         for name, frames in (("first", 6), ("timed", count)):
             started, cores = time.perf_counter(), time.process_time()
             result = reconstruct(
-                folder,
+                open_source(folder, max_frames=frames),
                 Path(temporary) / name,
                 model=subject.model,
                 variables=variables,
                 longer_edge=max(subject.image_size),
-                max_frames=frames,
                 progress=False,
             )
             seconds, cores = time.perf_counter() - started, time.process_time() - cores

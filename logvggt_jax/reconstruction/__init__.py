@@ -7,15 +7,15 @@ from logvggt_jax.reconstruction.exporters.tum import read_trajectory, write_traj
 from logvggt_jax.reconstruction.point_cloud import PointFilter
 from logvggt_jax.reconstruction.reconstruct import reconstruct
 from logvggt_jax.reconstruction.result import Reconstruction
-from logvggt_jax.reconstruction.sources import FolderSource, SourceFrame, VideoSource, open_source
+from logvggt_jax.reconstruction.sources import Source, SourceFrame, SourceOptions, open_source
 
 __all__ = [
     "EXPORTERS",
-    "FolderSource",
     "PointFilter",
     "Reconstruction",
+    "Source",
     "SourceFrame",
-    "VideoSource",
+    "SourceOptions",
     "open_source",
     "read_cameras",
     "read_depth",

@@ -49,30 +49,19 @@ from logvggt_jax.streaming import Cameras, FrameResult, Predictor, open_predicto
 _NARROWEST_FIELD_OF_VIEW = 0.01  # radians
 
 
-def check_request(
-    source_path: str | Path,
-    output: str | Path,
-    *,
-    longer_edge: int | None = None,
-    stride: int = 1,
-    max_frames: int | None = None,
-    overwrite: bool = False,
-) -> Source:
-    """The source, if `reconstruct` can begin; for callers that want to know before they load a large model.
-
-    Arguments and errors as in `reconstruct`.
+def check_request(source: Source, output: str | Path, *, longer_edge: int | None, overwrite: bool) -> Path:
+    """The absolute path of the output, if `reconstruct` can begin; for callers that want to know before they load a
+    large model. Arguments and errors as in `reconstruct`.
     """
     if longer_edge is not None:
         check_longer_edge(longer_edge)
-    source = open_source(source_path, stride=stride, max_frames=max_frames)
     if Path(output).expanduser().resolve() in (source.path.resolve(), *source.path.resolve().parents):
         raise InputError(f"output {output} contains the source {source.path}: choose another output")
-    check_output(output, overwrite=overwrite, marker=CAMERAS_FILE)
-    return source
+    return check_output(output, overwrite=overwrite, marker=CAMERAS_FILE)
 
 
 def reconstruct(
-    source_path: str | Path,
+    source: Source | str | Path,
     output: str | Path,
     *,
     model: LogVGGT,
@@ -80,8 +69,6 @@ def reconstruct(
     method: str = "windows",
     settings: Any = None,
     longer_edge: int = LONGER_EDGE,
-    stride: int = 1,
-    max_frames: int | None = None,
     point_filter: PointFilter | None = None,
     num_previews: int = 8,
     overwrite: bool = False,
@@ -95,7 +82,7 @@ def reconstruct(
     but for the cameras and at most 104 MB of candidates for the point cloud, memory on the device is the method's.
 
     Args:
-      source_path: folder of images or video, see `open_source`.
+      source: folder of images or video; what `open_source` gives chooses among the frames.
       output: folder to make; it appears when all is done, until then the work lies beside it in a `.partial` folder.
       model: the model.
       variables: {"params": …}.
@@ -103,8 +90,6 @@ def reconstruct(
       settings: of the method's own settings class; None for its defaults.
       longer_edge: size in pixels, a multiple of 14, to which the longer edge of the frames is resized; take
         what the model was trained with (518 for VGGT).
-      stride: take every `stride`-th frame.
-      max_frames: stop after so many.
       point_filter: which pixels become points.
       num_previews: pictures of frames beside their depth, evenly over the sequence.
       overwrite: replace an earlier reconstruction.
@@ -117,10 +102,8 @@ def reconstruct(
     """
     if num_previews < 0:
         raise InputError(f"num_previews must not be negative, got {num_previews}")
-    source = check_request(
-        source_path, output, longer_edge=longer_edge, stride=stride, max_frames=max_frames, overwrite=overwrite
-    )
-    target = Path(output).expanduser().resolve()
+    source = source if isinstance(source, Source) else open_source(source)
+    target = check_request(source, output, longer_edge=longer_edge, overwrite=overwrite)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Rate(), TimeRemainingColumn())
     console = Console(stderr=True)
     bars = Progress(*columns, console=console, disable=not (progress and console.is_terminal))
@@ -185,8 +168,10 @@ def _stream(
     timestamps: list[float] = []
     transform = None
 
-    def prepare(load: Callable[[], SourceFrame]) -> _Picture:
+    def prepare(load: Callable[[], SourceFrame | None]) -> _Picture | None:
         frame = load()
+        if frame is None:
+            return None
         image, transform = resize(frame.image, longer_edge=longer_edge)
         write_picture(image_file(folder, frame.name), image)
         return _Picture(frame.name, frame.timestamp, image, transform)
@@ -204,6 +189,8 @@ def _stream(
             advance()
 
     for picture in pool.map(prepare, source.loaders()):
+        if picture is None:
+            continue
         images[len(names)] = picture.image
         names.append(picture.name)
         timestamps.append(picture.timestamp)

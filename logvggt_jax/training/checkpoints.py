@@ -15,7 +15,7 @@ from logvggt_jax.model.parameters import stack_layers, unstack_layers
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.processes import any_process
 from logvggt_jax.training.state import TrainState
-from logvggt_jax.weights.checkpoints import check_destination, digests, save_model, verify_digests
+from logvggt_jax.weights.checkpoints import check_destination, digests, read_with_orbax, save_model, verify_digests
 from logvggt_jax.weights.provenance import Provenance
 
 # How fast, from where and with how many broken clips the data come; the data stream checks that they are the same.
@@ -142,12 +142,7 @@ class RunCheckpoints:
         return stack_layers(state) if layer_by_layer else state, Position(meta["stage"], restored["data"])
 
     def _read(self, step: int, args: Any, where: str, mend: str) -> Mapping[str, Any]:
-        try:
-            return self._manager.restore(step, args=args)
-        except Exception as error:
-            # Orbax raises bare Exception, among others, for truncated and missing files.
-            reason = " ".join(str(error).split())
-            raise InputError(f"{where} cannot be read ({type(error).__name__}: {reason:.200}); {mend}") from error
+        return read_with_orbax(lambda: self._manager.restore(step, args=args), where, mend)
 
     def _check_configuration(self, stored: Mapping[str, Any], where: str) -> None:
         ours = self.config.to_dict()

@@ -11,7 +11,7 @@ import dataclasses
 import hashlib
 import importlib.metadata
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from logvggt_jax.config import ModelConfig, from_mapping
-from logvggt_jax.errors import InputError, MissingInput, OutputExists, disk_errors
+from logvggt_jax.errors import InputError, MissingInput, OutputExists, disk_errors, one_line
 from logvggt_jax.files import atomic_folder
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.weights.files import open_state_dict
@@ -263,24 +263,31 @@ def _restore(path: Path, target: Any) -> Any:
     """Parameters in the shapes and placement of `target`, after a check that these are the stored shapes."""
     if not path.is_dir():
         raise MissingInput(f"{path}: the parameters are missing; {_MEND}")
-    try:
+
+    def read() -> Any:
         with _checkpointer() as checkpointer:
             stored = checkpointer.metadata(path).item_metadata
             if stored is None:
                 raise FileNotFoundError("Orbax's description of the parameters is missing")
             if wrong := first_misfit(stored.tree, target, "the configuration in config.json"):
-                raise _OtherModelError(f"{path}: {wrong}; the two belong to different models")
+                raise InputError(f"{path}: {wrong}; the two belong to different models")
             return checkpointer.restore(path, target)
-    except _OtherModelError:
+
+    return read_with_orbax(read, f"{path}:", _MEND)
+
+
+def read_with_orbax(read: Callable[[], Any], where: str, mend: str) -> Any:
+    """What `read` returns; what Orbax raises, bare Exception among others, as an InputError with `where` and `mend`.
+
+    An InputError that `read` raises itself passes through.
+    """
+    try:
+        return read()
+    except InputError:
         raise
     except Exception as error:
-        # Orbax raises bare Exception, among others, for truncated and missing files.
-        reason = " ".join(str(error).split())
-        raise InputError(f"{path}: cannot be read ({type(error).__name__}: {reason:.200}); {_MEND}") from error
-
-
-class _OtherModelError(InputError):
-    """The stored parameters are not those of the configuration."""
+        reason = f"{type(error).__name__}: {one_line(error):.200}"
+        raise InputError(f"{where} cannot be read ({reason}); {mend}") from error
 
 
 @contextlib.contextmanager

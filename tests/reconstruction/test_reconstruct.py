@@ -184,13 +184,11 @@ def test_a_video_gives_the_same_results_as_a_folder_of_its_frames(
 
 def test_a_limit_on_points_holds(model: LogVGGT, variables: dict, room: Path, tmp_path: Path) -> None:
     limited = reconstruct(
-        room,
+        open_source(room, stride=2, max_frames=3),
         tmp_path / "out",
         model=model,
         variables=variables,
         longer_edge=LONGER_EDGE,
-        stride=2,
-        max_frames=3,
         point_filter=PointFilter(edge_threshold=None, max_points=100),
         num_previews=0,
         progress=False,
@@ -403,12 +401,11 @@ def test_no_field_of_view_is_reported_and_replaced(model: LogVGGT, variables: di
     }
     with pytest.warns(UserWarning, match="3 of 3 frames have no field of view"):
         reconstruct(
-            room,
+            open_source(room, max_frames=3),
             tmp_path / "out",
             model=model,
             variables={"params": params},
             longer_edge=LONGER_EDGE,
-            max_frames=3,
             progress=False,
         )
     cameras = read_cameras(tmp_path / "out" / "cameras.json")

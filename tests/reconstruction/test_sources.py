@@ -8,8 +8,14 @@ import cv2
 import numpy as np
 import pytest
 
-from logvggt_jax.reconstruction import sources
-from logvggt_jax.reconstruction.sources import FolderSource, SourceFrame, VideoSource, open_source
+from logvggt_jax.reconstruction.sources import (
+    FolderSource,
+    SourceFrame,
+    SourceOptions,
+    VideoSource,
+    image_folder,
+    open_source,
+)
 
 
 def write_image(path: Path, value: int, size: tuple[int, int] = (20, 30)) -> None:
@@ -66,7 +72,7 @@ def test_names_differ_where_stems_do_not(tmp_path: Path) -> None:
 def test_stride_and_limit_keep_the_position_as_time(tmp_path: Path) -> None:
     for number in range(10):
         write_image(tmp_path / f"{number}.png", number)
-    source = FolderSource(tmp_path, stride=3, max_frames=3)
+    source = FolderSource(tmp_path, SourceOptions(stride=3, max_frames=3))
     assert reds(list(source)) == [0, 3, 6]
     assert [frame.timestamp for frame in source] == [0, 3, 6]
     assert len(source) == source.expected_frames == 3
@@ -76,8 +82,8 @@ def test_folder_reads_a_file_only_when_it_is_reached(tmp_path: Path, monkeypatch
     for number in range(5):
         write_image(tmp_path / f"{number}.png", number)
     read: list[str] = []
-    original = sources.read_rgb
-    monkeypatch.setattr(sources, "read_rgb", lambda path: read.append(path.name) or original(path))
+    original = image_folder.read_rgb
+    monkeypatch.setattr(image_folder, "read_rgb", lambda path: read.append(path.name) or original(path))
     frames = iter(open_source(tmp_path))
     assert read == []
     next(frames)
@@ -138,7 +144,7 @@ def test_real_video_is_counted_by_decoding(examples_dir: Path) -> None:
 
 def test_video_that_ends_early_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_video(tmp_path / "clip.mp4", 12)
-    source = VideoSource(tmp_path / "clip.mp4")
+    source = VideoSource(tmp_path / "clip.mp4", SourceOptions())
     monkeypatch.setattr(source, "_announced", 40)
     with pytest.warns(UserWarning, match="12 frames decoded, its header announces 40"):
         assert len(list(source)) == 12

@@ -150,6 +150,7 @@ def test_finished_run_is_left_alone(run_config: TrainConfig, straight: tuple[Tra
     assert _numbers(finished) == _numbers(straight[1])
 
 
+@pytest.mark.usefixtures("abandoned_reads")
 def test_damaged_checkpoint_is_named_with_the_way_out(
     run_config: TrainConfig, straight: tuple[TrainState, Path], finished: Path
 ) -> None:

@@ -1,10 +1,8 @@
 """Model folders: what is saved comes back, and what is damaged is named."""
 
 import dataclasses
-import gc
 import json
 import shutil
-import time
 
 import jax
 import jax.numpy as jnp
@@ -46,15 +44,6 @@ def vggt_file(tmp_path_factory, vggt_state_dict):
     path = tmp_path_factory.mktemp("vggt") / "model.safetensors"
     save_file(vggt_state_dict, path)
     return path
-
-
-@pytest.fixture
-def abandoned_reads():
-    """When one read fails Orbax drops the others; their complaints belong to the test that made them."""
-    yield
-    for _ in range(3):  # on busy cores they end a little later
-        time.sleep(0.1)
-        gc.collect()
 
 
 def _edit(folder, change):
@@ -154,7 +143,6 @@ def test_a_changed_leaf_is_named(folder, small_variables):
         load_model(folder)
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.usefixtures("abandoned_reads")
 def test_flipped_bytes_of_a_stored_array_are_noticed(folder):
     data = max((file for file in folder.rglob("*") if file.parent.name == "d"), key=lambda file: file.stat().st_size)
@@ -167,7 +155,6 @@ def test_flipped_bytes_of_a_stored_array_are_noticed(folder):
     assert str(folder) in str(caught.value) and "\n" not in str(caught.value)
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.usefixtures("abandoned_reads")
 def test_a_truncated_or_missing_file_is_an_error(folder):
     data = max((file for file in folder.rglob("*") if file.parent.name == "d"), key=lambda file: file.stat().st_size)

@@ -1,0 +1,35 @@
+"""Frames of a folder or a video, read one at a time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from logvggt_jax.errors import InputError, MissingInput
+from logvggt_jax.reconstruction.sources.image_folder import IMAGE_SUFFIXES, FolderSource
+from logvggt_jax.reconstruction.sources.source import Source, SourceFrame, SourceOptions
+from logvggt_jax.reconstruction.sources.video import VideoSource
+
+__all__ = ["FolderSource", "Source", "SourceFrame", "SourceOptions", "VideoSource", "open_source"]
+
+
+def open_source(path: str | Path, **options: Any) -> Source:
+    """A folder of images or a video as a `Source`.
+
+    Args:
+      path: folder or video file.
+      options: those of `SourceOptions`: which frames are taken.
+
+    Raises:
+      MissingInput: nothing is there, or the folder holds no image.
+      InputError: the file is no video, or an option is out of range.
+    """
+    chosen = SourceOptions(**options)
+    path = Path(path).expanduser()
+    if not path.exists():
+        raise MissingInput(f"{path} does not exist: expected a folder of images or a video file")
+    if path.is_dir():
+        return FolderSource(path, chosen)
+    if path.suffix.lower() in IMAGE_SUFFIXES:
+        raise InputError(f"{path} is a single image: give the folder that holds the sequence, or a video")
+    return VideoSource(path, chosen)

@@ -1,0 +1,125 @@
+"""What a source of frames is: the frames, which of them are taken, and what is said about the others."""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+import hashlib
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from logvggt_jax.errors import InputError
+
+SIZE_MISMATCH = ("error", "crop", "skip")
+
+
+class SourceFrame(NamedTuple):
+    """One frame of a source.
+
+    Attributes:
+      name: file name without suffix, or `frame-000123` with the position in the video.
+      timestamp: seconds from the video's start; for folders, which know no time, the position in the sorted folder.
+      image: [H, W, 3] uint8 RGB.
+    """
+
+    name: str
+    timestamp: float
+    image: np.ndarray
+
+
+class SkippedFrame(NamedTuple):
+    """A frame that could not be read: its name, and why in one line."""
+
+    name: str
+    reason: str
+
+
+@dataclasses.dataclass(frozen=True)
+class SourceOptions:
+    """Which frames of a source are taken.
+
+    Attributes:
+      stride: take every n-th frame.
+      max_frames: stop after so many; None for all.
+      fps: take at most so many frames a second, by their time stamps; None for all.
+      start, end: seconds of the video; None for its beginning and end.
+      pattern: glob that names of image files have to match; None for all.
+      size_mismatch: what happens to images of another size than the first: `error`, `crop` or `skip`.
+      strict: a frame that cannot be read is an error. Otherwise it is left out and listed.
+      most_broken: the share of the frames that may be left out so, beyond a first two.
+    """
+
+    stride: int = 1
+    max_frames: int | None = None
+    fps: float | None = None
+    start: float | None = None
+    end: float | None = None
+    pattern: str | None = None
+    size_mismatch: str = "error"
+    strict: bool = False
+    most_broken: float = 0.05
+
+    def __post_init__(self) -> None:
+        for name in ("stride", "max_frames"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise InputError(f"{name} must be at least 1, got {value}")
+        if self.fps is not None and not 0 < self.fps < float("inf"):
+            raise InputError(f"fps must be above 0, got {self.fps}")
+        if not 0 <= (self.start or 0.0) < (float("inf") if self.end is None else self.end):
+            raise InputError(f"start must lie between 0 and the end ({self.end} s), got {self.start} s")
+        if self.size_mismatch not in SIZE_MISMATCH:
+            raise InputError(f"size_mismatch must be one of {', '.join(SIZE_MISMATCH)}, got {self.size_mismatch!r}")
+
+
+class Source(abc.ABC):
+    """Frames in order. Everything that headers say is checked when it is opened; pixels are read as they are needed.
+
+    Attributes:
+      path: folder or file.
+      options: which frames are taken.
+      notes: what the user should know before the work begins, one line each: what is left out, and why.
+      skipped: frames that could not be read, filled while frames are loaded.
+    """
+
+    def __init__(self, path: Path, options: SourceOptions) -> None:
+        self.path, self.options = path, options
+        self.notes: list[str] = []
+        self.skipped: list[SkippedFrame] = []
+
+    def __iter__(self) -> Iterator[SourceFrame]:
+        """The frames that can be read, one at a time."""
+        return (frame for load in self.loaders() if (frame := load()) is not None)
+
+    @property
+    @abc.abstractmethod
+    def expected_frames(self) -> int | None:
+        """Number of frames as far as it is known before they are read; None where it is not."""
+
+    @property
+    @abc.abstractmethod
+    def image_size(self) -> tuple[int, int] | None:
+        """(H, W) of the frames as they will be handed out; None where it is known with the first frame only."""
+
+    @abc.abstractmethod
+    def fingerprint(self) -> str:
+        """Digest of what decides the frames: options, and names, sizes and times of change of the files."""
+
+    @abc.abstractmethod
+    def loaders(self, first: int = 0) -> Iterator[Callable[[], SourceFrame | None]]:
+        """What reads each frame, in order, from the loader number `first` on; every call begins anew.
+
+        Loaders may be called in any thread and at the same time. A loader gives None for a frame that could not be
+        read and is left out; an error ends the sequence.
+        """
+
+
+def fingerprint(options: SourceOptions, files: list[Path]) -> str:
+    """Digest of options and files, see `Source.fingerprint`."""
+    stated = [(str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
+    text = json.dumps([dataclasses.asdict(options), stated])
+    return hashlib.blake2b(text.encode(errors="surrogateescape"), digest_size=16).hexdigest()
