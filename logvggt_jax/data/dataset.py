@@ -23,6 +23,11 @@ class Dataset(Protocol):
         """Unique sequence names."""
         ...
 
+    @property
+    def identity(self) -> Mapping[str, Any]:
+        """What decides the frames of a sequence besides the set's files and the sequence's name; JSON values."""
+        ...
+
     def num_frames(self, sequence: str) -> int:
         """Number of frames of `sequence` that count."""
         ...
@@ -82,7 +87,7 @@ class Reader(abc.ABC):
     @property
     @abc.abstractmethod
     def identity(self) -> Mapping[str, Any]:
-        """What decides the frames of a sequence besides the set's files; JSON values."""
+        """As of `Dataset`."""
 
 
 def check_split(split: str, reader: Reader) -> None:

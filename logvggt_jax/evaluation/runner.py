@@ -304,8 +304,9 @@ def _where(clip: Clip) -> dict[str, Any]:
 def _key(clip: Clip, method: Method) -> str:
     """Digest of what decides the clip's numbers, and of the names under which they stand in the file."""
     protocol, dataset = clip.benchmark.protocol, clip.benchmark.dataset
+    assert dataset is not None  # the plan has only clips of data sets that are there
     names = [protocol.name, method.name]
-    data = [protocol.dataset, getattr(dataset, "options", None), clip.sequence, clip.indices]
+    data = [protocol.dataset, dataset.identity, clip.sequence, clip.indices]
     claims = [method.depth, method.pose, method.points, method.static]
     return record_key(code_version(), names, data, protocol.measures(), claims, method.identity)
 

@@ -61,4 +61,6 @@ def test_identities_tell_apart_what_gives_other_frames():
         open_dataset("rooms", None, "test", num_rooms=1, **options) for options in ({}, {"seed": 1}, {"width": 70})
     ]
     assert len({json.dumps(each.identity) for each in rooms}) == 3
-    assert rooms[0].identity == open_dataset("rooms", None, "test", num_rooms=1).identity
+    # A room is the same whichever others are opened with it.
+    for split, count in (("test", 1), ("test", 2), ("all", 1)):
+        assert rooms[0].identity == open_dataset("rooms", None, split, num_rooms=count).identity

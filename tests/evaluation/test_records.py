@@ -7,7 +7,9 @@ from typing import Any
 
 import pytest
 from known_answers import SETTINGS, benchmarks_of, failing, run
+from layouts import co3dv2
 
+from logvggt_jax.data.readers.co3dv2 import Co3Dv2
 from logvggt_jax.data.rooms.rooms import Rooms
 from logvggt_jax.evaluation import environment, runner
 from logvggt_jax.evaluation.environment import code_version
@@ -46,6 +48,27 @@ def test_results_of_other_settings_or_parameters_are_not_taken_over(rooms: Rooms
     assert len(calls) == 8
     run(rooms, [dataclasses.replace(method, identity="b")], tmp_path, dataclasses.replace(SETTINGS, seed=1))
     assert len(calls) == 12 and len(records(tmp_path)) == 4
+
+
+def test_a_sequence_whose_frames_differ_by_split_is_measured_again(tmp_path: Path) -> None:
+    """A list of Co3Dv2 names frames; under the same name and indices `all` and `test` have other ones."""
+    root = tmp_path / "co3dv2"
+    co3dv2.LAYOUT.write(root, co3dv2.LAYOUT.views)
+    sequence = co3dv2.NAME.split("/")[1]
+    numbers = co3dv2.FRAME_NUMBERS[1:]
+    co3dv2.write_list(root, "apple", "fewview_dev", test=[[sequence, number, "x"] for number in numbers])
+    method, calls = failing("", at_call=-1)
+    settings = dataclasses.replace(SETTINGS, clip_lengths=(2,), stride=1)
+    for split, expected in (("all", 1), ("test", 2), ("test", 2)):
+        run(Co3Dv2(root, split), [method], tmp_path / "out", settings)
+        assert len(calls) == expected, split
+
+
+def test_rooms_measured_among_fewer_are_taken_over_by_a_run_over_more(tmp_path: Path) -> None:
+    method, calls = failing("", at_call=-1)
+    for num_rooms, expected in ((1, 2), (2, 4)):
+        run(Rooms("test", height=28, width=42, num_frames=16, num_rooms=num_rooms), [method], tmp_path)
+        assert len(calls) == expected
 
 
 def test_other_code_measures_again(rooms: Rooms, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

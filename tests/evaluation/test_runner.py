@@ -88,7 +88,7 @@ class Broken:
     """Two rooms of which one cannot be read."""
 
     def __init__(self, rooms: Rooms) -> None:
-        self.rooms, self.sequences = rooms, rooms.sequences
+        self.rooms, self.sequences, self.identity = rooms, rooms.sequences, rooms.identity
 
     def num_frames(self, sequence: str) -> int:
         return self.rooms.num_frames(sequence)

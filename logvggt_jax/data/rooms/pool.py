@@ -45,6 +45,11 @@ class RoomPool:
         if self.folder:
             self._arrays = _open_arrays(self.folder, self.rooms)
 
+    @property
+    def identity(self) -> dict[str, Any]:
+        """That of the rooms."""
+        return self.rooms.identity
+
     def num_frames(self, sequence: str) -> int:
         """Frames of `sequence`."""
         return self.rooms.num_frames(sequence)
@@ -112,12 +117,17 @@ def render_pool(
             for array in maps.values():
                 array.flush()  # type: ignore[attr-defined]
             del maps
-            (unfinished / "options.json").write_text(json.dumps(rooms.identity, indent=2) + "\n")
+            (unfinished / "options.json").write_text(json.dumps(_contents(rooms), indent=2) + "\n")
     return RoomPool(rooms, _open_arrays(folder, rooms), folder)
 
 
+def _contents(rooms: Rooms) -> dict[str, Any]:
+    """What decides all frames of a pool, as JSON values."""
+    return {**rooms.identity, "sequences": [rooms.sequences[0], rooms.sequences[-1], len(rooms.sequences)]}
+
+
 def _digest(rooms: Rooms) -> str:
-    return hashlib.sha256(json.dumps(rooms.identity, sort_keys=True).encode()).hexdigest()[:16]
+    return hashlib.sha256(json.dumps(_contents(rooms), sort_keys=True).encode()).hexdigest()[:16]
 
 
 def _shapes(rooms: Rooms) -> dict[str, tuple[tuple[int, ...], np.dtype]]:

@@ -95,13 +95,9 @@ class Rooms(Reader):
 
     @property
     def identity(self) -> dict[str, Any]:
-        """Everything that decides the frames: the options and the version of what renders them."""
-        return {"renderer": _RENDERER_VERSION, **self.options}
-
-    @property
-    def options(self) -> dict[str, Any]:
-        """Everything that the frames depend on, as JSON values."""
+        """The version of what renders the frames, and the options that decide those of a room."""
         return {
+            "renderer": _RENDERER_VERSION,
             "height": self.height,
             "width": self.width,
             "num_frames": self._num_frames,
@@ -110,7 +106,6 @@ class Rooms(Reader):
             "speed": list(self.speed),
             "period": self.period,
             "facing_north": self.facing_north,
-            "sequences": [self.sequences[0], self.sequences[-1], len(self.sequences)],
         }
 
     def num_frames(self, sequence: str) -> int:

@@ -19,7 +19,7 @@ def assert_same_frames(pool, rooms: Rooms) -> None:
         for key in ("images", "depth", "intrinsics", "extrinsics"):
             assert np.array_equal(getattr(expected, key), getattr(got, key)), key
         assert got.metric and pool.frame_names(name) == rooms.frame_names(name)
-    assert pool.sequences == rooms.sequences
+    assert pool.sequences == rooms.sequences and pool.identity == rooms.identity
 
 
 def test_a_pool_in_memory_equals_rendering_on_demand():
@@ -44,9 +44,10 @@ def test_a_cached_pool_is_opened_not_rendered_again(tmp_path: Path, monkeypatch:
     assert_same_frames(pickle.loads(sent), ROOMS)
 
 
-def test_other_options_have_another_cache(tmp_path: Path):
+@pytest.mark.parametrize("options", [{"speed": 1.5}, {"num_rooms": 2}])
+def test_other_options_have_another_cache(options: dict, tmp_path: Path):
     render_pool(ROOMS, cache_dir=tmp_path, progress=False)
-    other = Rooms("val", height=28, width=42, num_frames=5, num_rooms=3, speed=1.5)
+    other = Rooms("val", **{"height": 28, "width": 42, "num_frames": 5, "num_rooms": 3, **options})
     assert_same_frames(render_pool(other, cache_dir=tmp_path, progress=False), other)
     assert len(list(tmp_path.iterdir())) == 2
 
