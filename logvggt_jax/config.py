@@ -20,6 +20,8 @@ import numpy as np
 
 from logvggt_jax.errors import InputError
 
+PATCH = 14
+"""Pixels of a patch's side: edges of the model's images are multiples of it."""
 ATTENTION_IMPLEMENTATIONS = ("auto", "xla", "cudnn", "tpu_flash")
 
 Config = TypeVar("Config")
@@ -104,6 +106,18 @@ def require_one_of(config: Any, choices: Sequence[Any], *names: str) -> None:
             )
 
 
+def check_size(size: Sequence[int], what: str) -> None:
+    """Raises InputError unless `size` is (H, W), pixels that images for the model can have; messages call it `what`."""
+    if len(size) != 2 or not all(_is_number(edge, numbers.Integral) and _fills_patches(edge, PATCH) for edge in size):
+        raise InputError(f"{what} must be (H, W), multiples of {PATCH} pixels, got {size!r}")
+
+
+def check_longer_edge(longer_edge: int, what: str = "longer_edge", *, least: int = PATCH) -> None:
+    """Raises InputError unless images for the model can have this longer edge; messages call it `what`."""
+    if not _is_number(longer_edge, numbers.Integral) or not _fills_patches(longer_edge, least):
+        raise InputError(f"{what} must be a multiple of {PATCH} pixels, at least {least}, got {longer_edge!r}")
+
+
 def freeze_lists(config: Any) -> None:
     """Turns lists among the fields of a frozen dataclass into tuples, so that it hashes; for `__post_init__`."""
     for field in dataclasses.fields(config):
@@ -181,6 +195,10 @@ def _described(hint: Any) -> str:
     return "a mapping" if origin is not None else f"of type {getattr(hint, '__name__', hint)}"
 
 
+def _fills_patches(edge: int, least: int) -> bool:
+    return edge >= least and edge % PATCH == 0
+
+
 def _is_number(value: Any, kind: type) -> bool:
     return isinstance(value, kind) and not isinstance(value, bool)
 
@@ -221,12 +239,12 @@ class EncoderConfig:
     mlp_ratio: int = 4
     num_registers: int = 4
     position_grid: int = 37
-    patch_size: int = 14
+    patch_size: int = PATCH
     frozen: bool = True
 
     def __post_init__(self) -> None:
         require_counts(self, "embed_dim", "depth", "num_heads", "mlp_ratio", "num_registers", "position_grid")
-        require_one_of(self, (14,), "patch_size")  # images are prepared for no other
+        require_one_of(self, (PATCH,), "patch_size")  # images are prepared for no other
         _divides(self, self.embed_dim, self.num_heads, 1, "one slice of channels a head")
 
 

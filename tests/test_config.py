@@ -19,7 +19,15 @@ from logvggt_jax import (
     RefinementConfig,
     WindowConfig,
 )
-from logvggt_jax.config import from_mapping, require_counts, require_one_of, require_within, to_mapping
+from logvggt_jax.config import (
+    check_longer_edge,
+    check_size,
+    from_mapping,
+    require_counts,
+    require_one_of,
+    require_within,
+    to_mapping,
+)
 from logvggt_jax.errors import InputError
 
 
@@ -183,3 +191,15 @@ def test_a_point_head_survives_the_round_trip() -> None:
     config = dataclasses.replace(ModelConfig(), point_head=DPTConfig(features=64))
     assert ModelConfig.from_dict(config.to_dict()) == config
     assert ModelConfig.from_dict(ModelConfig().to_dict()).point_head is None
+
+
+def test_sizes_and_edges_of_images_are_whole_patches() -> None:
+    check_size((14, 518), "size")
+    for size in ((14, 500), (0, 14), (-14, 14), (14.0, 14), (14,), (14, 14, 14)):
+        with pytest.raises(InputError, match=r"^Some\.size must be \(H, W\), multiples of 14 pixels, got \(") as error:
+            check_size(size, "Some.size")
+        assert "\n" not in str(error.value)
+    check_longer_edge(14)
+    for edge, least in ((500, 14), (0, 14), (14, 28), (28.0, 14)):
+        with pytest.raises(InputError, match=rf"^longer_edge must be a multiple of 14 pixels, at least {least}, got"):
+            check_longer_edge(edge, least=least)

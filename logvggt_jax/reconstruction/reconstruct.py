@@ -22,7 +22,8 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from logvggt_jax.data.feeding.transforms import LONGER_EDGE, ResizeTransform, check_longer_edge, resize
+from logvggt_jax.config import check_longer_edge
+from logvggt_jax.data.feeding.transforms import LONGER_EDGE, ResizeTransform, resize
 from logvggt_jax.errors import InputError
 from logvggt_jax.files import atomic_folder, check_output
 from logvggt_jax.geometry import decode_poses

@@ -12,6 +12,7 @@ from typing import Any
 
 from logvggt_jax.config import (
     ModelConfig,
+    check_size,
     freeze_lists,
     from_mapping,
     require_counts,
@@ -105,6 +106,8 @@ class StageConfig:
             raise InputError(f"StageConfig.min_stride={self.min_stride} exceeds max_stride={self.max_stride}")
         if not self.sizes:
             raise InputError("StageConfig.sizes is empty, give at least one (height, width)")
+        for size in self.sizes:
+            check_size(size, "StageConfig.sizes")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -178,6 +181,7 @@ class ValidationConfig:
         require_counts(self, "every", "num_clips", "clip_length", "stride")
         if self.clip_length < 2:
             raise InputError("ValidationConfig.clip_length must be at least 2: pose errors are of pairs of frames")
+        check_size(self.size, "ValidationConfig.size")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -3,8 +3,7 @@
 import dataclasses
 from typing import Literal
 
-from logvggt_jax.config import require_counts
-from logvggt_jax.errors import InputError
+from logvggt_jax.config import check_longer_edge
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,6 +18,5 @@ class Provenance:
     source: str | None = None  # file, hub repository or training run, in a few words
 
     def __post_init__(self) -> None:
-        require_counts(self, "longer_edge")
-        if self.longer_edge is not None and self.longer_edge % 14:
-            raise InputError(f"Provenance.longer_edge must be a multiple of 14 pixels, got {self.longer_edge}")
+        if self.longer_edge is not None:
+            check_longer_edge(self.longer_edge, "Provenance.longer_edge")

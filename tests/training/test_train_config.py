@@ -13,7 +13,7 @@ from ml_collections import ConfigDict
 from logvggt_jax.data.feeding.augmentation import ColourAugmentation
 from logvggt_jax.data.feeding.holdouts import HoldOut
 from logvggt_jax.errors import InputError
-from logvggt_jax.training.config import TrainConfig
+from logvggt_jax.training.config import TrainConfig, ValidationConfig
 
 
 def _mapping(config: TrainConfig) -> dict[str, Any]:
@@ -107,6 +107,8 @@ def test_missing_fields_are_named(run_config: TrainConfig) -> None:
         ("data.max_broken", 1.0, r"must lie in \[0, 1\), got 1\.0"),
         ("stages.first.min_stride", 3, "=3 exceeds max_stride=2"),
         ("stages.first.steps", 0, "must be a positive integer, got 0"),
+        ("stages.first.sizes", ((28, 42), (50, 70)), r"must be \(H, W\), multiples of 14 pixels, got \(50, 70\)"),
+        ("stages.first.sizes", ((0, 70),), r"must be \(H, W\), multiples of 14 pixels, got \(0, 70\)"),
         ("stages.first.steps", "50", "must be a whole number, got '50'"),
         ("data.sources.rooms.stride", (3, 2), r"must be a pair 1 <= low <= high, got \(3, 2\)"),
     ],
@@ -116,3 +118,9 @@ def test_values_are_checked_under_their_names(run_config: TrainConfig, path: str
     _set(values, path, value)
     with pytest.raises(InputError, match=rf"^config\.{re.escape(path)} ?{message}"):
         TrainConfig.from_dict(values)
+
+
+def test_the_size_of_validation_is_checked(run_config: TrainConfig) -> None:
+    source = run_config.data.sources[0]
+    with pytest.raises(InputError, match=r"^ValidationConfig\.size must be \(H, W\), multiples of 14 pixels, got"):
+        ValidationConfig(source, every=1, num_clips=1, clip_length=2, stride=1, size=(28, 50))

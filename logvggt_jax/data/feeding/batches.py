@@ -15,6 +15,7 @@ import grain
 import numpy as np
 from absl import flags
 
+from logvggt_jax.config import check_size
 from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.data.feeding.augmentation import ColourAugmentation
 from logvggt_jax.data.feeding.broken_clips import BrokenClips
@@ -209,6 +210,8 @@ def training_batches(
     sizes = [(int(height), int(width)) for height, width in sizes]
     if not sizes or len(set(sizes)) < len(sizes):
         raise InputError(f"sizes must be different (height, width), at least one, got {sizes}")
+    for size in sizes:
+        check_size(size, "sizes")
     strides = dict(strides or {})
     if not strides.keys() <= datasets.keys():
         raise InputError(f"strides must be of {', '.join(datasets)}, got those of {', '.join(strides)}")

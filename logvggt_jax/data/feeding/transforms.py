@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image
 
+from logvggt_jax.config import PATCH, check_longer_edge, check_size
 from logvggt_jax.errors import InputError
 from logvggt_jax.frames import Frames
 
-PATCH = 14
 LONGER_EDGE = 518
 """Pixels of the longer edge of VGGT's training images."""
 
@@ -121,12 +121,6 @@ def resize(
     return np.asarray(resized), ResizeTransform(original_size=(height, width), size=(rows, columns))
 
 
-def check_longer_edge(longer_edge: int) -> None:
-    """Raises InputError unless `longer_edge` is a size that `resize` can give pictures."""
-    if longer_edge < PATCH or longer_edge % PATCH:
-        raise InputError(f"longer_edge must be a positive multiple of {PATCH}, got {longer_edge}")
-
-
 def nearest_size(size: tuple[int, int], sizes: Sequence[tuple[int, int]]) -> tuple[int, int]:
     """The one of `sizes` (H, W) whose aspect ratio is nearest to that of `size`; the first of equally near ones."""
     aspect = math.log(size[1] / size[0])
@@ -142,10 +136,9 @@ def fit(frames: Frames, size: tuple[int, int]) -> Frames:
     Frames that already fit are returned as they are.
 
     Raises:
-      ValueError: `size` is not two multiples of 14.
-      InputError: a principal point lies outside its image.
+      InputError: `size` is not two multiples of 14, or a principal point lies outside its image.
     """
-    _check_size(size)
+    check_size(size, "size")
     source = frames.images.shape[1:3]
     if source == size and all(crop == (1.0, 0.0, 0.0) for crop in _crops(frames, size)):
         return frames
@@ -164,7 +157,7 @@ def fit_each(frames: Iterable[Frames], count: int, size: tuple[int, int]) -> Fra
 
     Raises as `fit` does.
     """
-    _check_size(size)
+    check_size(size, "size")
     clip = Frames(
         images=np.empty((count, *size, 3), np.uint8),
         depth=np.empty((count, *size), np.float32),
@@ -179,12 +172,6 @@ def fit_each(frames: Iterable[Frames], count: int, size: tuple[int, int]) -> Fra
         clip = clip._replace(metric=part.metric)
         done += len(part.images)
     return clip
-
-
-def _check_size(size: tuple[int, int]) -> None:
-    height, width = size
-    if height < PATCH or width < PATCH or height % PATCH or width % PATCH:
-        raise ValueError(f"size must be two positive multiples of {PATCH}, got {size}")
 
 
 def _fit_into(clip: Frames, first: int, frames: Frames, size: tuple[int, int]) -> None:

@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from logvggt_jax.config import require_counts, require_within
+from logvggt_jax.config import check_size, require_counts, require_within
 from logvggt_jax.errors import InputError
 from logvggt_jax.evaluation.protocols.frame_selection import Clips
 from logvggt_jax.evaluation.protocols.images import Fit
@@ -25,8 +25,7 @@ class ClipSettings:
     figures: int = 1  # clips of each length that are drawn, for the first method
 
     def __post_init__(self) -> None:
-        if any(side < 14 or side % 14 for side in self.image_size):
-            raise InputError(f"ClipSettings.image_size must be (H, W), multiples of 14, got {self.image_size}")
+        check_size(self.image_size, "ClipSettings.image_size")
         if not self.clip_lengths or any(length < 2 for length in self.clip_lengths):
             raise InputError(
                 f"ClipSettings.clip_lengths must be at least one number of 2 or more frames, got {self.clip_lengths}"

@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from logvggt_jax.data.feeding.transforms import PATCH, fit
+from logvggt_jax.config import PATCH
+from logvggt_jax.data.feeding.transforms import fit
 from logvggt_jax.errors import InputError
 from logvggt_jax.types import Frames
 

@@ -5,8 +5,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from logvggt_jax.config import require_counts, require_within
-from logvggt_jax.errors import InputError
+from logvggt_jax.config import check_longer_edge, require_counts, require_within
 from logvggt_jax.evaluation.protocols.frame_selection import FrameSelection
 from logvggt_jax.evaluation.protocols.images import ImageRule
 
@@ -94,10 +93,7 @@ class ProtocolSettings:
     rooms: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # options of procedural rooms
 
     def __post_init__(self) -> None:
-        if self.longer_edge < 28 or self.longer_edge % 14:
-            raise InputError(
-                f"ProtocolSettings.longer_edge must be a multiple of 14, at least 28, got {self.longer_edge}"
-            )
+        check_longer_edge(self.longer_edge, "ProtocolSettings.longer_edge", least=28)
         require_counts(self, "max_points")
         require_within(self, "(0, inf)", "icp_threshold")
 

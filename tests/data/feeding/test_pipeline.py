@@ -498,6 +498,7 @@ def test_sequences_too_short_for_a_clip_are_left_out_or_refused():
         {"clip_length": 0},
         {"stride": (3, 1)},
         {"sizes": []},
+        {"sizes": [(14, 28), (50, 70)], "max_broken": 0.9},
         {"max_broken": 1.0},
         {"min_valid_depth": -0.1},
     ],
