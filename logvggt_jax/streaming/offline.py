@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import jax
@@ -101,6 +101,19 @@ class FinalFrames:
             for i in range(len(encodings))
         ]
 
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All cameras added so far, for `restore`; nothing where there is none."""
+        if not len(self):
+            return {}
+        lists = {"encodings": self._encodings, "extrinsics": self._extrinsics, "intrinsics": self._intrinsics}
+        return {name: np.stack(values) for name, values in lists.items()}
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Takes up what `arrays` gave."""
+        self._encodings = list(arrays.get("encodings", ()))
+        self._extrinsics = list(arrays.get("extrinsics", ()))
+        self._intrinsics = list(arrays.get("intrinsics", ()))
+
     def cameras(self) -> Cameras:
         """Cameras of all frames added so far."""
         if not self._encodings:
@@ -168,6 +181,14 @@ class OfflineSession:
             f"full attention over {len(images)} frames of {height} x {width} pixels", "take fewer or smaller frames"
         ):
             return self._final.add(predict_plain(self._model, self._variables, np.stack(images)))
+
+    def snapshot(self) -> tuple[list[FrameResult], dict[str, np.ndarray]]:
+        """See `Predictor.snapshot`: the frames, since nothing is computed before the end."""
+        return [], {"images": np.stack(self._images)} if self._images else {}
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """See `Predictor.restore`."""
+        self._images = list(arrays.get("images", ()))
 
     def cameras(self) -> Cameras:
         """Cameras of the frames handed out so far."""

@@ -6,7 +6,7 @@ number is a number of the code that users run. A new method is a file of this fo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -43,6 +43,17 @@ class Predictor(Protocol):
 
     def close(self) -> list[FrameResult]:
         """Ends the sequence: the frames still held, oldest first. Afterwards every pose is final."""
+        ...
+
+    def snapshot(self) -> tuple[list[FrameResult], dict[str, np.ndarray]]:
+        """Waits for the device; the frames that are final by now, oldest first, and what `restore` needs to go on.
+
+        A snapshot changes no number: a stream that goes on from one gives what it would have given.
+        """
+        ...
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Takes up a snapshot of the same method, model and settings; for a predictor that has seen no frame."""
         ...
 
     def cameras(self) -> Cameras:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import NamedTuple
 
@@ -207,6 +207,43 @@ class StreamSession:
             self._take_off(_finish(self._windows, self._variables, self._state))
             self._state = self._newest = None
             return self._landed(0)
+
+    def snapshot(self) -> tuple[list[FrameResult], dict[str, np.ndarray]]:
+        """See `Predictor.snapshot`: cache, held tokens, compact tokens and poses, and the frames not yet in a window."""
+        with self._memory():
+            results = self._landed(0)
+        if self._newest is None:
+            return results, {}
+        arrays = {f"tokens/{name}": array for name, array in self._store.arrays().items()} if self._store.count else {}
+        if self._state is not None:
+            fields = dataclasses.fields(self._state)
+            arrays |= {f"state/{field.name}": np.asarray(getattr(self._state, field.name)) for field in fields}
+        if self._pending:
+            arrays["pending"] = np.stack(self._pending)
+        counts = (self._received, self._refined, self._handed_out)
+        return results, {
+            **arrays,
+            "newest": self._newest,
+            "counts": np.array(counts, np.int64),
+            "encodings": self._encodings,
+        }
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """See `Predictor.restore`."""
+        if not arrays:
+            return
+        self._newest = arrays["newest"]
+        self._image_size = (self._newest.shape[0], self._newest.shape[1])
+        self._pending = list(arrays.get("pending", ()))
+        self._received, self._refined, self._handed_out = (int(count) for count in arrays["counts"])
+        self._encodings = arrays["encodings"]
+        if tokens := {name.removeprefix("tokens/"): x for name, x in arrays.items() if name.startswith("tokens/")}:
+            self._store.restore(tokens)
+        if fields := {name.removeprefix("state/"): x for name, x in arrays.items() if name.startswith("state/")}:
+            del fields["image_size"]
+            self._state = WindowState(
+                image_size=self._image_size, **{name: jnp.asarray(array) for name, array in fields.items()}
+            )
 
     def cameras(self, *, provisional: bool = False) -> Cameras:
         """Cameras of the frames whose pose is final; with `provisional` of all frames handed out."""
