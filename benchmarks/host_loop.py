@@ -14,6 +14,7 @@ import argparse
 import tempfile
 import time
 from collections import deque
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -72,6 +73,13 @@ class ClockPredictor:
         results = self._landed(ahead=0)
         self.own_seconds += time.thread_time()
         return results
+
+    def snapshot(self) -> tuple[list[FrameResult], dict[str, np.ndarray]]:
+        """Nothing worth saving."""
+        return [], {}
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Nothing is ever saved."""
 
     def cameras(self) -> Cameras:
         """A walk along x."""

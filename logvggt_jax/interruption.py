@@ -8,6 +8,14 @@ from types import FrameType
 from typing import Any
 
 
+class Interrupted(Exception):
+    """A signal ended a run; `signal` is its name, and the message says what is left and how to go on."""
+
+    def __init__(self, signal_name: str, message: str) -> None:
+        super().__init__(message)
+        self.signal = signal_name
+
+
 class StopRequest:
     """While entered, the first of some signals sets `reason` to its name; a second one acts as usual.
 

@@ -209,7 +209,7 @@ class StreamSession:
             return self._landed(0)
 
     def snapshot(self) -> tuple[list[FrameResult], dict[str, np.ndarray]]:
-        """See `Predictor.snapshot`: cache, held tokens, compact tokens and poses, and the frames not yet in a window."""
+        """See `Predictor.snapshot`: cache, held and compact tokens, poses, and frames not yet in a window."""
         with self._memory():
             results = self._landed(0)
         if self._newest is None:

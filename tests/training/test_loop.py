@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from logvggt_jax.errors import InputError
+from logvggt_jax.interruption import StopRequest
 from logvggt_jax.training import loop
 from logvggt_jax.training.checkpoints import Position, RunCheckpoints
 from logvggt_jax.training.config import SourceConfig, TrainConfig, ValidationConfig
-from logvggt_jax.interruption import StopRequest
 from logvggt_jax.training.loop import NonFiniteTraining, train
 from logvggt_jax.training.metrics_log import MetricsLog, read_metrics
 from logvggt_jax.training.sharding import data_mesh
