@@ -8,6 +8,7 @@ import argparse
 import contextlib
 import json
 import shutil
+import signal
 import sys
 import traceback
 import warnings
@@ -16,32 +17,47 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from logvggt_jax.errors import InputError, disk_errors, one_line
+from logvggt_jax.interruption import Interrupted
+from logvggt_jax.terminal import forgiving_streams
 
 if TYPE_CHECKING:
     from logvggt_jax.streaming import ChunkPlan
 
-BAD_INPUT, INTERRUPTED = 2, 130
+OUTPUT_LOST, BAD_INPUT, INTERRUPTED = 1, 2, 130
 MODES = ("windows", "chunks", "offline")  # the registry of methods, which would load JAX
 PROBLEMS_FOUND = 1
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command line and returns the exit code: 0, 2 for bad input; `data check` 1 where it found problems.
+    """Runs the command line and returns the exit code.
 
-    Any exception but InputError is a fault of this package and passes through with its traceback.
+    0; 2 for bad input; 128 and its number where a signal ended the run; 1 where `data check` or `doctor` found
+    problems, or standard output could not be written. A reader of standard output that goes away is no error. Any exception but
+    InputError is a fault of this package and passes through with its traceback.
 
     Args:
       arguments: without the program's name; default `sys.argv[1:]`.
     """
-    parser = _parser()
-    options = parser.parse_args(_with_dashes(sys.argv[1:] if arguments is None else arguments))
+    with forgiving_streams() as output:
+        code = _run(sys.argv[1:] if arguments is None else arguments)
+    if output.failure is not None and not isinstance(output.failure, BrokenPipeError):
+        print(f"logvggt: error: standard output cannot be written: {one_line(output.failure)}", file=sys.stderr)
+        return code or OUTPUT_LOST
+    return code
+
+
+def _run(arguments: Sequence[str]) -> int:
+    options = _parser().parse_args(_with_dashes(arguments))
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
             return options.run(options) or 0
     except KeyboardInterrupt:
-        print("logvggt: interrupted; nothing half-written is left", file=sys.stderr)
+        print("logvggt: interrupted", file=sys.stderr)
         return INTERRUPTED
+    except Interrupted as interruption:
+        print(f"logvggt: ended by {interruption.signal}: {interruption}", file=sys.stderr)
+        return 128 + signal.Signals[interruption.signal]
     except InputError as error:
         if options.traceback:
             traceback.print_exc()
@@ -61,7 +77,7 @@ def _convert(options: argparse.Namespace) -> None:
     print(f"model: {options.output}")
 
 
-def _reconstruct(options: argparse.Namespace) -> None:
+def _reconstruct(options: argparse.Namespace) -> int:
     from logvggt_jax.compile import check_devices, enable_compilation_cache
     from logvggt_jax.model.parameters import in_compute_type
     from logvggt_jax.reconstruction.method import choose_method
@@ -100,6 +116,7 @@ def _reconstruct(options: argparse.Namespace) -> None:
         overwrite=options.overwrite,
     )
     print(result.summary())
+    return 0 if result.complete else INTERRUPTED
 
 
 def _settings(options: argparse.Namespace, method: str) -> ChunkPlan | None:
