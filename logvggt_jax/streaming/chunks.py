@@ -21,7 +21,8 @@ from logvggt_jax.errors import InputError
 from logvggt_jax.geometry import Similarity, robust_similarity, unproject_pixels
 from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.model.parameters import in_compute_type
-from logvggt_jax.streaming.offline import FinalFrames, PlainPrediction, predict_plain
+from logvggt_jax.streaming.offline import FinalFrames, PlainPrediction, plain_program, predict_plain
+from logvggt_jax.streaming.program import Program
 from logvggt_jax.streaming.results import Cameras, FrameResult, PredictionError, checked_frames, device_memory
 
 PredictChunk = Callable[[np.ndarray], PlainPrediction]
@@ -126,6 +127,13 @@ class ChunkChain:
                 f"the one before on the {shared} frames they share ({error}); take larger chunks with more overlap"
             ) from error
         return move(chunk, similarity)
+
+
+def chunk_program(model: LogVGGT, image_size: tuple[int, int], plan: ChunkPlan, num_frames: int | None) -> Program:
+    """A full chunk, or the whole of a shorter sequence; all but the overlap become final with it."""
+    size = min(plan.size, num_frames or plan.size)
+    final = size - plan.overlap if size == plan.size else size
+    return plain_program(model, image_size, size)._replace(frames=final)
 
 
 class ChunkSession:

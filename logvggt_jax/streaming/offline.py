@@ -14,6 +14,7 @@ from logvggt_jax.config import WindowConfig, require_counts
 from logvggt_jax.geometry import encode_poses
 from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.model.parameters import in_compute_type
+from logvggt_jax.streaming.program import Program, abstract_variables, flops_of
 from logvggt_jax.streaming.results import Cameras, FrameResult, PredictionError, checked_frames, device_memory
 
 
@@ -66,6 +67,14 @@ def _predict(model: LogVGGT, variables: Variables, images: jax.Array) -> PlainPr
     predictions = model.apply(variables, images[None])
     wanted = {name: getattr(predictions, name) for name in PlainPrediction._fields}
     return jax.tree.map(lambda x: x[0], PlainPrediction(**wanted))
+
+
+def plain_program(model: LogVGGT, image_size: tuple[int, int], num_frames: int) -> Program:
+    """`predict_plain` of so many frames."""
+    plain, variables = plain_vggt(model, num_frames), abstract_variables(model.config)
+    images = jax.ShapeDtypeStruct((num_frames, *image_size, 3), np.uint8)
+    flops = flops_of(plain, lambda chosen: lambda v, i: chosen.apply(v, i[None]), variables, images)
+    return Program(_predict.lower(plain, variables, images), flops, num_frames)
 
 
 class FinalFrames:
@@ -193,3 +202,10 @@ class OfflineSession:
     def cameras(self) -> Cameras:
         """Cameras of the frames handed out so far."""
         return self._final.cameras()
+
+
+def offline_program(
+    model: LogVGGT, image_size: tuple[int, int], settings: OfflineSettings, num_frames: int | None
+) -> Program:
+    """All frames at once; of a sequence whose length is not known, as many as are allowed."""
+    return plain_program(model, image_size, num_frames or settings.max_frames or 1)

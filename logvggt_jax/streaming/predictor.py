@@ -14,10 +14,11 @@ import numpy as np
 
 from logvggt_jax.errors import InputError
 from logvggt_jax.model.logvggt import LogVGGT, Variables
-from logvggt_jax.streaming.chunks import ChunkPlan, ChunkSession
-from logvggt_jax.streaming.offline import OfflineSession, OfflineSettings
+from logvggt_jax.streaming.chunks import ChunkPlan, ChunkSession, chunk_program
+from logvggt_jax.streaming.offline import OfflineSession, OfflineSettings, offline_program
+from logvggt_jax.streaming.program import Program
 from logvggt_jax.streaming.results import Cameras, FrameResult
-from logvggt_jax.streaming.windows import StreamSession, WindowSettings
+from logvggt_jax.streaming.windows import StreamSession, WindowSettings, window_program
 
 
 class Predictor(Protocol):
@@ -69,12 +70,15 @@ class Method(NamedTuple):
       settings: the frozen dataclass of what can be set, all fields with defaults.
       trained_for: what its weights have to be trained for: `windows` (LoG-VGGT) or `vggt` (plain VGGT).
       summary: what the method does, in a few words.
+      program: model, (H, W) of the images, settings and number of frames (None: not known) to the program in which the
+        method spends its time.
     """
 
     open: Callable[[LogVGGT, Variables, Any], Predictor]
     settings: type
     trained_for: str
     summary: str
+    program: Callable[[LogVGGT, tuple[int, int], Any, int | None], Program]
 
 
 METHODS: dict[str, Method] = {
@@ -83,12 +87,21 @@ METHODS: dict[str, Method] = {
         WindowSettings,
         "windows",
         "LoG-VGGT: overlapping windows that hand tokens on, poses refined globally",
+        window_program,
     ),
     "offline": Method(
-        OfflineSession, OfflineSettings, "vggt", "plain VGGT: all frames in one window of full global attention"
+        OfflineSession,
+        OfflineSettings,
+        "vggt",
+        "plain VGGT: all frames in one window of full global attention",
+        offline_program,
     ),
     "chunks": Method(
-        ChunkSession, ChunkPlan, "vggt", "plain VGGT on overlapping chunks, chained by robust similarities"
+        ChunkSession,
+        ChunkPlan,
+        "vggt",
+        "plain VGGT on overlapping chunks, chained by robust similarities",
+        chunk_program,
     ),
 }
 

@@ -14,6 +14,7 @@ from logvggt_jax import LogVGGT
 from logvggt_jax.reconstruction import Reconstruction, Source, reconstruct
 from logvggt_jax.streaming import METHODS, Cameras, FrameResult, Method, WindowSettings
 from logvggt_jax.streaming.results import decoded_cameras
+from logvggt_jax.streaming.windows import window_program
 
 LONGER_EDGE = 42
 
@@ -62,7 +63,9 @@ class Recorder:
 def reconstruct_recorded(predictor: Recorder, source: Source | Path, output: Path, **options: Any) -> Reconstruction:
     """A reconstruction by a method whose predictor this is."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(METHODS, "recorder", Method(lambda *_: predictor, WindowSettings, "windows", "records"))
+        patch.setitem(
+            METHODS, "recorder", Method(lambda *_: predictor, WindowSettings, "windows", "records", window_program)
+        )
         return reconstruct(
             source, output, model=LogVGGT(), variables={}, method="recorder", longer_edge=LONGER_EDGE, **options
         )
