@@ -59,7 +59,7 @@ def reconstruct(
     overwrite: bool = False,
     progress: bool = True,
     workers: int | None = None,
-    save_seconds: float = 10.0,
+    save_seconds: float = 1.0,
 ) -> Reconstruction:
     """Reconstructs a sequence and writes cameras, trajectory, depth and points.
 
@@ -84,7 +84,7 @@ def reconstruct(
       point_filter: which pixels become points.
       num_previews: pictures of frames beside their depth, evenly over the sequence.
       overwrite: begin anew, whatever an earlier run has left, and replace an earlier reconstruction.
-      progress: show a progress bar where standard error is a terminal.
+      progress: show a progress bar where standard error is a terminal, and say there if a run is taken up.
       workers: threads beside the one that feeds the device; None for one a core, at most eight.
       save_seconds: time between two saved states; longer where saving takes more than a twentieth of the time.
 
@@ -128,6 +128,8 @@ def reconstruct(
             save_seconds=save_seconds,
         )
         task = bars.add_task("Depth and cameras", total=source.expected_frames, completed=run.num_taken)
+        if run.num_taken and progress:
+            console.print(f"going on after {run.num_taken} frames that an earlier run has done", highlight=False)
         started = time.monotonic()
         complete = run.stream(stop, advance=lambda: bars.advance(task))
         seconds = time.monotonic() - started
