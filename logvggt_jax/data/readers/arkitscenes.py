@@ -22,7 +22,7 @@ import numpy as np
 
 from logvggt_jax.data.dataset import TRAINING, About
 from logvggt_jax.data.errors import UnequalSizes
-from logvggt_jax.data.formats.calibration import in_pixels, numbers, pinhole, relative
+from logvggt_jax.data.formats.calibration import in_pixels, numbers, pinhole, relative, whole_number
 from logvggt_jax.data.formats.image import read_depth, read_rgb
 from logvggt_jax.data.formats.pose_track import PoseTrack
 from logvggt_jax.data.formats.quarter_turns import turned_extrinsics, turned_intrinsics, turns_to_upright
@@ -33,6 +33,7 @@ from logvggt_jax.errors import InputError
 _FOLDS = {"train": ("Training",), "val": ("Validation",), "all": ("Training", "Validation")}
 _VIDEO = re.compile(r"\d+")
 _SHAPE_TOLERANCE = 0.02
+_MAX_TIME = 1e12  # seconds; milliseconds beyond it would leave int64
 # Intrinsics of a record whose calibration is read with its picture.
 _WITH_THE_PICTURE = np.full((3, 3), np.nan)
 
@@ -107,7 +108,7 @@ class ARKitScenes(FolderDataset):
                     image=pictures[time],
                     depth=depths[time],
                     # Millions of one-line files: opened with their pictures, not to list them.
-                    companion=calibrations[near],
+                    calibration=calibrations[near],
                     intrinsics=_WITH_THE_PICTURE,
                     extrinsics=turned_extrinsics(extrinsics, turns),
                     quarter_turns=turns,
@@ -116,8 +117,8 @@ class ARKitScenes(FolderDataset):
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         image = read_rgb(record.image)
         size = image.shape[:2]
-        assert record.companion is not None
-        intrinsics = in_pixels(_calibration(record.companion), size, record.image)
+        assert record.calibration is not None
+        intrinsics = in_pixels(_calibration(record.calibration), size, record.image, record.calibration)
         intrinsics = turned_intrinsics(intrinsics, size, record.quarter_turns)
         return image, _at_size(read_depth(record.depth), size, record.depth), intrinsics
 
@@ -139,7 +140,7 @@ def _trajectory(text: str, path: Path) -> PoseTrack:
         if not row.strip():
             continue
         time, *vectors = numbers(row, f"{path}, line {line}", count=7)
-        if not np.isfinite(time):
+        if not abs(time) < _MAX_TIME:  # NaN neither
             raise InputError(f"{path}, line {line}: expected a time in seconds first, got {time}: download it again")
         times.append(_milliseconds(time))
         poses.append(_pose(np.array(vectors)))
@@ -161,9 +162,10 @@ def _calibration(path: Path) -> np.ndarray:
     """Intrinsics [3, 3] of a picture of one pixel."""
     text = SourceFiles().text(path, "the picture's calibration; download the video again")
     width, height, *values = numbers(text, path, count=6)
-    if not (width >= 1 and height >= 1):
+    size = whole_number(height, path), whole_number(width, path)
+    if min(size) < 1:
         raise InputError(f"{path}: expected a width and height above 0, got {width:g} x {height:g}: download it again")
-    return relative(pinhole(*values), (int(height), int(width)))
+    return relative(pinhole(*values), size)
 
 
 def _at_size(depth: np.ndarray, size: tuple[int, int], path: Path) -> np.ndarray:

@@ -71,7 +71,8 @@ class KITTI(FolderDataset):
 
     def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
         drive = sequence.split("/")[0]
-        intrinsics = _intrinsics(self.root / _date(drive) / "calib_cam_to_cam.txt", files)
+        calibration = self.root / _date(drive) / "calib_cam_to_cam.txt"
+        intrinsics = _intrinsics(calibration, files)
         if sequence == drive:
             image_folder = self._raw_pictures(drive)
             depths = numbered_files(files, folder / "proj_depth" / "groundtruth" / "image_02", _PICTURE)
@@ -89,7 +90,7 @@ class KITTI(FolderDataset):
             images, depths = ({number: pair[kind] for number, pair in pairs.items()} for kind in (0, 1))
         for number, image in images.items():
             if number in depths:
-                yield frame(image, depths[number], intrinsics, NO_POSES)
+                yield frame(image, depths[number], intrinsics, NO_POSES, calibration=calibration)
             else:
                 yield Dropped("no depth")
 

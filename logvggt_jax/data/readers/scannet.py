@@ -90,7 +90,8 @@ class ScanNet(FolderDataset):
         path = scene / "intrinsic" / "intrinsic_depth.txt"
         intrinsics = numbers(files.text(path, "the depth camera's intrinsics"), path, count=16).reshape(4, 4)[:3, :3]
         for image, depth, pose, where in frames:
-            yield frame(image, depth, intrinsics, world_to_camera(pose, where, stored="camera_to_world"))
+            extrinsics = world_to_camera(pose, where, stored="camera_to_world")
+            yield frame(image, depth, intrinsics, extrinsics, calibration=path)
 
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         image, raw = read_rgb(record.image), read_depth(record.depth)

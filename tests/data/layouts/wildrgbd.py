@@ -70,7 +70,7 @@ LAYOUT = Layout(
             )
         ),
         # Row by row, and a focal length of a million pixels.
-        (r"00000\.png: intrinsics", lambda root: write_metadata(root / SCENE, INTRINSICS.T)),
-        (r"00000\.png: intrinsics fx=1e\+06", lambda root: write_metadata(root / SCENE, pinhole(SIZE, 1e6))),
+        (r"metadata: intrinsics", lambda root: write_metadata(root / SCENE, INTRINSICS.T)),
+        (r"metadata: intrinsics fx=1e\+06", lambda root: write_metadata(root / SCENE, pinhole(SIZE, 1e6))),
     ),
 )
