@@ -56,7 +56,7 @@ class FrameAnnotation:
         if self.camera is None:
             return None
         rotation, translation = self.camera[:9].reshape(3, 3), self.camera[9:12]
-        if np.abs(translation).max() > _MAX_DISTANCE:
+        if not np.abs(translation).max() <= _MAX_DISTANCE or not np.isfinite(rotation).all():
             return None
         pose = np.column_stack([_PYTORCH3D_AXES @ rotation.T, _PYTORCH3D_AXES @ translation])
         return world_to_camera(pose, where, stored="world_to_camera")

@@ -23,7 +23,7 @@ from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, Fram
 from logvggt_jax.errors import InputError
 
 # Makes the world right-handed; which axis is flipped changes no relative pose.
-_MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
+_MIRROR = np.array([1.0, -1.0, 1.0, 1.0])  # of the columns
 _SEQUENCE = re.compile(r"\d{4}")
 _NUMBERS = ("f_x", "f_y", "c_x", "c_y")
 
@@ -77,4 +77,4 @@ def _camera(text: str, path: Path) -> tuple[np.ndarray, np.ndarray | None]:
             f"{path}: expected a left-handed world (determinant -1), got determinant "
             f"{np.linalg.det(pose):+.3g}: replace it with the data set's original file"
         )
-    return intrinsics, world_to_camera(pose @ _MIRROR, path, stored="world_to_camera")
+    return intrinsics, world_to_camera(pose * _MIRROR, path, stored="world_to_camera")

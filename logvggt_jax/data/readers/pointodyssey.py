@@ -87,10 +87,10 @@ def _cameras(files: SourceFiles, folder: Path) -> tuple[np.ndarray, np.ndarray]:
     if not zipfile.is_zipfile(path):
         raise InputError(f"{path}: truncated or damaged npz file (no zip directory): fetch it again")
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             names = archive.files
             found = {name: archive[name] for name in ("intrinsics", "extrinsics") if name in names}
-    except (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error) as error:
+    except (OSError, EOFError, ValueError, LookupError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
         raise InputError(f"{path}: truncated or damaged npz file ({error}): fetch it again") from error
     if len(found) < 2 or _LATER_ARRAY not in names:
         raise InputError(

@@ -55,7 +55,7 @@ LAYOUT = Layout(
             )
             for text, complaint in (
                 ("1 0 0 0", "expected 17 numbers, got 4"),
-                ("1.5 1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1", "frame number"),
+                ("1.5 1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1", "frame number: expected a whole number, got 1\\.5"),
                 ("1 1 0 0 0 0 -1 0 0 0 0 1 0 0 0 0 1", "rigid"),
             )
         ),
