@@ -2,9 +2,9 @@
 
 Layout, as exported by the SensReader of the official repository: `<root>/<part>/<scene>/` with
 `color/<n>.jpg`, `depth/<n>.png`, `pose/<n>.txt` and `intrinsic/intrinsic_depth.txt`. `<part>` is `scans_train`,
-`scans_test` or `scannetv2`, or is left out; scenes are named `scene0000_00`. Numbers are not padded. Depth is uint16 in
-millimetres, 0 where invalid. Poses are camera-to-world in metres, OpenCV axes; a lost frame's entries are `-inf`.
-Intrinsics are 4x4.
+`scans_test` or `scannetv2`, or is left out; scenes are named `scene0000_00`. Numbers are not padded (`0.jpg`), or are,
+as other exporters write them (`000000.jpg`). Depth is uint16 in millimetres, 0 where invalid. Poses are camera-to-world
+in metres, OpenCV axes; a lost frame's entries are `-inf`. Intrinsics are 4x4.
 
 Also read, where a scene has no `color`, is the form that published evaluations prepare (MonST3R's script):
 `color_90/frame_0000.jpg`, `depth_90/frame_0000.png` and `pose_90.txt` with 16 numbers a line, and likewise for other

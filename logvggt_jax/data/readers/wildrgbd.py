@@ -131,7 +131,7 @@ def _poses(files: SourceFiles, path: Path) -> dict[int, np.ndarray | None]:
             continue
         where = f"{path}, line {line}"
         values = numbers(row, where, count=17)
-        number = whole_number(values[0], f"{where}, frame number")
+        number = whole_number(values[0], f"{where}: frame number")
         poses[number] = world_to_camera(values[1:].reshape(4, 4), where, stored="camera_to_world")
     if not poses:
         raise InputError(f"{path}: no poses; fetch it again")
