@@ -19,6 +19,7 @@ from absl import logging
 from logvggt_jax.data.dataset import Reader, check_indices, check_sequence, check_split
 from logvggt_jax.data.errors import EmptySequence, MissingFiles, UnequalSizes
 from logvggt_jax.data.formats.calibration import check_intrinsics
+from logvggt_jax.data.formats.image import read_depth
 from logvggt_jax.data.formats.source_files import SourceFiles, refused
 from logvggt_jax.data.readers.listing_index import ListingIndex, code_digest
 from logvggt_jax.errors import InputError
@@ -36,7 +37,7 @@ class FrameRecord:
 
     name: str  # unique in its sequence
     image: Path  # colour picture
-    depth: Path  # depth in the set's own encoding
+    depth: Path  # depth in the set's own encoding; the picture itself for a frame without depth
     intrinsics: np.ndarray  # [3, 3] float64, pixels as the set's reader needs them (its `_read_frame` decides)
     extrinsics: np.ndarray  # [4, 4] float64, world-to-camera, rigid; NaN in sets without poses
     companion: Path | None = None  # a third file that the frame needs, such as a mask of valid depth
@@ -66,6 +67,16 @@ def frame(
         return Dropped("no intrinsics", others.get("calibration"))
     others = {"name": image.stem, **others}
     return FrameRecord(image=image, depth=depth, intrinsics=intrinsics, extrinsics=extrinsics, **others)
+
+
+def read_depth_of(record: FrameRecord, image: np.ndarray, units: float) -> np.ndarray:
+    """Depth [h, w] float32 of a frame whose file is 16-bit with so many `units` a metre.
+
+    A picture in depth's place stands for no depth: it is 0 throughout, of the size of `image` [H, W, 3].
+    """
+    if record.depth == record.image:
+        return np.zeros(image.shape[:2], np.float32)
+    return read_depth(record.depth).astype(np.float32) / np.float32(units)
 
 
 @dataclass(frozen=True)
