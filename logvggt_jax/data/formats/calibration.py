@@ -6,7 +6,7 @@ import numpy as np
 
 from logvggt_jax.data.errors import AbsurdIntrinsics, BadPose
 from logvggt_jax.errors import InputError
-from logvggt_jax.geometry import invert, nearest_rotation
+from logvggt_jax.geometry import invert, nearest_rotation, quaternion_to_matrix
 
 # Camera axes x right, y up, z back to x right, y down, z forward, and the reverse; multiplied from the right onto
 # camera-to-world, from the left onto world-to-camera matrices.
@@ -78,6 +78,23 @@ def world_to_camera(pose: np.ndarray, where: str | Path, *, stored: str) -> np.n
     raise ValueError(f"stored must be camera_to_world or world_to_camera, got {stored!r}")
 
 
+def pose_from_quaternion(
+    quaternion: np.ndarray, position: np.ndarray, where: str | Path, *, stored: str
+) -> np.ndarray | None:
+    """World-to-camera [4, 4] float64 of a pose that is `stored` as in `world_to_camera`: `quaternion` x y z w, [4], and
+    `position` [3]; None where it is not finite.
+
+    Raises BadPose naming `where` for a quaternion whose length is not 1 to 0.01.
+    """
+    if not (np.isfinite(quaternion).all() and np.isfinite(position).all()):
+        return None
+    # Numbers of another magnitude would overflow in the length.
+    if np.abs(quaternion).max() > 2 or abs(np.linalg.norm(quaternion) - 1) > _ROTATION_TOLERANCE:
+        raise BadPose(f"{where}: expected a unit quaternion, got {quaternion} (x y z w): fetch the file again")
+    pose = np.concatenate([quaternion_to_matrix(quaternion), position[:, None]], axis=1)
+    return world_to_camera(pose, where, stored=stored)
+
+
 def check_intrinsics(intrinsics: np.ndarray, size: tuple[int, int], picture: Path, calibration: Path | None) -> None:
     """Raises InputError unless intrinsics [3, 3] can belong to `picture`, which has `size` (H, W).
 
@@ -121,7 +138,7 @@ def in_pixels(
     from square: it was turned or cropped.
     """
     matrix = scaled(intrinsics, size[1], size[0])
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
         aspect = matrix[0, 0] / matrix[1, 1]
     if not 1 / _PIXEL_ASPECT < aspect < _PIXEL_ASPECT:
         raise InputError(

@@ -13,11 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from logvggt_jax.data.errors import BadPose, BrokenPicture
-from logvggt_jax.data.formats.calibration import numbers, pinhole, whole_number, world_to_camera
+from logvggt_jax.data.errors import BrokenPicture
+from logvggt_jax.data.formats.calibration import numbers, pinhole, pose_from_quaternion, whole_number
 from logvggt_jax.data.formats.source_files import SourceFiles, read_regular
 from logvggt_jax.errors import InputError
-from logvggt_jax.geometry import quaternion_to_matrix
 
 # By COLMAP's number: name and how many parameters.
 _MODELS = (
@@ -141,12 +140,8 @@ def _camera(model: str, size: tuple[int, int], parameters: tuple[float, ...], wh
 
 def _image(name: str, camera: int, pose: np.ndarray, where: str) -> ColmapImage:
     """`pose`: quaternion (w first) and translation [7]."""
-    if not np.isfinite(pose).all():
-        return ColmapImage(name, camera, None)
-    if abs(np.linalg.norm(pose[:4]) - 1) > 0.01:
-        raise BadPose(f"{where}: expected a unit quaternion qw qx qy qz, got {pose[:4]}: export the model again")
-    matrix = np.concatenate([quaternion_to_matrix(pose[[1, 2, 3, 0]]), pose[4:, None]], axis=1)
-    return ColmapImage(name, camera, world_to_camera(matrix, where, stored="world_to_camera"))
+    extrinsics = pose_from_quaternion(pose[[1, 2, 3, 0]], pose[4:], where, stored="world_to_camera")
+    return ColmapImage(name, camera, extrinsics)
 
 
 def _text_cameras(text: str, path: Path) -> Iterator[tuple[int, ColmapCamera]]:

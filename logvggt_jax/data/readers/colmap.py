@@ -70,7 +70,7 @@ class Colmap(FolderDataset):
         if absent:
             raise missing_files(dict.fromkeys(absent, f"but {image_file} names it; copy it there"))
         intrinsics = {
-            number: _intrinsics(cameras, number, camera_file, folder) for number in {image.camera for image in images}
+            number: _intrinsics(cameras, number, camera_file, image_file) for number in {i.camera for i in images}
         }
         there = {each / name for each, held in names.items() for name in held}
         yield from (Dropped("no pose") for path in there - set(paths) if path.suffix.lower() in _PICTURE_SUFFIXES)
@@ -103,17 +103,17 @@ def _inside(folder: Path, name: str, model_file: Path) -> Path:
     return folder / relative_name
 
 
-def _intrinsics(cameras: Mapping[int, ColmapCamera], number: int, path: Path, folder: Path) -> np.ndarray:
+def _intrinsics(cameras: Mapping[int, ColmapCamera], number: int, path: Path, image_file: Path) -> np.ndarray:
     """Intrinsics [3, 3] of a picture of one pixel."""
     if number not in cameras:
-        raise InputError(f"{path}: no camera {number}, which pictures have: export the model again")
+        raise InputError(f"{path}: no camera {number}, which {image_file} names: export the model again")
     camera = cameras[number]
     matrix = camera.intrinsics()
     if matrix is None:
         raise InputError(
             f"{path}: camera {number} is {camera.model} with distortion, frames need a pinhole: run `colmap "
-            f"image_undistorter --image_path {folder / 'images'} --input_path {path.parent} --output_path "
-            "<new folder>` and pass the new folder"
+            f"image_undistorter --image_path <images> --input_path {path.parent} --output_path <new folder>` and pass "
+            "the new folder"
         )
     return relative(matrix, camera.size)
 

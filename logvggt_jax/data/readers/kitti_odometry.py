@@ -34,6 +34,7 @@ from logvggt_jax.geometry import compose
 
 _WITH_POSES = re.compile(r"0\d|10")
 _PICTURE = "{:06d}.png"
+_MAX_SHIFT = 10.0  # metres between cameras on one car
 _UNITS_PER_METRE = 256.0
 
 
@@ -87,8 +88,13 @@ def _from_camera_0(projection: np.ndarray, path: Path) -> np.ndarray:
     """[4, 4], from points of camera 0 to points of the camera of this `projection` [3, 4]."""
     try:
         shift = np.linalg.solve(projection[:, :3], projection[:, 3])
-    except np.linalg.LinAlgError as error:
-        raise InputError(f"{path}, P2: {error}; expected intrinsics: fetch the calibration again") from error
+    except np.linalg.LinAlgError:
+        shift = np.full(3, np.inf)
+    if not np.abs(shift).max() <= _MAX_SHIFT:  # NaN neither
+        raise InputError(
+            f"{path}, P2: expected intrinsics, and a camera within {_MAX_SHIFT} m of camera 0: fetch the calibration "
+            "again"
+        )
     moved = np.eye(4)
     moved[:3, 3] = shift
     return moved

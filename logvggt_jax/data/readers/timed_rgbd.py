@@ -12,13 +12,12 @@ from typing import ClassVar
 
 import numpy as np
 
-from logvggt_jax.data.errors import BadPose, MissingFiles, UnequalCounts, missing_files
-from logvggt_jax.data.formats.calibration import in_pixels, numbers, relative, world_to_camera
+from logvggt_jax.data.errors import MissingFiles, UnequalCounts, missing_files
+from logvggt_jax.data.formats.calibration import in_pixels, numbers, pose_from_quaternion, relative
 from logvggt_jax.data.formats.image import read_rgb
 from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.data.readers.folder_dataset import NO_POSES, Dropped, FolderDataset, FrameRecord, frame, read_depth_of
 from logvggt_jax.errors import InputError
-from logvggt_jax.geometry import quaternion_to_matrix
 
 TOLERANCE = 0.02  # seconds
 _SIZE = (480, 640)  # that the calibrations belong to
@@ -152,12 +151,7 @@ class Trajectory:
         """World-to-camera [4, 4] of pose `index`; None where it is not finite. BadPose for no unit quaternion."""
         position, quaternion = self._poses[index, :3], self._poses[index, 3:]
         where = f"{self.path}, line {self._lines[index]}"
-        if not np.isfinite(self._poses[index]).all():
-            return None
-        if abs(np.linalg.norm(quaternion) - 1) > 0.01:
-            raise BadPose(f"{where}: expected a unit quaternion qx qy qz qw, got {quaternion}: fetch the file again")
-        pose = np.concatenate([quaternion_to_matrix(quaternion), position[:, None]], axis=1)
-        return world_to_camera(pose, where, stored="camera_to_world")
+        return pose_from_quaternion(quaternion, position, where, stored="camera_to_world")
 
 
 def listed_files(path: Path, files: SourceFiles) -> tuple[np.ndarray, list[Path]]:
