@@ -31,7 +31,7 @@ from logvggt_jax.data.formats.image import read_depth, read_rgb
 from logvggt_jax.data.formats.pose_track import PoseTrack
 from logvggt_jax.data.formats.quarter_turns import turned_extrinsics, turned_intrinsics, turns_to_upright
 from logvggt_jax.data.formats.source_files import SourceFiles
-from logvggt_jax.data.readers.folder_dataset import NO_POSES, Dropped, FolderDataset, FrameRecord
+from logvggt_jax.data.readers.folder_dataset import INDOORS, NO_POSES, Dropped, FolderDataset, FrameRecord
 from logvggt_jax.errors import InputError
 
 _FOLDS = {"train": ("Training",), "val": ("Validation",), "all": ("Training", "Validation")}
@@ -61,6 +61,7 @@ class ARKitScenes(FolderDataset):
     title = "ARKitScenes"
     expects = "raw/Training/<video>/vga_wide, or 3dod/Training/<video> (the folder that the download script was given)"
     metric = True
+    plausible_depth = INDOORS
     splits = ("train", "val", "all")
     about = About(
         source="download script of the repository apple/ARKitScenes, raw data or 3dod",

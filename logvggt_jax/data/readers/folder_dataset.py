@@ -11,7 +11,7 @@ from collections import Counter, OrderedDict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from absl import logging
@@ -28,6 +28,7 @@ from logvggt_jax.frames import Frames
 NO_POSES = np.full((4, 4), np.nan)
 # Listings kept in memory; a set of twenty thousand sequences would fill it with all of them.
 _RECENT = 64
+INDOORS = (0.05, 50.0)  # metres, `plausible_depth` of rooms, halls and tables
 _GAPS = (30, 10, 5, 2, 1)
 
 
@@ -93,7 +94,14 @@ class FolderDataset(Reader):
     A reader says in `_find_sequences` which sequences a split has, in `_frames` which frames a sequence has, and in
     `_read_frame` how one frame is decoded. Both listings are kept in an index (see `listing_index`), for which they
     read folders and text files through `SourceFiles`.
+
+    Attributes:
+      plausible_depth: metres between which the median of a frame's depth lies, in metric sets; for checks of a copy.
+      centred: whether principal points lie near the picture's centre; for checks of a copy.
     """
+
+    plausible_depth: ClassVar[tuple[float, float]] = (0.01, 1000.0)
+    centred: ClassVar[bool] = True
 
     def __init__(self, root: str | Path, split: str = "all") -> None:
         """Lists the sequences of a `split` in the set's folder `root`; frames are listed when a sequence is first used.
@@ -154,6 +162,10 @@ class FolderDataset(Reader):
     def frame_names(self, sequence: str) -> list[str]:
         """Names of these frames, in time order."""
         return [record.name for record in self._listing(sequence).frames]
+
+    def record(self, sequence: str, index: int) -> FrameRecord:
+        """The files of a frame, and what is known of it before they are opened."""
+        return self._listing(sequence).frames[index]
 
     def dropped_frames(self, sequence: str) -> dict[str, int]:
         """Frames of the folder that do not count, by reason."""

@@ -33,7 +33,7 @@ from logvggt_jax.data.formats.calibration import OPENGL_AXES, world_to_camera
 from logvggt_jax.data.formats.hdf5 import read_hdf5
 from logvggt_jax.data.formats.numbered_files import numbered_frames
 from logvggt_jax.data.formats.source_files import SourceFiles
-from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame
+from logvggt_jax.data.readers.folder_dataset import INDOORS, Dropped, FolderDataset, FrameRecord, frame
 from logvggt_jax.errors import InputError
 
 _CAMERA_TABLE = "metadata_camera_parameters.csv"
@@ -63,6 +63,8 @@ class HyperSim(FolderDataset):
     title = "HyperSim"
     expects = f"ai_VVV_NNN with _detail and images, and {_CAMERA_TABLE} from the set's repository"
     metric = True
+    plausible_depth = INDOORS
+    centred = False  # shifted lenses
     splits = ("train", "val", "test", "all")
     about = About(
         source="download script of the repository apple/ml-hypersim, a zip file a scene (parts of scenes: "

@@ -18,7 +18,7 @@ from logvggt_jax.data.formats.image import read_depth, read_rgb
 from logvggt_jax.data.formats.numbered_files import numbered_frames, without_gaps
 from logvggt_jax.data.formats.pose_lists import read_pose_list
 from logvggt_jax.data.formats.source_files import SourceFiles
-from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame
+from logvggt_jax.data.readers.folder_dataset import INDOORS, Dropped, FolderDataset, FrameRecord, frame
 
 _CENTRE, _SIZE = (320.0, 240.0), (480, 640)
 _MAX_DEPTH = 10.0  # metres, valid itself
@@ -35,6 +35,7 @@ class NRGBD(FolderDataset):
     title = "Neural RGB-D"
     expects = "<scene>/{images,depth,focal.txt,poses.txt}"
     metric = True
+    plausible_depth = INDOORS
     splits = ("all",)
     about = About(
         source="repository dazinovic/neural-rgbd-surface-reconstruction",

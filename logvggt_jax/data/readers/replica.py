@@ -18,7 +18,7 @@ from logvggt_jax.data.formats.json_values import expecting, read_json
 from logvggt_jax.data.formats.numbered_files import numbered_frames, without_gaps
 from logvggt_jax.data.formats.pose_lists import read_pose_list
 from logvggt_jax.data.formats.source_files import SourceFiles
-from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame
+from logvggt_jax.data.readers.folder_dataset import INDOORS, Dropped, FolderDataset, FrameRecord, frame
 from logvggt_jax.errors import InputError
 
 # The rendering's own, for downloads that lack the file.
@@ -37,6 +37,7 @@ class Replica(FolderDataset):
     title = "Replica"
     expects = "cam_params.json and <scene>/{traj.txt,results} (the rendering that NICE-SLAM distributes)"
     metric = True
+    plausible_depth = INDOORS
     splits = ("all",)
     about = About(
         source="the rendering that the download script of the repository cvg/nice-slam fetches; the official meshes "

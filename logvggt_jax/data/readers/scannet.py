@@ -26,7 +26,7 @@ from logvggt_jax.data.formats.image import read_depth, read_rgb
 from logvggt_jax.data.formats.numbered_files import numbered_frames, without_gaps
 from logvggt_jax.data.formats.pose_lists import read_pose_list
 from logvggt_jax.data.formats.source_files import SourceFiles
-from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame
+from logvggt_jax.data.readers.folder_dataset import INDOORS, Dropped, FolderDataset, FrameRecord, frame
 from logvggt_jax.errors import InputError
 
 _SCENE = re.compile(r"scene\d{4}_\d{2}")
@@ -50,6 +50,7 @@ class ScanNet(FolderDataset):
     title = "ScanNet"
     expects = "scans_train, scans_test or scannetv2 with scene0000_00/{color,depth,pose,intrinsic} (export the .sens)"
     metric = True
+    plausible_depth = INDOORS
     splits = ("train", "val", "test", "all")
     about = About(
         source="terms-of-use form by e-mail (repository ScanNet/ScanNet); export each .sens with its SensReader; for "

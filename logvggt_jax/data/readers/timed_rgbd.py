@@ -16,7 +16,15 @@ from logvggt_jax.data.errors import MissingFiles, UnequalCounts, missing_files
 from logvggt_jax.data.formats.calibration import in_pixels, numbers, pose_from_quaternion, relative
 from logvggt_jax.data.formats.image import read_rgb
 from logvggt_jax.data.formats.source_files import SourceFiles
-from logvggt_jax.data.readers.folder_dataset import NO_POSES, Dropped, FolderDataset, FrameRecord, frame, read_depth_of
+from logvggt_jax.data.readers.folder_dataset import (
+    INDOORS,
+    NO_POSES,
+    Dropped,
+    FolderDataset,
+    FrameRecord,
+    frame,
+    read_depth_of,
+)
 from logvggt_jax.errors import InputError
 
 TOLERANCE = 0.02  # seconds
@@ -60,6 +68,7 @@ class TimedRGBD(FolderDataset):
     """
 
     metric = True
+    plausible_depth = INDOORS
     splits = ("all",)
     folder_pattern: ClassVar[re.Pattern[str]]
     container: ClassVar[str | None]  # folder below `root` that may hold the sequences

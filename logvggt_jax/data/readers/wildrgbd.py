@@ -21,7 +21,7 @@ from logvggt_jax.data.formats.json_values import expecting, read_json
 from logvggt_jax.data.formats.numbered_files import numbered_frames
 from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.data.formats.split_lists import sequences_present
-from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame
+from logvggt_jax.data.readers.folder_dataset import INDOORS, Dropped, FolderDataset, FrameRecord, frame
 from logvggt_jax.errors import InputError
 
 _SCENE = re.compile(r"scene_\d+")
@@ -44,6 +44,7 @@ class WildRGBD(FolderDataset):
     title = "WildRGB-D"
     expects = "<category>/scenes/scene_XXX/rgb (unpack the categories' zip files)"
     metric = True
+    plausible_depth = INDOORS
     splits = ("train", "test", "all")
     about = About(
         source="zip files by category (repository wildrgbd/wildrgbd)",
