@@ -3,6 +3,7 @@
 Values that are finite in a file and infinite in float32 never reach a model.
 """
 
+import errno
 import gzip
 import json
 import os
@@ -11,6 +12,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from damage import CONTENT_DAMAGES, PLACE_DAMAGES, damaged_copies
@@ -162,6 +164,38 @@ def test_lists_whose_names_cannot_be_names_are_refused(tmp_path: Path):
             SourceFiles().content(tmp_path / name, "a file")
     with pytest.raises(InputError, match="name too long"):
         SourceFiles().content(tmp_path / ("a" * 300), "a file")
+
+
+@pytest.mark.parametrize("kind", ["image", "depth", "table"])
+def test_files_that_may_not_be_read_are_named(tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch):
+    """As another user than the superuser meets them."""
+    layout = layout_of("scannet")
+    layout.write(tmp_path, layout.views)
+    refused = tmp_path / (layout.tables[0] if kind == "table" else getattr(layout, kind))
+    read = Path.read_bytes
+
+    def read_bytes(path: Path) -> bytes:
+        if path == refused:
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+        return read(path)
+
+    monkeypatch.setattr(Path, "read_bytes", read_bytes)
+    with pytest.raises(InputError, match="Permission denied") as error:
+        read_all(layout, tmp_path)
+    assert named(error, f"{refused}: ")
+
+
+def test_depth_that_leaves_float32_is_invalid(tmp_path: Path):
+    layout = layout_of("hypersim")
+    layout.write(tmp_path, layout.views)
+    path = tmp_path / layout.depth
+    with h5py.File(path, "r+") as file:
+        distance = file["dataset"][()].astype(np.float64)
+        distance[0], distance[1], distance[2], distance[3] = 1e39, np.nan, -1, 1e300
+        del file["dataset"]
+        file["dataset"] = distance
+    depth = opened(layout, tmp_path).read(layout.sequence, [1]).depth[0]
+    assert not depth[:4].any() and depth[4:].all()
 
 
 def test_links_to_files_are_followed(tmp_path: Path):

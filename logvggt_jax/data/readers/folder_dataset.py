@@ -111,7 +111,11 @@ class FolderDataset(Reader):
         """
         check_split(split, self)
         self.root, self.split = Path(root), split
-        if not self.root.is_dir():
+        try:
+            is_folder = self.root.is_dir()
+        except OSError as error:
+            raise refused(self.root, error) from error
+        if not is_folder:
             raise MissingFiles(f"{self.root}: no such folder; pass the folder that holds {self.expects}")
         self._index = ListingIndex(self.identity, self.root, code_digest(type(self)))
         self._recent: OrderedDict[str, Listing] = OrderedDict()

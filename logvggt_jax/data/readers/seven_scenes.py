@@ -14,7 +14,7 @@ import numpy as np
 
 from logvggt_jax.data.dataset import EVALUATION, LICENCE_NOT_READ, About, check_indices
 from logvggt_jax.data.errors import MissingFiles, missing_files
-from logvggt_jax.data.formats.calibration import numbers, pinhole, scaled, world_to_camera
+from logvggt_jax.data.formats.calibration import in_pixels, numbers, pinhole, relative, scaled, world_to_camera
 from logvggt_jax.data.formats.image import read_depth, read_rgb
 from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.data.readers.folder_dataset import INDOORS, NO_POSES, Dropped, FolderDataset, FrameRecord, frame
@@ -110,7 +110,7 @@ class SevenScenes(FolderDataset):
 
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         image, depth = read_rgb(record.image), _metres(read_depth(record.depth))
-        matrix = _at_size(record.intrinsics, image.shape[:2])
+        matrix = in_pixels(relative(record.intrinsics, _SIZE), image.shape[:2], record.image)
         if not record.depth.name.endswith(".proj.png"):
             depth = _carry_to_colour(depth, matrix, image.shape[:2])
         return image, depth, matrix
