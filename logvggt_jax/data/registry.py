@@ -9,8 +9,10 @@ from logvggt_jax.data.readers.arkitscenes import ARKitScenes
 from logvggt_jax.data.readers.blendedmvs import BlendedMVS
 from logvggt_jax.data.readers.bonn import Bonn
 from logvggt_jax.data.readers.co3dv2 import Co3Dv2
+from logvggt_jax.data.readers.colmap import Colmap
 from logvggt_jax.data.readers.hypersim import HyperSim
 from logvggt_jax.data.readers.kitti import KITTI
+from logvggt_jax.data.readers.kitti_odometry import KITTIOdometry
 from logvggt_jax.data.readers.mvs_synth import MVSSynth
 from logvggt_jax.data.readers.nrgbd import NRGBD
 from logvggt_jax.data.readers.pointodyssey import PointOdyssey
@@ -20,6 +22,7 @@ from logvggt_jax.data.readers.seven_scenes import SevenScenes
 from logvggt_jax.data.readers.sintel import Sintel
 from logvggt_jax.data.readers.spring import Spring
 from logvggt_jax.data.readers.tum import TUM
+from logvggt_jax.data.readers.tum_recording import TUMRecording
 from logvggt_jax.data.readers.virtual_kitti import VirtualKITTI
 from logvggt_jax.data.readers.wildrgbd import WildRGBD
 from logvggt_jax.data.rooms.rooms import Rooms
@@ -44,9 +47,12 @@ _READERS: tuple[type[Reader], ...] = (
     KITTI,
     TUM,
     Rooms,
+    KITTIOdometry,
+    TUMRecording,
+    Colmap,
 )
 READERS: dict[str, type[Reader]] = {reader.name: reader for reader in _READERS}
-"""Readers by name; the paper's training sets first, then those that it only evaluates on."""
+"""Readers by name: the paper's training sets, those that it only evaluates on, rooms, those that it does not use."""
 
 DATASETS: tuple[str, ...] = tuple(READERS)
 """All names that `open_dataset` knows."""
