@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from logvggt_jax.errors import InputError
+from logvggt_jax.errors import InputError, disk_errors, printable
 from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE, read_cameras
 from logvggt_jax.reconstruction.depth_files import read_depth, read_picture
 from logvggt_jax.reconstruction.point_cloud import count_points, read_points
@@ -51,17 +51,19 @@ class Reconstruction:
         """The reconstruction in a folder that `reconstruct` has written.
 
         Raises:
-          InputError: the folder is not one, or a file of it is missing or cut off. What else is wrong with a file is
-            said when it is read.
+          InputError: the folder is not one, its cameras cannot be used, or a file is missing or cut off. What else is
+            wrong with a file is said when it is read.
         """
         folder = Path(folder).expanduser()
         result = cls.with_cameras_of(folder)
         files = [depth_file(folder, name) for name in result.names]
-        if (folder / IMAGE_FOLDER).exists():  # results of earlier versions have none
-            files += [image_file(folder, name) for name in result.names]
+        with disk_errors(folder / IMAGE_FOLDER):
+            if (folder / IMAGE_FOLDER).exists():  # results of earlier versions have none
+                files += [image_file(folder, name) for name in result.names]
         for file in files:
-            if not file.is_file():
-                raise InputError(f"{file} is missing: the reconstruction is damaged or incomplete; make it again")
+            with disk_errors(file):
+                if not file.is_file():
+                    raise InputError(f"{file} is missing: the reconstruction is damaged or incomplete; make it again")
         count_points(folder / POINTS_FILE)
         return result
 
@@ -105,18 +107,18 @@ class Reconstruction:
 
     def depth_and_confidence(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         """Both of one frame, in one reading."""
-        return read_depth(depth_file(self.folder, self.names[index]))
+        return read_depth(depth_file(self.folder, self.names[index]), self.depth_size)
 
     def image(self, index: int) -> np.ndarray:
         """A frame as the model saw it, [h, w, 3] uint8 RGB, to the few grey levels that JPEG costs."""
-        return read_picture(image_file(self.folder, self.names[index]))
+        return read_picture(image_file(self.folder, self.names[index]), self.depth_size)
 
     def points(self) -> tuple[np.ndarray, np.ndarray]:
         """The cloud: points [M, 3] float32 in the world, and colours [M, 3] uint8."""
         return read_points(self.folder / POINTS_FILE)
 
     def summary(self) -> str:
-        """One line a result, with its place."""
+        """One line a result, with its place; for people, so that a name's control characters are shown as escapes."""
         height, width = self.depth_size
         lines = [
             (CAMERAS_FILE, f"intrinsics and world-to-camera extrinsics of {self.num_frames} frames"),
@@ -129,9 +131,8 @@ class Reconstruction:
         took = ""
         if self.seconds:
             took = f" in {self.seconds:.1f} s ({self.num_frames / self.seconds:.2f} frames/s)"
-        return "\n".join(
-            [f"{self.num_frames} frames{took}", *(f"  {self.folder / name}: {what}" for name, what in lines)]
-        )
+        folder = printable(str(self.folder))
+        return "\n".join([f"{self.num_frames} frames{took}", *(f"  {folder}/{name}: {what}" for name, what in lines)])
 
 
 def depth_file(folder: Path, name: str) -> Path:
