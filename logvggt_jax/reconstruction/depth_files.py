@@ -52,7 +52,8 @@ def read_depth(path: str | Path, size: tuple[int, int] | None = None) -> tuple[n
     with _result_file(path) as stream:
         try:
             with np.load(stream, allow_pickle=False) as arrays:
-                maps = arrays["depth"], arrays["confidence"]
+                # What has no array's header comes as bytes.
+                maps = np.asarray(arrays["depth"]), np.asarray(arrays["confidence"])
         except OSError:
             raise
         except Exception as error:  # numpy and zipfile meet damaged files with two dozen kinds

@@ -319,7 +319,7 @@ def _points(depth: np.ndarray, image: np.ndarray, indices: np.ndarray) -> FrameP
 def _bins(confidence: np.ndarray, indices: np.ndarray) -> np.ndarray:
     """Bins [n] of the confidences of some pixels."""
     values = np.clip(confidence.reshape(-1)[indices], 0.0, np.finfo(np.float16).max)
-    return values.astype(np.float16).view(np.uint16)
+    return np.abs(values).astype(np.float16).view(np.uint16)  # -0.0 would be a bin of its own
 
 
 @functools.lru_cache(4)

@@ -271,6 +271,15 @@ def test_stride_invalid_depth_and_edges() -> None:
     np.testing.assert_array_equal(edges, expected)
 
 
+@pytest.mark.parametrize("lowest", [-0.0, -1.0, 0.0])
+def test_confidences_of_nothing_and_less_are_the_lowest(lowest: float) -> None:
+    confidence = np.full((4, 5), 2.0, np.float32)
+    confidence[0] = lowest
+    frames = [(np.ones((4, 5), np.float32), confidence, np.zeros((4, 5, 3), np.uint8))]
+    _, chosen = select(PointFilter(25, max_points=None), frames)
+    assert chosen[0].indices.tolist() == list(range(5, 20))
+
+
 def test_nothing_valid_gives_no_points() -> None:
     frames = [(np.zeros((4, 5), np.float32), np.ones((4, 5), np.float32), np.zeros((4, 5, 3), np.uint8))]
     selection, chosen = select(PointFilter(), frames)
