@@ -79,7 +79,15 @@ def run_case(kind: Kind, valid: Path, folder: Path, seed: int, keep: Path | None
             keep_input(root, keep, kind.name, seed)
         return outcome
     finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        remove_tree(folder)
+
+
+def remove_tree(folder: Path) -> None:
+    """Removes a folder with all in it, also that from which permissions were taken."""
+    for inner, names, _ in os.walk(folder):
+        for name in names:
+            (Path(inner) / name).chmod(0o700)
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 def keep_input(root: Path, keep: Path, kind: str, seed: int) -> None:
@@ -111,4 +119,4 @@ def judge(kind: Kind, root: Path, output: Path, seed: int, done: str) -> Outcome
 def _trace(error: BaseException) -> str:
     """The innermost places in this package that an error passed."""
     frames = [frame for frame in traceback.extract_tb(error.__traceback__) if "logvggt_jax" in frame.filename]
-    return " < ".join(f"{os.path.basename(f.filename)}:{f.lineno} {f.name}" for f in reversed(frames[-4:]))  # noqa: PTH119
+    return " < ".join(f"{Path(frame.filename).name}:{frame.lineno} {frame.name}" for frame in reversed(frames[-4:]))

@@ -6,8 +6,10 @@ of the file, or the folder around it.
 
 from __future__ import annotations
 
+import functools
 import io
 import os
+import tempfile
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -54,18 +56,30 @@ def _pick(choices: dict, random: np.random.Generator) -> tuple:
 
 
 def _places() -> dict[str, Callable[[Path], object]]:
-    places = {**PLACE_DAMAGES, "removed": Path.unlink, "link to nothing": _as_dangling_link}
-    places |= {"folder removed": _folder_removed, "renamed": _renamed, "copied beside": _copied}
-    if os.getuid() == 0:  # nothing is forbidden to the superuser
+    places: dict[str, Callable[[Path], object]] = {**PLACE_DAMAGES, "removed": Path.unlink}
+    places |= {"link to nothing": _as_dangling_link, "folder removed": _folder_removed}
+    places |= {"renamed": _renamed, "copied beside": _copied}
+    if _nothing_is_forbidden():
         del places["no permission"]
+    else:
+        places["folder without permission"] = lambda path: path.parent.chmod(0)
     return places
+
+
+@functools.cache
+def _nothing_is_forbidden() -> bool:
+    """As to the superuser, outside of some containers."""
+    with tempfile.NamedTemporaryFile() as file:
+        Path(file.name).chmod(0)
+        return os.access(file.name, os.R_OK)
 
 
 def _contents(path: Path, files: list[Path]) -> dict[str, Damage]:
     damages: dict[str, Damage] = {**CONTENT_DAMAGES, **_BYTES}
 
     def another(content: bytes, random: np.random.Generator) -> bytes:
-        return files[random.integers(len(files))].read_bytes()
+        readable = [file for file in files if os.access(file, os.R_OK)]
+        return readable[random.integers(len(readable))].read_bytes()
 
     damages["content of another file"] = another
     suffix = path.suffix.lower()

@@ -71,7 +71,7 @@ def _write_images(root: Path) -> None:
 def _write_video(root: Path) -> None:
     import cv2
 
-    writer = cv2.VideoWriter(str(root / "walk.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 10, (64, 48))
+    writer = cv2.VideoWriter(str(root / "walk.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 10, (64, 48))
     for picture in _pictures():
         writer.write(picture)
     writer.release()

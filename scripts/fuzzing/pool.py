@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 
-from fuzzing.cases import NOTE, Kind, Outcome, keep_input, run_case
+from fuzzing.cases import NOTE, Kind, Outcome, keep_input, remove_tree, run_case
 
 _MEMORY = 16 * 2**30  # address space of a worker: what asks for more has believed a damaged number
 _PREPARATION = 300.0  # seconds, for imports and the valid inputs
@@ -92,7 +92,7 @@ class _Worker:
         self._process.kill()
         self._process.join()
         self.connection.close()
-        shutil.rmtree(self._folder, ignore_errors=True)
+        remove_tree(self._folder)
 
     def _replaced(self, outcome: Outcome) -> Outcome:
         self._process.kill()
