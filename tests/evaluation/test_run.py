@@ -13,7 +13,7 @@ import pytest
 from rich.console import Console
 
 from logvggt_jax.config import ModelConfig
-from logvggt_jax.errors import InputError
+from logvggt_jax.errors import InputError, OutputExists
 from logvggt_jax.evaluation.report.report import print_report
 from logvggt_jax.evaluation.run import run_evaluation
 from logvggt_jax.weights import save_model
@@ -80,7 +80,7 @@ def test_the_model_and_all_baselines_make_a_table(
     for text in (terminal.getvalue(), markdown):
         assert all(name in text for name in names)
         assert "training rooms" in text and "†" in text and shown in text
-        assert "To get these numbers again: command" in text
+        assert re.search(r"To get these numbers again:\s+command\n", text)
     # The pictures of the first clip are drawn for the first row, and the page holds them.
     stems = {path.stem.rpartition("_")[2] for path in (output / "figures").iterdir()}
     assert stems == {"depth", "points", "trajectory"}
@@ -90,3 +90,15 @@ def test_the_model_and_all_baselines_make_a_table(
     rows = list(csv.reader((output / "tables" / "01-depth-clips-of-4-frames.csv").read_text().splitlines()))
     assert rows[0][:2] == ["method", "Abs Rel (scale) ↓"]
     assert rows[1][:2] == ["LoG-VGGT", shown]
+
+
+def test_only_a_new_folder_or_an_evaluations_is_written_to(tmp_path: Path) -> None:
+    values, output = configuration("rooms", {}), tmp_path / "out"
+    output.mkdir()
+    (output / "results.json").write_text("another program's")
+    with pytest.raises(OutputExists, match=r"out is not overwritten: it holds no clips\.jsonl"):
+        run_evaluation(values, tmp_path / "no-model", output, command="command")
+    assert [path.name for path in output.iterdir()] == ["results.json"]
+    (output / "clips.jsonl").touch()
+    with pytest.raises(InputError, match="no-model"):
+        run_evaluation(values, tmp_path / "no-model", output, command="command")
