@@ -147,7 +147,7 @@ def main() -> None:
         size = write_sequence(folder, options.frames)
         print(f"{options.frames} files of 640 x 480 pixels, {size:.0f} kB each, to {SIZE[0]} x {SIZE[1]}")
         started, used = time.perf_counter(), time.process_time()
-        METHODS["clock"] = Method(lambda *_: predictor, WindowSettings, "windows", "a clock in the device's place")
+        METHODS["clock"] = Method("clock", lambda *_: predictor, WindowSettings, "windows", "a clock, not a device")
         result = reconstruct(
             folder,
             Path(scratch) / "out",

@@ -54,12 +54,14 @@ class Method(NamedTuple):
     """A line of the registry.
 
     Attributes:
+      title: what tables call it.
       open: model, variables and settings to a predictor of one sequence.
       settings: the frozen dataclass of what can be set, all fields with defaults.
       trained_for: what its weights have to be trained for: `windows` (LoG-VGGT) or `vggt` (plain VGGT).
       summary: what the method does, in a few words.
     """
 
+    title: str
     open: Callable[[LogVGGT, Variables, Any], Predictor]
     settings: type
     trained_for: str
@@ -68,16 +70,21 @@ class Method(NamedTuple):
 
 METHODS: dict[str, Method] = {
     "windows": Method(
-        StreamSession.from_settings,
+        "LoG-VGGT",
+        StreamSession,
         WindowSettings,
         "windows",
-        "LoG-VGGT: overlapping windows that hand tokens on, poses refined globally",
+        "overlapping windows that hand tokens on, poses refined globally",
     ),
     "offline": Method(
-        OfflineSession, OfflineSettings, "vggt", "plain VGGT: all frames in one window of full global attention"
+        "VGGT offline", OfflineSession, OfflineSettings, "vggt", "all frames in one window of full global attention"
     ),
     "chunks": Method(
-        ChunkSession, ChunkPlan, "vggt", "plain VGGT on overlapping chunks, chained by robust similarities"
+        "VGGT on chunks",
+        ChunkSession,
+        ChunkPlan,
+        "vggt",
+        "overlapping chunks without memory, chained by robust similarities",
     ),
 }
 

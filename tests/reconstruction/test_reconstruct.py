@@ -253,7 +253,7 @@ class Recorder:
 def reconstruct_recorded(predictor: Recorder, source: Path, output: Path, **options: Any) -> Reconstruction:
     """A reconstruction by a method whose predictor this is."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(METHODS, "recorder", Method(lambda *_: predictor, WindowSettings, "windows", "records"))
+        patch.setitem(METHODS, "recorder", Method("", lambda *_: predictor, WindowSettings, "windows", "records"))
         return reconstruct(
             source, output, model=LogVGGT(), variables={}, method="recorder", longer_edge=LONGER_EDGE, **options
         )
