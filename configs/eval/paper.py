@@ -25,7 +25,7 @@ def get_config() -> ConfigDict:
 
     # Rows of the model: LoG-VGGT's windows, VGGT offline up to max_frames, VGGT on overlapping chunks chained together.
     config.methods = ("windows", "offline", "chunks")
-    config.references = ConfigDict({"max_frames": 200, "chunk_size": 60, "chunk_overlap": 30})
+    config.settings = ConfigDict({"offline": {"max_frames": 200}, "chunks": {"size": 60, "overlap": 30}})
     # Names of logvggt_jax/evaluation/methods/variants.py, evaluated beside the network.
     config.variants = ()
 

@@ -7,8 +7,7 @@ from typing import Any
 
 from logvggt_jax.evaluation.costs.throughput import measured_timings
 from logvggt_jax.evaluation.datasets import open_run
-from logvggt_jax.evaluation.methods.method import Checkpoint
-from logvggt_jax.evaluation.methods.rows import model_rows
+from logvggt_jax.evaluation.methods.method import Checkpoint, model_row
 from logvggt_jax.evaluation.methods.variants import variant_methods
 from logvggt_jax.evaluation.report.report import write_report
 from logvggt_jax.evaluation.runner import evaluate
@@ -44,7 +43,7 @@ def run_evaluation(
     run, output = read_run(configuration), Path(output)
     benchmarks, baselines = open_run(run, data_root)
     loaded = Checkpoint.load(checkpoint)
-    rows = model_rows(loaded, run.methods, run.references)
+    rows = [model_row(method, loaded, run.settings_of(method)) for method in run.methods]
 
     def timings() -> dict[str, Any]:
         assert isinstance(run, PaperRun) and run.timings is not None

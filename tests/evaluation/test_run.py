@@ -41,7 +41,7 @@ def configuration(name: str, changes: dict[str, Any]) -> dict[str, Any]:
         ("rooms", {}, None, "no-model"),
         ("rooms", {}, "d", "leave --data_root=d out"),
         ("rooms", {"evaluation.stride": 0}, None, r"config\.evaluation\.stride must be"),
-        ("rooms", {"references.chunk_overlap": 12}, None, "below the chunk size 12, got 12"),
+        ("rooms", {"settings.chunks.overlap": 12}, None, "below the chunk size 12, got 12"),
         ("rooms", {"rooms.number": 3}, None, "unknown option 'number'"),
         ("seven_scenes", {}, None, "give its folder with --data_root"),
         ("seven_scenes", {}, "no-data", "no-data"),
