@@ -39,5 +39,6 @@ def get_config() -> ConfigDict:
     protocol.max_points = 1_000_000
     protocol.icp_threshold = 0.1
     protocol.seed = 0
-    protocol.rooms = ConfigDict({"num_rooms": 24, "style": "compass", "num_frames": 96})
+    # Of data sets' readers, by name.
+    protocol.options = ConfigDict({"rooms": {"num_rooms": 24, "style": "compass", "num_frames": 96}})
     return config

@@ -13,7 +13,7 @@ def get_config() -> ConfigDict:
     config.dataset = "rooms"
     config.split = "test"
     # Rooms of the kind that configs/tiny.py trains on.
-    config.rooms = ConfigDict({"num_rooms": 24, "style": "compass", "num_frames": 96})
+    config.options = ConfigDict({"num_rooms": 24, "style": "compass", "num_frames": 96})
     config.baselines = True
     # Rows of the model: LoG-VGGT's windows, VGGT offline up to max_frames, and VGGT on overlapping chunks, as long as
     # the model was trained at.

@@ -11,7 +11,7 @@ from pathlib import Path
 import jax
 from PIL import Image
 
-from logvggt_jax.data.rooms.rooms import Rooms
+from logvggt_jax.data.registry import open_dataset
 from logvggt_jax.doctor.finding import Finding
 from logvggt_jax.doctor.subject import Subject, random_variables
 from logvggt_jax.reconstruction import open_source, reconstruct
@@ -23,7 +23,7 @@ def examine(subject: Subject) -> Iterator[Finding]:
     """A sequence of JPEGs, once to compile and once to be timed."""
     size = (60, 80) if subject.tiny else (480, 640)
     count = 6 if subject.tiny else 60 if subject.quick else 300
-    rooms = Rooms("test", num_rooms=1, num_frames=_RENDERED, height=size[0], width=size[1])
+    rooms = open_dataset("rooms", None, "test", num_rooms=1, num_frames=_RENDERED, height=size[0], width=size[1])
     pictures = rooms.read(rooms.sequences[0], range(_RENDERED)).images
     variables = jax.device_get(random_variables(subject.model))
     with tempfile.TemporaryDirectory() as temporary, warnings.catch_warnings():

@@ -47,7 +47,7 @@ class ClipRun(Run):
     dataset: str  # one of `logvggt_jax.data.DATASETS`
     split: str  # `train`, `val`, `test` or `all`
     evaluation: ClipSettings  # clips and metrics
-    rooms: Mapping[str, Any] | None = None  # options of procedural rooms, for `dataset` = `rooms` alone
+    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # further arguments of the set's reader
 
     @property
     def max_sequences(self) -> int | None:
