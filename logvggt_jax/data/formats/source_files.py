@@ -1,6 +1,7 @@
 """The folders and text files that a listing is made from, read with their state remembered."""
 
 import re
+import stat
 from pathlib import Path
 
 from logvggt_jax.data.errors import MissingFiles
@@ -58,4 +59,4 @@ def file_state(path: Path) -> list[int]:
         status = path.stat()
     except OSError:
         return [_ABSENT, _ABSENT]
-    return [status.st_mtime_ns, status.st_size if path.is_file() else 0]
+    return [status.st_mtime_ns, status.st_size if stat.S_ISREG(status.st_mode) else 0]
