@@ -78,7 +78,6 @@ class _Run:
         self.deadline = None if config.max_minutes is None else time.monotonic() + 60 * config.max_minutes
         model = LogVGGT(config.model)
         # Shapes alone: a run that goes on needs no initial weights.
-        # Deep stacks are trained as one loop over stacked layers: their step compiles once and updates few arrays.
         self.shapes = abstract_parameters(config.model)
         self.optimizer, self.step = make_program(model, config, self.shapes, mesh)
         self.programs: dict[tuple[int, ...], jax.stages.Compiled] = {}
