@@ -17,7 +17,7 @@ from logvggt_jax.config import (
     ModelConfig,
     RefinementConfig,
 )
-from logvggt_jax.model.logvggt import LogVGGT, abstract_variables
+from logvggt_jax.model.logvggt import LogVGGT, variable_shapes
 
 # Values that parameters are cut from: a generator for each of a thousand shapes would compile for minutes.
 _BLOCK = 1 << 22
@@ -69,4 +69,4 @@ def random_variables(model: LogVGGT, *, scale: float = 0.02) -> dict[str, Any]:
         offset = (start + size) % _BLOCK
         return values + np.float32(1.0) if path[-1].key == "scale" else values
 
-    return jax.tree_util.tree_map_with_path(cut, abstract_variables(model.config))
+    return jax.tree_util.tree_map_with_path(cut, variable_shapes(model.config))

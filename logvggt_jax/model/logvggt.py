@@ -18,7 +18,7 @@ from logvggt_jax.model.refinement import Refinement
 from logvggt_jax.model.windows import Windows, WindowState
 from logvggt_jax.types import Predictions, WindowOutput
 
-__all__ = ["LogVGGT", "Variables", "abstract_variables"]
+__all__ = ["LogVGGT", "Variables", "variable_shapes"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,7 +166,7 @@ class LogVGGT:
 
 
 @functools.lru_cache(maxsize=8)
-def abstract_variables(config: ModelConfig) -> Variables:
+def variable_shapes(config: ModelConfig) -> Variables:
     """{"params": …} of a model as `jax.ShapeDtypeStruct`s; traced once for each configuration, nothing is allocated."""
     # They do not depend on the form of attention, and tracing cuDNN's asks for a GPU.
     model, patch = LogVGGT(dataclasses.replace(config, attention="xla")), config.encoder.patch_size

@@ -7,7 +7,7 @@ import optax
 from jax.sharding import Mesh
 
 from logvggt_jax.config import ModelConfig
-from logvggt_jax.model.logvggt import LogVGGT, abstract_variables
+from logvggt_jax.model.logvggt import LogVGGT, variable_shapes
 from logvggt_jax.model.parameters import stack_layers
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.optimizer import learning_rate_schedule, make_optimizer
@@ -16,7 +16,7 @@ from logvggt_jax.training.step import make_loss_terms, make_train_step
 
 def abstract_parameters(config: ModelConfig) -> Any:
     """Shapes of what is trained: deep stacks are one loop over stacked layers, whose step compiles once for all."""
-    return jax.eval_shape(stack_layers, abstract_variables(config)["params"])
+    return jax.eval_shape(stack_layers, variable_shapes(config)["params"])
 
 
 def make_program(

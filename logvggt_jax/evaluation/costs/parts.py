@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from logvggt_jax.model.aggregator import WindowTokens
-from logvggt_jax.model.logvggt import LogVGGT, abstract_variables
+from logvggt_jax.model.logvggt import LogVGGT, variable_shapes
 from logvggt_jax.model.refinement import Span, num_triggers
 from logvggt_jax.model.windows import num_windows
 from logvggt_jax.operations import count_flops
@@ -55,7 +55,7 @@ def sequence_parts(model: LogVGGT, num_frames: int, image_size: tuple[int, int])
     config = model.config
     stride, overlap = config.windows.stride, config.windows.size - config.windows.stride
     windows = num_windows(num_frames, config.windows.size, stride)
-    variables = abstract_variables(model.config)
+    variables = variable_shapes(model.config)
 
     def images(count: int) -> jax.ShapeDtypeStruct:
         return jax.ShapeDtypeStruct((1, count, *image_size, 3), jnp.uint8)
@@ -91,7 +91,7 @@ def _refinement_parts(model: LogVGGT, num_frames: int) -> list[Part]:
     triggers = num_triggers(num_frames, size)
     # The last trigger has its full size, see `Refinement.fire_all`.
     count = triggers * size
-    variables = abstract_variables(model.config)
+    variables = variable_shapes(model.config)
     tokens = jax.ShapeDtypeStruct((1, count, width), jnp.float32)
     scalar, lengths = jax.ShapeDtypeStruct((), jnp.int32), jax.ShapeDtypeStruct((1,), jnp.int32)
     span = Span(scalar, scalar, lengths)  # type: ignore[arg-type]
@@ -112,7 +112,7 @@ def flops_by_part(model: LogVGGT, num_frames: int, image_size: tuple[int, int]) 
     Attention is counted in its XLA form, of whose products the other kernels do no fewer.
     """
     model = LogVGGT(dataclasses.replace(model.config, attention="xla"))
-    variables = abstract_variables(model.config)
+    variables = variable_shapes(model.config)
     counts = dict.fromkeys(PARTS, 0.0)
     for part in sequence_parts(model, num_frames, image_size):
         counts[part.name] += part.calls * count_flops(part.function, variables, *part.arguments)
@@ -147,23 +147,6 @@ def time_part(part: Part, variables: Any, *, rounds: int = 3, least_seconds: flo
         slowest=max(seconds),
         temporary_bytes=None if memory is None else int(memory.temp_size_in_bytes),
     )
-
-
-def matmul_flops_per_second(dtype: str, *, size: int | None = None, rounds: int = 5) -> float:
-    """The fastest of `rounds` large products of square matrices of `dtype`: a peak that programs can be held against.
-
-    `size` is their side; None takes 1536 on CPUs and 8192 elsewhere.
-    """
-    side = size or (1536 if jax.default_backend() == "cpu" else 8192)
-    factor = jnp.ones((side, side), dtype)
-    product = jax.jit(lambda x: x @ x)
-    jax.block_until_ready(product(factor))
-    seconds = []
-    for _ in range(rounds):
-        started = time.perf_counter()
-        jax.block_until_ready(product(factor))
-        seconds.append(time.perf_counter() - started)
-    return 2 * side**3 / min(seconds)
 
 
 def peak_device_bytes() -> int | None:

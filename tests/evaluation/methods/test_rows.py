@@ -46,7 +46,9 @@ def test_a_line_of_the_registry_is_a_row(small_config: ModelConfig, monkeypatch:
     class Settings:
         gap: int = 1
 
-    monkeypatch.setitem(METHODS, "mine", Method("My method", lambda *given: given[2], Settings, "vggt", "skips"))
+    monkeypatch.setitem(
+        METHODS, "mine", Method("My method", lambda *given: given[2], Settings, "vggt", "skips", lambda *_: None)
+    )
     checkpoint = Checkpoint(LogVGGT(small_config), {}, "")
     row = model_row("mine", checkpoint, Settings(gap=2))
     assert (row.name, row.knows) == ("My method", "its training; skips (gap=2)")
