@@ -47,3 +47,8 @@ def disk_errors(path: str | Path) -> Iterator[None]:
 def one_line(error: BaseException) -> str:
     """An error's message on one line."""
     return " ".join(str(error).split()) or type(error).__name__
+
+
+def install_line(extra: str) -> str:
+    """The command that brings an extra of this package, for messages."""
+    return f'pip install "logvggt-jax[{extra}]"'

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from logvggt_jax.data.errors import BrokenPicture, missing_file
-from logvggt_jax.errors import MissingPackage
+from logvggt_jax.errors import MissingPackage, install_line
 
 
 def read_exr(path: str | Path) -> np.ndarray:
@@ -17,7 +17,7 @@ def read_exr(path: str | Path) -> np.ndarray:
     try:
         import OpenEXR
     except ImportError as error:
-        raise MissingPackage(f'{path}: reading EXR needs OpenEXR: pip install "logvggt-jax[data]"') from error
+        raise MissingPackage(f"{path}: reading EXR needs OpenEXR: {install_line('data')}") from error
     if not Path(path).is_file():
         raise missing_file(path)
     try:
