@@ -4,7 +4,7 @@
 
     python eval.py --config=configs/eval/paper.py --checkpoint=vggt/model --data_root=data --output=runs/eval-paper
 
-Any field of the configuration can be changed on the command line: --config.rooms.num_rooms=8. The rows of the model
+Any field of the configuration can be changed on the command line: --config.options.num_rooms=8. The rows of the model
 are chosen by name, the first one is drawn: --config.methods="('windows', 'offline')".
 """
 

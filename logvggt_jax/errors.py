@@ -71,3 +71,8 @@ def _escaped(character: str) -> str:
     if "\udc80" <= character <= "\udcff":
         return f"\\x{ord(character) - 0xDC00:02x}"
     return character.encode("unicode_escape", "surrogatepass").decode()
+
+
+def install_line(extra: str) -> str:
+    """The command that brings an extra of this package, for messages."""
+    return f'pip install "logvggt-jax[{extra}]"'

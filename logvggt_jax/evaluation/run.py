@@ -1,14 +1,14 @@
 """A whole evaluation, from a configuration's values to the tables on disk."""
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from logvggt_jax.evaluation.costs.throughput import measured_timings
 from logvggt_jax.evaluation.datasets import open_run
-from logvggt_jax.evaluation.methods.method import Checkpoint
-from logvggt_jax.evaluation.methods.rows import model_rows
+from logvggt_jax.evaluation.methods.method import Checkpoint, model_row
 from logvggt_jax.evaluation.methods.variants import variant_methods
 from logvggt_jax.evaluation.records import RECORDS_FILE
 from logvggt_jax.evaluation.report.report import write_report
@@ -48,17 +48,16 @@ def run_evaluation(
     output = check_output(output, overwrite=True, marker=RECORDS_FILE)
     benchmarks, baselines = open_run(run, data_root)
     loaded = Checkpoint.load(checkpoint)
-    rows = model_rows(loaded, run.methods, run.references)
-
-    def timings() -> dict[str, Any]:
-        assert isinstance(run, PaperRun) and run.timings is not None
-        others = [row for row, name in zip(rows, run.methods, strict=True) if name != "windows"]
-        edge = run.protocol.longer_edge
-        return measured_timings(loaded, others, run.timings, output, longer_edge=edge, fresh=fresh)
-
+    rows = {method: model_row(method, loaded, run.settings_of(method)) for method in run.methods}
+    timings = None
+    if isinstance(run, PaperRun) and run.timings is not None and run.timings.lengths:
+        others = [row for method, row in rows.items() if method != "windows"]
+        timings = functools.partial(
+            measured_timings, loaded, others, run.timings, output, longer_edge=run.protocol.longer_edge, fresh=fresh
+        )
     results = evaluate(
         benchmarks,
-        [*rows, *variant_methods(loaded, run.variants), *baselines(loaded.model)],
+        [*rows.values(), *variant_methods(loaded, run.variants), *baselines(loaded.model)],
         output,
         title=run.title,
         command=command,
@@ -67,7 +66,7 @@ def run_evaluation(
         max_sequences=run.max_sequences,
         figures=run.figures,
         fresh=fresh,
-        timings=timings if isinstance(run, PaperRun) and run.timings and run.timings.lengths else None,
+        timings=timings,
     )
     write_report(results, output)
     return results

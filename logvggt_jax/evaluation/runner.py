@@ -75,6 +75,8 @@ def evaluate(
     the measures, and the method with its parameters. A later run takes over what it finds under its keys. Results of
     other runs in the folder stay until this one is complete, and then make place for it.
 
+    A clip that is to be drawn and whose pictures are not there is predicted and measured again for the first method.
+
     Clips that are too short or cannot be read, methods that cannot predict a clip (out of memory among other things),
     and metrics that a clip does not admit, are listed with their reason; means are over the others and carry their
     number beside the number planned. Any other exception is a fault of this package and is not caught.
@@ -121,8 +123,12 @@ def evaluate(
             progress.update(task, description=printable(f"{protocol.name}: {clip.sequence}"))
             draws = drawn.get(protocol.name, 0) < figures
             drawn[protocol.name] = drawn.get(protocol.name, 0) + draws
-            asked = [method for method in methods if (clip, method.name) in keys]
-            pending = [method for method in asked if keys[clip, method.name] not in records]
+            pending = [
+                method
+                for method in methods
+                if (clip, method.name) in keys
+                and not _is_done(records, keys[clip, method.name], output if draws and method is methods[0] else None)
+            ]
             if pending:
                 reason = _run_clip(clip, pending, methods[0], records, keys, output / FIGURES_FOLDER if draws else None)
                 if reason:
@@ -207,8 +213,10 @@ def _run_clip(
         return str(error)
     truth = prepare_truth(data, protocol.points if any(method.points for method in pending) else None)
     for method in pending:
-        pictures: list[str] = []
+        pictures: list[str] | None = None
         prediction, score = _predicted(method, truth, protocol)
+        if prediction is None and keys[clip, method.name] in records:
+            continue  # it was only to be drawn, and what was measured before stays
         if figures is not None and method is drawn and prediction is not None:
             records.claim()
             pictures = _draw(figures, clip, keys[clip, method.name], method, prediction, truth)
@@ -223,6 +231,17 @@ def _run_clip(
         }
         records.add(keys[clip, method.name], record)
     return ""
+
+
+def _is_done(records: ClipRecords, key: str, drawn_in: Path | None) -> bool:
+    """Whether a clip is measured and, where it is to be drawn in an output folder, its pictures are there.
+
+    A record's `figures` are null where nothing was drawn, and empty where there was nothing to draw.
+    """
+    if key not in records:
+        return False
+    figures = records[key]["figures"]
+    return drawn_in is None or (figures is not None and all((drawn_in / path).is_file() for path in figures))
 
 
 def _predicted(method: Method, truth: ClipTruth, protocol: Protocol) -> tuple[ClipPrediction | None, ClipScore]:
@@ -287,7 +306,7 @@ def _collected(
             for record in done:
                 where = {key: record[key] for key in ("benchmark", "sequence", "frames", "method")}
                 failures += [{**where, "metric": group, "reason": why} for group, why in record["failures"].items()]
-                figures += record["figures"]
+                figures += record["figures"] or []
     return {"benchmarks": described, "summary": summary, "failures": failures, "figures": figures}
 
 

@@ -18,6 +18,7 @@ from logvggt_jax.evaluation import environment, runner
 from logvggt_jax.evaluation.environment import code_version
 from logvggt_jax.evaluation.methods.baselines import static_camera
 from logvggt_jax.evaluation.runner import Benchmark
+from logvggt_jax.streaming import PredictionError
 
 
 def records(folder: Path) -> list[dict[str, Any]]:
@@ -209,3 +210,29 @@ def test_results_name_the_environments_that_measured_them(
         rows = [static_camera(), dataclasses.replace(static_camera(), name="another")]
         results = run(rooms, rows[:methods], tmp_path)
     assert [each["device"] for each in results["environments"]] == ["first", "second"]
+
+
+def test_pictures_that_are_missing_are_drawn_at_a_second_start(rooms: Rooms, tmp_path: Path) -> None:
+    """Of the clips that are drawn alone, by the first method alone; a failure then costs no number."""
+    first, calls = failing("no memory", at_call=9, error=PredictionError)
+    second, others = failing("", at_call=-1)
+    methods = [first, dataclasses.replace(second, name="second")]
+    run(rooms, methods, tmp_path)
+    assert (len(calls), len(others)) == (4, 4) and not list(tmp_path.rglob("*.png"))
+    drawing = dataclasses.replace(SETTINGS, figures=1)
+
+    def draw() -> dict[str, Any]:
+        return run(rooms, methods, tmp_path, drawing)
+
+    results = draw()
+    assert (len(calls), len(others)) == (6, 4), "one clip of each length"
+    pictures = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.png")}
+    assert pictures == set(results["figures"]) and len(pictures) == 2
+    draw()
+    assert len(calls) == 6
+    (tmp_path / min(pictures)).unlink()
+    assert draw()["figures"] == results["figures"] and len(calls) == 7 and (tmp_path / min(pictures)).exists()
+    # The ninth call fails, and what was measured before stays.
+    for name in pictures:
+        (tmp_path / name).unlink()
+    assert draw()["summary"] == results["summary"] and len(calls) == 9 and len(records(tmp_path)) == 8

@@ -41,8 +41,12 @@ def configuration(name: str, changes: dict[str, Any]) -> dict[str, Any]:
         ("rooms", {}, None, "no-model"),
         ("rooms", {}, "d", "leave --data_root=d out"),
         ("rooms", {"evaluation.stride": 0}, None, r"config\.evaluation\.stride must be"),
-        ("rooms", {"references.chunk_overlap": 12}, None, "below the chunk size 12, got 12"),
-        ("rooms", {"rooms.number": 3}, None, "unknown option 'number'"),
+        ("rooms", {"settings.chunks.overlap": 12}, None, "below the chunk size 12, got 12"),
+        ("rooms", {"options.number": 3}, None, "unknown option 'number'"),
+        ("rooms", {"options.height": 28}, None, "rooms: height follows from the rest of the run"),
+        ("paper", {"protocol.options.room": {}}, None, "unknown data set 'room'"),
+        ("paper", {"protocol.options.rooms.number": 3}, None, "rooms: unknown option 'number'"),
+        ("paper", {"protocol.options.rooms.num_frames": 0}, None, "rooms: num_frames must be at least 1"),
         ("seven_scenes", {}, None, "give its folder with --data_root"),
         ("seven_scenes", {}, "no-data", "no-data"),
         ("paper", {}, "no-data", "no-data: no such folder"),
@@ -64,7 +68,7 @@ def test_the_model_and_all_baselines_make_a_table(
     save_model(tmp_path / "model", small_config, small_variables["params"])
     clips = {"image_size": (28, 42), "clip_lengths": (4,), "max_points": 800, "figures": 1}
     changes = {f"evaluation.{name}": value for name, value in clips.items()}
-    changes |= {"rooms.num_rooms": 1, "methods": ("windows",)}
+    changes |= {"options.num_rooms": 1, "methods": ("windows",)}
     values, output = configuration("rooms", changes), tmp_path / "out"
     results = run_evaluation(values, tmp_path / "model", output, command="command")
     assert json.loads((output / "results.json").read_text()) == results
@@ -79,7 +83,7 @@ def test_the_model_and_all_baselines_make_a_table(
     markdown, shown = (output / "report.md").read_text(), f"{trained['scale/abs_rel']:.4f}"
     for text in (terminal.getvalue(), markdown):
         assert all(name in text for name in names)
-        assert "training rooms" in text and "†" in text and shown in text
+        assert "training split of procedural rooms" in text and "†" in text and shown in text
         assert re.search(r"To get these numbers again:\s+command\n", text)
     # The pictures of the first clip are drawn for the first row, and the page holds them.
     stems = {path.stem.rpartition("_")[2] for path in (output / "figures").iterdir()}

@@ -19,7 +19,7 @@ from logvggt_jax.data.dataset import check_frames
 from logvggt_jax.data.errors import MissingFiles
 from logvggt_jax.data.readers.folder_dataset import FolderDataset
 from logvggt_jax.data.registry import READERS, open_dataset
-from logvggt_jax.errors import InputError
+from logvggt_jax.errors import InputError, one_line
 
 INCONSISTENT = 0.1
 """Relative difference above which depth, intrinsics and poses are said not to belong together.
@@ -130,7 +130,7 @@ class _Problems:
             for path, reason in error.reasons.items():
                 self.add(error.kind, f"{path}: no such file, {reason}")
             return
-        message = " ".join(str(error).split())
+        message = one_line(error)
         if isinstance(error, InputError):
             self.add(getattr(error, "kind", "damaged file"), message)
         elif isinstance(error, OSError):

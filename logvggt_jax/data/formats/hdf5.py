@@ -7,7 +7,7 @@ import numpy as np
 
 from logvggt_jax.data.errors import BrokenPicture
 from logvggt_jax.data.formats.source_files import check_regular
-from logvggt_jax.errors import MissingPackage
+from logvggt_jax.errors import MissingPackage, install_line
 
 
 def read_hdf5(
@@ -22,7 +22,7 @@ def read_hdf5(
     try:
         import h5py
     except ImportError as error:
-        raise MissingPackage(f'{path}: reading HDF5 needs h5py: pip install "logvggt-jax[data]"') from error
+        raise MissingPackage(f"{path}: reading HDF5 needs h5py: {install_line('data')}") from error
     if content is None:
         check_regular(path)
     try:

@@ -72,7 +72,7 @@ def file_state(path: Path) -> list[int]:
     """
     try:
         status = path.stat()
-        return [status.st_mtime_ns, status.st_size if path.is_file() else 0]
+        return [status.st_mtime_ns, status.st_size if stat.S_ISREG(status.st_mode) else 0]
     except OSError:
         return [_ABSENT, _ABSENT]
     except ValueError as error:  # a zero byte, or half of a pair of UTF-16 codes
