@@ -1,0 +1,169 @@
+"""Decoding of videos and cameras by OpenCV."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import re
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from logvggt_jax.errors import InputError
+from logvggt_jax.reconstruction.sources.decoding import Damage, Picture, VideoHeader
+
+# OpenCV tells neither why a frame failed nor whether the file has ended: after so many failures in a row it has.
+_MOST_FAILURES = 64
+_PYAV = "pip install 'logvggt-jax[video]'"
+
+
+class OpenCVDecoder:
+    """See `VideoDecoder`.
+
+    Args:
+      source: a file's absolute path, the address of a stream, or the number of a camera.
+      name: what messages call it.
+      timeout: seconds to wait for a network stream; None for files.
+    """
+
+    def __init__(self, source: str | int, name: str, timeout: float | None = None) -> None:
+        self._source, self._name, self._timeout = source, name, timeout
+
+    def header(self) -> VideoHeader:
+        """See `VideoDecoder.header`."""
+        with _captured_stderr() as messages:
+            capture = self._open()
+            read = any(capture.grab() for _ in range(_MOST_FAILURES))
+            image = capture.retrieve()[1] if read else None
+            said = messages()
+        codec = _fourcc(capture)
+        if "interlaced to progressive" in said:
+            raise InputError(
+                f"{self._name} is interlaced, which OpenCV cannot convert: {_PYAV}, or deinterlace it with "
+                "ffmpeg -i INPUT -vf bwdif=send_frame OUTPUT.mp4"
+            )
+        if image is None:
+            raise InputError(
+                f"{self._name} holds no frame that OpenCV can decode (codec {codec}): {_PYAV}, or re-encode it, for "
+                "example to H.264 mp4"
+            )
+        rate = capture.get(cv2.CAP_PROP_FPS)
+        count = capture.get(cv2.CAP_PROP_FRAME_COUNT)
+        frames = int(count) if math.isfinite(count) and count > 0 else None
+        capture.release()
+        return VideoHeader(
+            size=image.shape[:2],
+            rate=rate if math.isfinite(rate) and rate > 0 else None,
+            frames=frames,
+            announced=frames if self._states_frames() else None,
+            seconds=None,
+            notes=(
+                f"{self._name} is decoded by OpenCV, which notices neither a change of size within a video, nor later "
+                f"interlaced parts, mirrored recordings, HDR or pixels that are not square: {_PYAV}",
+            ),
+        )
+
+    def pictures(self) -> Iterator[Picture | Damage]:
+        """See `VideoDecoder.pictures`."""
+        capture = self._open()
+        rate = capture.get(cv2.CAP_PROP_FPS)
+        step = 1.0 / rate if math.isfinite(rate) and rate > 0 else math.inf
+        # Frames that failed are known by the gaps that they leave.
+        failed = in_a_row = 0
+        last: float | None = None
+        size: tuple[int, int] | None = None
+        try:
+            while in_a_row < _MOST_FAILURES:
+                decoded, image = capture.retrieve() if capture.grab() else (False, None)
+                if not decoded or image is None or not image.size:
+                    in_a_row += 1
+                    continue
+                failed, in_a_row = failed + in_a_row, 0
+                seconds = self._stamp(capture, last)
+                while failed and last is not None and seconds is not None and seconds - last > 1.5 * step:
+                    failed, last = failed - 1, last + step
+                    yield Damage(last, "cannot be decoded")
+                if size is None:
+                    size = image.shape[:2]
+                last = seconds
+                yield Picture(seconds, image.shape[:2], partial(_to_rgb, image))
+            yield from [Damage(None, "cannot be decoded")] * failed
+        finally:
+            capture.release()
+
+    def _states_frames(self) -> bool:
+        """Whether the count is the file's own (mp4, mov, avi); OpenCV multiplies duration and rate elsewhere."""
+        if isinstance(self._source, int) or self._timeout is not None:
+            return False
+        with Path(self._source).open("rb") as file:
+            head = file.read(8)
+        return head[4:] == b"ftyp" or head[:4] == b"RIFF"
+
+    def _stamp(self, capture: cv2.VideoCapture, last: float | None) -> float | None:
+        if isinstance(self._source, int):
+            return time.monotonic()
+        seconds = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+        # Without time stamps OpenCV says 0 every time.
+        return None if last is not None and seconds == 0 else seconds
+
+    def _open(self) -> cv2.VideoCapture:
+        parameters = []
+        if self._timeout is not None:
+            milliseconds = round(1000 * self._timeout)
+            parameters = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, milliseconds, cv2.CAP_PROP_READ_TIMEOUT_MSEC, milliseconds]
+        try:
+            capture = cv2.VideoCapture(self._source, cv2.CAP_ANY, parameters)
+        except (UnicodeError, cv2.error) as error:
+            raise InputError(f"{self._name} cannot be opened by OpenCV: rename it, or {_PYAV}") from error
+        if capture.isOpened():
+            return capture
+        if isinstance(self._source, int):
+            raise InputError(f"{self._name} cannot be opened: is it connected, free, and allowed to be used?")
+        if self._timeout is not None:
+            raise InputError(
+                f"{self._name} cannot be reached within {self._timeout:g} s: check address, network and password"
+            )
+        raise InputError(
+            f"{self._name} cannot be opened as a video: expected a file that OpenCV decodes (mp4, avi, mkv, webm, …) "
+            f"or a folder of images; {_PYAV} for more formats, or re-encode it, for example to H.264 mp4"
+        )
+
+
+def _to_rgb(image: np.ndarray) -> np.ndarray:
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def _fourcc(capture: cv2.VideoCapture) -> str:
+    code = int(capture.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF
+    return re.sub(r"[^\w.-]", "", code.to_bytes(4, "little").decode("latin-1")) or "unknown"
+
+
+@contextlib.contextmanager
+def _captured_stderr() -> Iterator[Callable[[], str]]:
+    """What libraries print to standard error in the block: OpenCV hands out errors in no other way.
+
+    Gives a function that returns what has been printed so far; nothing of it reaches the terminal.
+    """
+    sys.stderr.flush()
+    kept = os.dup(2)
+    try:
+        with tempfile.TemporaryFile() as file:
+            os.dup2(file.fileno(), 2)
+            try:
+
+                def printed() -> str:
+                    file.seek(0)
+                    return file.read().decode(errors="replace")
+
+                yield printed
+            finally:
+                os.dup2(kept, 2)
+    finally:
+        os.close(kept)
