@@ -27,12 +27,15 @@ def open_source(path: str | Path, **options: Any) -> Source:
     chosen = SourceOptions(**options)
     if is_live(path):
         return VideoSource(path, chosen)
-    path = Path(path).expanduser()
     try:
+        path = Path(path).expanduser()
         with disk_errors(path):
             path.stat()
     except MissingInput:
         raise MissingInput(f"{path} does not exist: expected a folder of images or a video file") from None
+    except (RuntimeError, ValueError) as error:
+        # No such user, or a null character.
+        raise error if isinstance(error, InputError) else InputError(f"{path!r} is no path: {error}") from error
     if path.is_dir():
         return FolderSource(path, chosen)
     if path.suffix.lower() in IMAGE_SUFFIXES:

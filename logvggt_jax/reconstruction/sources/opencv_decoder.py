@@ -21,6 +21,8 @@ from logvggt_jax.reconstruction.sources.decoding import Damage, Picture, VideoHe
 
 # OpenCV tells neither why a frame failed nor whether the file has ended: after so many failures in a row it has.
 _MOST_FAILURES = 64
+# The codec by which FFmpeg draws text as a terminal would.
+_TEXT = "ansi"
 _PYAV = "pip install 'logvggt-jax[video]'"
 
 
@@ -42,6 +44,9 @@ class OpenCVDecoder:
             capture = self._open()
             read = any(capture.grab() for _ in range(_MOST_FAILURES))
             image = capture.retrieve()[1] if read else None
+            count = capture.get(cv2.CAP_PROP_FRAME_COUNT)
+            frames = int(count) if math.isfinite(count) and count > 0 else None
+            single = frames is None and not capture.grab()
             said = messages()
         codec = _fourcc(capture)
         if "interlaced to progressive" in said:
@@ -54,9 +59,10 @@ class OpenCVDecoder:
                 f"{self._name} holds no frame that OpenCV can decode (codec {codec}): {_PYAV}, or re-encode it, for "
                 "example to H.264 mp4"
             )
+        if single or codec == _TEXT:
+            kind = "text" if codec == _TEXT else "a single image"
+            raise InputError(f"{self._name} is {kind}, not a video: give a video or the folder that holds the images")
         rate = capture.get(cv2.CAP_PROP_FPS)
-        count = capture.get(cv2.CAP_PROP_FRAME_COUNT)
-        frames = int(count) if math.isfinite(count) and count > 0 else None
         capture.release()
         return VideoHeader(
             size=image.shape[:2],
@@ -118,17 +124,18 @@ class OpenCVDecoder:
         if self._timeout is not None:
             milliseconds = round(1000 * self._timeout)
             parameters = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, milliseconds, cv2.CAP_PROP_READ_TIMEOUT_MSEC, milliseconds]
-        try:
+        if re.search("[\ud800-\udfff]", str(self._source)):
+            # A name that is no Unicode ends the process.
+            raise InputError(f"{self._name!r}: OpenCV cannot open a file of this name: rename it, or {_PYAV}")
+        with _quiet():
             capture = cv2.VideoCapture(self._source, cv2.CAP_ANY, parameters)
-        except (UnicodeError, cv2.error) as error:
-            raise InputError(f"{self._name} cannot be opened by OpenCV: rename it, or {_PYAV}") from error
         if capture.isOpened():
             return capture
         if isinstance(self._source, int):
             raise InputError(f"{self._name} cannot be opened: is it connected, free, and allowed to be used?")
         if self._timeout is not None:
             raise InputError(
-                f"{self._name} cannot be reached within {self._timeout:g} s: check address, network and password"
+                f"{self._name} cannot be opened (waited up to {self._timeout:g} s): check address, network and password"
             )
         raise InputError(
             f"{self._name} cannot be opened as a video: expected a file that OpenCV decodes (mp4, avi, mkv, webm, …) "
@@ -143,6 +150,17 @@ def _to_rgb(image: np.ndarray) -> np.ndarray:
 def _fourcc(capture: cv2.VideoCapture) -> str:
     code = int(capture.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF
     return re.sub(r"[^\w.-]", "", code.to_bytes(4, "little").decode("latin-1")) or "unknown"
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Without OpenCV's warnings: an error says the same."""
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
+    try:
+        yield
+    finally:
+        cv2.utils.logging.setLogLevel(level)
 
 
 @contextlib.contextmanager

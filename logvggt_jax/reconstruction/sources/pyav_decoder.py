@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import heapq
 import itertools
+import re
 from collections import deque
 from collections.abc import Iterator
 from fractions import Fraction
@@ -12,6 +13,7 @@ from functools import partial
 import av
 import av.error
 import av.filter
+import av.logging
 import numpy as np
 
 from logvggt_jax.errors import InputError
@@ -19,6 +21,8 @@ from logvggt_jax.reconstruction.sources.decoding import Damage, Picture, VideoHe
 
 # Text and single images, which FFmpeg would show as videos of one frame.
 _NO_VIDEOS = ("image2", "tty", "bin", "xbin", "adf", "idf")
+# Formats that state their duration; FFmpeg guesses that of others.
+_STATE_DURATION = ("mov", "matroska", "avi", "flv", "asf")
 _TOP_FIELD_FIRST, _BOTTOM_FIELD_FIRST = (2, 5), (3, 4)
 _HDR_TRANSFERS = {16: "PQ", 18: "HLG"}
 # Errors in a row after which a file that cannot be read on counts as ended.
@@ -58,7 +62,7 @@ class PyAVDecoder:
                 rate=float(rate) if rate else None,
                 frames=stream.frames or (round(seconds * rate) if seconds and rate else None),
                 announced=stream.frames or None,
-                seconds=seconds,
+                seconds=seconds if container.format.name.startswith(_STATE_DURATION) else None,
                 notes=tuple(_notes(self._name, frame, stream, interlaced=interlaced)),
             )
 
@@ -82,9 +86,10 @@ class PyAVDecoder:
             return av.open(self._url, options=options, metadata_errors="replace", timeout=self._timeout)
         except av.FFmpegError as error:
             if self._timeout is not None:
+                late = isinstance(error, av.error.ExitError | av.error.TimeoutError)
+                reason = f"no answer within {self._timeout:g} s" if late else error.strerror
                 raise InputError(
-                    f"{self._name} cannot be reached within {self._timeout:g} s ({error.strerror}): check address, "
-                    "network and password"
+                    f"{self._name} cannot be opened ({reason}): check address, network and password"
                 ) from error
             raise InputError(
                 f"{self._name} cannot be opened as a video ({error.strerror}): expected mp4, mov, avi, mkv, webm, ts "
@@ -109,8 +114,8 @@ class PyAVDecoder:
         stream = best if best in streams else streams[0]
         if stream.codec_context is None:
             raise InputError(
-                f"{self._name}: its codec {_codec_tag(stream)} cannot be decoded by the FFmpeg that PyAV brings; "
-                "re-encode it, for example to H.264 mp4"
+                f"{self._name}: its codec {_codec(container, stream.index)} cannot be decoded by the FFmpeg that PyAV "
+                "brings; re-encode it, for example to H.264 mp4"
             )
         # Threads within a frame lose nothing when a packet is damaged. With threads over frames, which large pictures
         # need, the library drops what follows a damaged packet among the last few of the file.
@@ -317,14 +322,20 @@ def _duration(container: av.container.InputContainer, stream: av.video.stream.Vi
     return total - start if "matroska" in container.format.name else total
 
 
-def _codec_tag(stream: av.video.stream.VideoStream) -> str:
-    tag = getattr(stream, "codec_tag", None)
-    return repr(tag) if tag else "(unknown)"
+def _codec(container: av.container.InputContainer, index: int) -> str:
+    """The codec of a stream for which there is no decoder, as FFmpeg names it."""
+    level = av.logging.get_level()
+    # The library tells it in its log only.
+    av.logging.set_level(av.logging.INFO)
+    try:
+        log = container.dumps_format()
+    finally:
+        av.logging.set_level(level)
+    found = re.search(rf"Stream #0:{index}\b[^\n]*Video: ([^,\n]+)", log)
+    return found[1] if found else "(unknown)"
 
 
-def _notes(
-    name: str, frame: av.VideoFrame, stream: av.video.stream.VideoStream, *, interlaced: bool
-) -> Iterator[str]:
+def _notes(name: str, frame: av.VideoFrame, stream: av.video.stream.VideoStream, *, interlaced: bool) -> Iterator[str]:
     if interlaced:
         yield f"{name} is interlaced: its frames are deinterlaced (bwdif), and finest lines lose some detail"
     if transfer := _HDR_TRANSFERS.get(frame.color_trc):

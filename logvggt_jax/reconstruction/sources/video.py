@@ -106,9 +106,8 @@ class VideoSource(Source):
         header = self._header
         clock, selection = FrameClock(header.rate if header else None), FrameSelection(self.options)
         size = header.size if header else None
-        taken = guessed = position = 0
-        seconds = 0.0
-        for picture in self._decoder.pictures():
+        taken, guessed, position, seconds = 0, 0, -1, 0.0
+        for position, picture in enumerate(self._decoder.pictures()):
             name, seconds = f"frame-{position:06d}", clock.time(picture.seconds)
             if selection.is_over(seconds):
                 break
@@ -128,11 +127,10 @@ class VideoSource(Source):
                         yield partial(self._frame, name, seconds, picture)
                     if taken == self.options.max_frames:
                         break
-            position += 1
         else:
-            self._check_end(position, seconds)
+            self._check_end(position + 1, seconds)
         if guessed:
-            self._add_note(f"{self._name}: {guessed} frames are damaged and were completed by guesses of the decoder")
+            self._add_note(f"{self._name}: frames with damaged parts, which the decoder filled by guesses: {guessed}")
         if not taken:
             raise InputError(
                 f"{self._name} gave no frame between {self.options.start or 0:g} s and "
@@ -216,29 +214,34 @@ def _check_file(path: Path) -> None:
         if status.st_size == 0:
             raise InputError(f"{path} is empty (0 bytes): copy or record the video anew")
         with path.open("rb") as file:
+            if file.read(30)[8:].startswith(b"WEBPVP8X") and file.read(4) == b"ANIM":
+                raise InputError(f"{path} is an animated WebP, which cannot be decoded: convert it to mp4 or GIF")
             _check_index(path, file, status.st_size)
 
 
 def _check_index(path: Path, file: BinaryIO, size: int) -> None:
     """Refuses an mp4 or mov file that lacks the box `moov`, without which none of it can be decoded."""
-    offset, first = 0, True
+    file.seek(0)
+    head = file.read(12)
+    if head[4:8] != b"ftyp" or head[8:] in _PICTURES:
+        return
+    offset = 0
     while offset + 8 <= size:
         file.seek(offset)
         head = file.read(16)
-        length, kind = int.from_bytes(head[:4], "big"), head[4:8]
-        if first and (kind != b"ftyp" or head[8:12] in _PICTURES):
-            return
-        first = False
-        if kind == b"moov":
-            return
+        length = int.from_bytes(head[:4], "big")
         if length == 1:
-            length = int.from_bytes(head[8:16], "big")
+            length = int.from_bytes(head[8:], "big")
+        if length == 0:
+            length = size - offset
         if length < 8:
             break
         offset += length
+        if head[4:8] == b"moov" and offset <= size:
+            return
     raise InputError(
-        f"{path} lacks its index (moov): the recording or the copy was broken off; copy it anew, or restore it with "
-        "untrunc and a whole video of the same camera"
+        f"{path} lacks its index (moov), or part of it: the recording or the copy was broken off; copy it anew, or "
+        "restore it with untrunc and a whole video of the same camera"
     )
 
 
