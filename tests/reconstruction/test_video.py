@@ -272,7 +272,7 @@ def test_no_frame_where_the_options_ask_for_it(tmp_path: Path, library: str) -> 
 @pytest.mark.parametrize("mirrored", [False, True])
 def test_pictures_are_upright(tmp_path: Path, library: str, degrees: int, mirrored: bool) -> None:
     if mirrored and library == "opencv":
-        assert "mirrored" in open_source(write(tmp_path / "a.mp4", [quarters()] * 2)).notes[0]
+        assert "mirroring" in open_source(write(tmp_path / "a.mp4", [quarters()] * 2)).notes[0]
         return
     path = write(tmp_path / "turned.mp4", [quarters()] * 2, turned=(degrees, mirrored))
     expected = np.rot90(quarters(), degrees // 90)
@@ -282,6 +282,21 @@ def test_pictures_are_upright(tmp_path: Path, library: str, degrees: int, mirror
     image = next(iter(source)).image
     assert source.image_size == image.shape[:2] == expected.shape[:2]
     np.testing.assert_allclose(corners(image), corners(expected), atol=12)
+
+
+@pytest.mark.parametrize("degrees", [90, 180, 270])
+def test_pictures_are_upright_by_a_tag(tmp_path: Path, degrees: int) -> None:
+    path = write(tmp_path / "plain.mkv", [quarters()] * 2)
+    tagged = tmp_path / "tagged.mkv"
+    with av.open(str(path)) as container, av.open(str(tagged), "w") as output:
+        stream = output.add_stream_from_template(container.streams.video[0])
+        stream.metadata["rotate"] = str(degrees)
+        for packet in container.demux(video=0):
+            if packet.size:
+                packet.stream = stream
+                output.mux(packet)
+    image = next(iter(open_source(tagged))).image
+    np.testing.assert_allclose(corners(image), corners(np.rot90(quarters(), -degrees // 90)), atol=12)
 
 
 def interlaced(count: int) -> list[np.ndarray]:
@@ -302,20 +317,21 @@ def combing(image: np.ndarray) -> float:
     return float(np.abs(lines[1:-1] - (lines[:-2] + lines[2:]) / 2).mean() - np.abs(lines[:-2] - lines[2:]).mean() / 2)
 
 
-INTERLACED = {
+INTERLACED: dict[str, dict[str, Any]] = {
     "h264.mp4": {"codec": "libx264", "options": {"flags": "+ildct+ilme", "x264-params": "tff=1"}},
     "mpeg2.ts": {"codec": "mpeg2video", "options": {"flags": "+ildct+ilme", "b": "2000k"}},
     "prores.mov": {"codec": "prores_ks", "pixels": "yuv422p10le", "options": {"flags": "+ildct"}},
+    "raw.mov": {"codec": "rawvideo", "pixels": "uyvy422"},
+    # Only their headers tell.
+    "mjpeg.mkv": {"codec": "mjpeg", "pixels": "yuvj422p"},
+    "png.mov": {"codec": "png", "pixels": "rgb24"},
 }
 
 
 @pytest.mark.parametrize("name", INTERLACED)
 def test_interlaced_pictures_are_made_whole(tmp_path: Path, name: str) -> None:
     images = interlaced(6)
-    settings = dict(INTERLACED[name])
-    path = write(tmp_path / name, images, context={"field_order": 2}, **settings)
-    with av.open(str(path)) as container:
-        assert next(container.decode(video=0)).interlaced_frame
+    path = write(tmp_path / name, images, context={"field_order": 2}, **INTERLACED[name])
     source = open_source(path)
     assert any("deinterlaced" in note for note in source.notes)
     frames = list(source)
@@ -476,7 +492,7 @@ def test_a_video_cut_short_says_so(tmp_path: Path, library: str) -> None:
     with av.open(str(path)) as container, av.open(str(moved), "w", options={"movflags": "faststart"}) as output:
         stream = output.add_stream_from_template(container.streams.video[0])
         for packet in container.demux(video=0):
-            if packet.dts is not None:
+            if packet.size:
                 packet.stream = stream
                 output.mux(packet)
     position = packets(moved)[12][0]
@@ -487,6 +503,21 @@ def test_a_video_cut_short_says_so(tmp_path: Path, library: str) -> None:
     assert 10 <= len(frames) <= 13
     # Who asks for the first frames only misses none.
     assert len(list(open_source(moved, max_frames=5))) == 5
+
+
+def test_an_edited_video_is_whole(tmp_path: Path) -> None:
+    path = write(tmp_path / "edited.mp4", [grey(i) for i in range(24)], options={"g": "8", "bf": "0"})
+    content = bytearray(path.read_bytes())
+    # Its edit list shows the second half: duration and first time stamp, here in 1 / 1000 and 1 / 10240 s.
+    place = content.index(b"elst") + 12
+    with av.open(str(path)) as container:
+        second = round(1 / container.streams.video[0].time_base)
+    content[place : place + 8] = (1200).to_bytes(4, "big") + second.to_bytes(4, "big")
+    path.write_bytes(content)
+    source = open_source(path)
+    frames = list(source)
+    assert source.expected_frames == len(frames) == 12
+    assert abs(frames[0].image.mean() - 40 - 8 * 10) < 10
 
 
 def test_a_matroska_video_cut_short_says_so(tmp_path: Path) -> None:

@@ -71,8 +71,8 @@ class OpenCVDecoder:
             announced=frames if self._states_frames() else None,
             seconds=None,
             notes=(
-                f"{self._name} is decoded by OpenCV, which notices neither a change of size within a video, nor later "
-                f"interlaced parts, mirrored recordings, HDR or pixels that are not square: {_PYAV}",
+                f"{self._name} is decoded by OpenCV, which does not notice a change of size within it, interlaced "
+                f"parts after its beginning, mirroring, HDR, or pixels that are not square: {_PYAV}",
             ),
         )
 

@@ -58,9 +58,9 @@ class PyAVDecoder:
             interlaced = _is_interlaced(frame, stream)
             rate, seconds = stream.average_rate or stream.guessed_rate, _duration(container, stream)
             return VideoHeader(
-                size=_shown_size(frame),
+                size=_shown_size(frame, _display_matrix(frame, stream)),
                 rate=float(rate) if rate else None,
-                frames=stream.frames or (round(seconds * rate) if seconds and rate else None),
+                frames=_likely_frames(stream.frames, seconds, rate),
                 announced=stream.frames or None,
                 seconds=seconds if container.format.name.startswith(_STATE_DURATION) else None,
                 notes=tuple(_notes(self._name, frame, stream, interlaced=interlaced)),
@@ -70,15 +70,46 @@ class PyAVDecoder:
         """See `VideoDecoder.pictures`."""
         with self._open() as container:
             stream = self._stream(container)
-            deinterlacer = Deinterlacer(stream)
+            deinterlacer = Deinterlacer(stream, self._name)
             for damage, frame in self._decode(container, stream):
                 if frame is not None:
-                    yield from map(_picture, deinterlacer.push(frame))
-                elif damage is not None:
+                    ready = deinterlacer.push(frame)
+                else:
                     # What was pushed before is shown before.
-                    yield from map(_picture, deinterlacer.drain())
+                    ready = deinterlacer.drain()
+                for decoded, whole in ready:
+                    yield self._picture(decoded, whole, stream)
+                if damage is not None:
                     yield damage
-            yield from map(_picture, deinterlacer.drain())
+            for decoded, whole in deinterlacer.drain():
+                yield self._picture(decoded, whole, stream)
+
+    def _picture(self, decoded: av.VideoFrame, whole: av.VideoFrame, stream: av.video.stream.VideoStream) -> Picture:
+        matrix = _display_matrix(decoded, stream)
+        # Filters pass on neither.
+        whole.colorspace, whole.color_range = decoded.colorspace, decoded.color_range
+        return Picture(
+            seconds=None if decoded.pts is None else float(decoded.pts * stream.time_base),
+            size=_shown_size(decoded, matrix),
+            convert=partial(self._convert, whole, matrix),
+            damaged=decoded.is_corrupt,
+        )
+
+    def _convert(self, frame: av.VideoFrame, matrix: np.ndarray | None) -> np.ndarray:
+        try:
+            rgb = frame.reformat(
+                format="rgb24",
+                src_color_range=frame.color_range,
+                dst_color_range="JPEG",
+                interpolation="BICUBIC",
+                threads=1,
+            ).to_ndarray()
+        except av.FFmpegError as error:
+            raise InputError(
+                f"{self._name}: pictures in the pixel format {frame.format.name} cannot be converted "
+                f"({error.strerror}); re-encode it, for example to H.264 mp4"
+            ) from error
+        return rgb if matrix is None else _turn(rgb, matrix)
 
     def _open(self) -> av.container.InputContainer:
         options = {"rtsp_transport": "tcp"} if self._url.startswith("rtsp") else {}
@@ -190,10 +221,14 @@ class Deinterlacer:
     """Makes whole pictures of those that show two moments in alternate lines; others pass unchanged.
 
     Frames come out in order, as many as go in, one later than they went in once an interlaced one has been met.
+
+    Args:
+      stream: the stream, whose header may say that it is interlaced.
+      name: what messages call it.
     """
 
-    def __init__(self, stream: av.video.stream.VideoStream) -> None:
-        self._stream = stream
+    def __init__(self, stream: av.video.stream.VideoStream, name: str) -> None:
+        self._stream, self._name = stream, name
         self._graph: av.filter.Graph | None = None
         self._made_for: tuple[object, ...] = ()
         self._inside: deque[av.VideoFrame] = deque()
@@ -206,7 +241,13 @@ class Deinterlacer:
         made_for = (frame.width, frame.height, frame.format.name, frame.colorspace, frame.color_range)
         if self._graph is None or made_for != self._made_for:
             yield from self.drain()
-            self._graph, self._made_for = self._build(frame), made_for
+            try:
+                self._graph, self._made_for = self._build(frame), made_for
+            except av.FFmpegError as error:
+                raise InputError(
+                    f"{self._name} is interlaced, and its pixel format {frame.format.name} cannot be deinterlaced "
+                    f"({error.strerror}): do it beforehand with ffmpeg -i INPUT -vf bwdif=send_frame OUTPUT.mp4"
+                ) from error
         self._inside.append(frame)
         self._graph.push(frame)
         yield from self._ready()
@@ -258,33 +299,21 @@ def _missing(waiting: list[int], failures: deque[str], shown: int, time_base: Fr
             yield Damage(float(stamp * time_base), failures.popleft())
 
 
-def _picture(frames: tuple[av.VideoFrame, av.VideoFrame]) -> Picture:
-    decoded, shown = frames
-    return Picture(
-        seconds=None if decoded.pts is None else float(decoded.pts * decoded.time_base),
-        size=_shown_size(decoded),
-        convert=partial(_convert, shown, _display_matrix(decoded), decoded.colorspace, decoded.color_range),
-        damaged=decoded.is_corrupt,
-    )
+def _likely_frames(stated: int, seconds: float | None, rate: Fraction | None) -> int | None:
+    """Number of frames that are shown; an edited file states those as well that it does not show."""
+    by_time = max(1, round(seconds * rate)) if seconds and rate else None
+    return min(stated, by_time) if stated and by_time else stated or by_time
 
 
-def _convert(frame: av.VideoFrame, matrix: np.ndarray | None, colorspace: int, color_range: int) -> np.ndarray:
-    frame.colorspace, frame.color_range = colorspace, color_range
-    rgb = frame.reformat(
-        format="rgb24",
-        src_color_range=color_range,
-        dst_color_range="JPEG",
-        interpolation="BICUBIC",
-        threads=1,
-    ).to_ndarray()
-    return rgb if matrix is None else _turn(rgb, matrix)
-
-
-def _display_matrix(frame: av.VideoFrame) -> np.ndarray | None:
+def _display_matrix(frame: av.VideoFrame, stream: av.video.stream.VideoStream) -> np.ndarray | None:
     """[2, 2] matrix D with (x, y) D the place, but for a shift, where the pixel (x, y) is shown; None for none."""
     for data in frame.side_data:
         if data.type.name == "DISPLAYMATRIX":
             return np.frombuffer(bytes(data), np.int32)[:9].reshape(3, 3)[:2, :2].astype(np.float64)
+    tags = {name.lower(): value for name, value in stream.metadata.items()}
+    if tags.get("rotate", "").lstrip("-").isdecimal():
+        # Clockwise, as older programs wrote it into any file.
+        return np.linalg.matrix_power(np.array([[0, 1], [-1, 0]]), round(int(tags["rotate"]) / 90) % 4)
     return None
 
 
@@ -301,8 +330,7 @@ def _turn(image: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(image[:: -1 if down < 0 else 1, :: -1 if across < 0 else 1])
 
 
-def _shown_size(frame: av.VideoFrame) -> tuple[int, int]:
-    matrix = _display_matrix(frame)
+def _shown_size(frame: av.VideoFrame, matrix: np.ndarray | None) -> tuple[int, int]:
     turned = matrix is not None and _is_transposed(matrix)
     return (frame.width, frame.height) if turned else (frame.height, frame.width)
 
