@@ -18,7 +18,14 @@ import numpy as np
 import pytest
 
 from logvggt_jax.errors import InputError
-from logvggt_jax.reconstruction.sources import SourceFrame, SourceOptions, VideoSource, open_source, video
+from logvggt_jax.reconstruction.sources import (
+    SourceFrame,
+    SourceOptions,
+    VideoSource,
+    open_source,
+    pyav_decoder,
+    video,
+)
 from logvggt_jax.reconstruction.sources.sampling import FrameClock, expected_frames
 
 HEIGHT, WIDTH = 48, 64
@@ -345,20 +352,36 @@ def test_interlaced_pictures_are_made_whole(tmp_path: Path, name: str) -> None:
     np.testing.assert_array_equal(tail[0].image, frames[4].image)
 
 
+def test_frames_that_stay_the_same_are_taken_by_opencv(tmp_path: Path, opencv_only: None) -> None:
+    path = write(tmp_path / "still.avi", [grey(0)] * 5, codec="huffyuv", pixels="yuv422p")
+    assert len(list(open_source(path))) == 5
+
+
+def test_a_damaged_duration_is_no_duration(tmp_path: Path) -> None:
+    path = write(tmp_path / "clip.mkv", [grey(i) for i in range(5)])
+    path.write_bytes(path.read_bytes().replace(b"00:00:00.5", b"00:0?:0x.5"))
+    assert len(list(open_source(path))) == 5
+
+
 def test_opencv_refuses_interlaced_pictures(tmp_path: Path, opencv_only: None) -> None:
     path = write(tmp_path / "tv.mp4", interlaced(4), context={"field_order": 2}, **INTERLACED["h264.mp4"])
     with pytest.raises(InputError, match=r"tv\.mp4 is interlaced.*logvggt-jax\[video\].*ffmpeg -i"):
         open_source(path)
 
 
-def test_an_interlaced_part_after_progressive_frames(tmp_path: Path) -> None:
+def test_an_interlaced_part_after_progressive_frames(tmp_path: Path, library: str) -> None:
     one = write(tmp_path / "one.ts", [grey(i) for i in range(4)], options={"g": "4"})
     two = write(
         tmp_path / "two.ts", interlaced(4), context={"field_order": 2}, **INTERLACED["h264.mp4"], stamps=range(4, 8)
     )
     path = tmp_path / "both.ts"
     path.write_bytes(one.read_bytes() + two.read_bytes())
-    frames = list(open_source(path))
+    source = open_source(path)
+    if library == "opencv":
+        with pytest.raises(InputError, match=r"both\.ts is interlaced"):
+            list(source)
+        return
+    frames = list(source)
     assert len(frames) == 8
     assert max(combing(frame.image) for frame in frames) < 0.3 * combing(interlaced(4)[1])
 
@@ -463,6 +486,18 @@ def test_damaged_packets_are_skipped_and_named(tmp_path: Path, library: str) -> 
     np.testing.assert_allclose(times(frames), np.array(names(frames)) / 10, atol=1e-6)
 
 
+@pytest.mark.parametrize("numbers", [[7, 15], [21], [22, 23]])
+def test_damage_to_large_videos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, numbers: list[int]) -> None:
+    # Decoded by several threads, which the library stops early if one of the last packets is damaged.
+    monkeypatch.setattr(pyav_decoder, "_LARGE", 0)
+    path, _ = damaged(tmp_path / "noise.mp4", numbers)
+    source = open_source(path, most_broken=1.0)
+    frames = list(source)
+    assert len(frames) + len(source.skipped) == 24
+    assert len(source.skipped) >= len(numbers)
+    np.testing.assert_allclose(times(frames), np.array(names(frames)) / 10, atol=1e-6)
+
+
 def test_the_first_damaged_frame_is_an_error_when_strict(tmp_path: Path, library: str) -> None:
     path, broken = damaged(tmp_path / "noise.mp4", [7, 15])
     frames = iter(open_source(path, strict=True))
@@ -533,7 +568,9 @@ def test_a_recording_that_begins_in_the_middle(tmp_path: Path) -> None:
     content = path.read_bytes()
     # The second frame refers to the first, which is missing; what stands in front of it describes the stream.
     cut.write_bytes(content[: 3 * 188] + content[packets(path)[3][0] // 188 * 188 :])
-    frames = list(open_source(cut))
+    source = open_source(cut)
+    assert any("begins in the middle" in note for note in source.notes)
+    frames = list(source)
     assert len(frames) == 12
     for frame, expected in zip(frames, list(open_source(path))[12:], strict=True):
         np.testing.assert_array_equal(frame.image, expected.image)
@@ -627,11 +664,21 @@ def test_a_name_that_is_no_unicode(tmp_path: Path, library: str) -> None:
 
 @pytest.fixture
 def address(tmp_path: Path) -> Iterator[str]:
-    """Of a server for the files of `tmp_path`."""
+    """Of a server for the files of `tmp_path`; of `cut.ts` it sends one half of what it announces."""
 
     class Handler(http.server.SimpleHTTPRequestHandler):
         def __init__(self, *arguments: Any) -> None:
             super().__init__(*arguments, directory=str(tmp_path))
+
+        def do_GET(self) -> None:
+            if self.path != "/cut.ts":
+                return super().do_GET()
+            content = (tmp_path / "cut.ts").read_bytes()
+            self.send_response(200)
+            self.send_header("Content-Length", str(len(content)))
+            self.end_headers()
+            self.wfile.write(content[: len(content) // 2])
+            return None
 
         def log_message(self, *arguments: object) -> None:
             pass
@@ -655,6 +702,16 @@ def test_a_stream_is_opened_when_it_is_read(tmp_path: Path, library: str, addres
     frames = list(source)
     assert names(frames) == [0, 2, 4]
     assert frames[0].image.shape == (HEIGHT, WIDTH, 3)
+
+
+def test_what_a_stream_gave_before_it_broke_off_is_taken(tmp_path: Path, library: str, address: str) -> None:
+    write(tmp_path / "cut.ts", [busy(i) for i in range(12)], options={"g": "4"})
+    # A path keeps one slash of an address.
+    source = open_source(Path(f"{address}/cut.ts"))
+    frames = list(source)
+    assert 3 <= len(frames) <= 8
+    if library == "pyav":
+        assert "cannot be read" in source.skipped[0].reason
 
 
 def test_a_stream_that_cannot_be_reached(library: str, address: str) -> None:

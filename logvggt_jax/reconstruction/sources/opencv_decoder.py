@@ -49,11 +49,7 @@ class OpenCVDecoder:
             single = frames is None and not capture.grab()
             said = messages()
         codec = _fourcc(capture)
-        if "interlaced to progressive" in said:
-            raise InputError(
-                f"{self._name} is interlaced, which OpenCV cannot convert: {_PYAV}, or deinterlace it with "
-                "ffmpeg -i INPUT -vf bwdif=send_frame OUTPUT.mp4"
-            )
+        self._check_converted(said)
         if image is None:
             raise InputError(
                 f"{self._name} holds no frame that OpenCV can decode (codec {codec}): {_PYAV}, or re-encode it, for "
@@ -71,8 +67,8 @@ class OpenCVDecoder:
             announced=frames if self._states_frames() else None,
             seconds=None,
             notes=(
-                f"{self._name} is decoded by OpenCV, which does not notice a change of size within it, interlaced "
-                f"parts after its beginning, mirroring, HDR, or pixels that are not square: {_PYAV}",
+                f"{self._name} is decoded by OpenCV, which does not notice a change of size within it, interlacing "
+                f"that only its header tells, mirroring, HDR, or pixels that are not square: {_PYAV}",
             ),
         )
 
@@ -84,7 +80,7 @@ class OpenCVDecoder:
         # Frames that failed are known by the gaps that they leave.
         failed = in_a_row = 0
         last: float | None = None
-        size: tuple[int, int] | None = None
+        before: np.ndarray | None = None
         try:
             while in_a_row < _MOST_FAILURES:
                 decoded, image = capture.retrieve() if capture.grab() else (False, None)
@@ -96,13 +92,24 @@ class OpenCVDecoder:
                 while failed and last is not None and seconds is not None and seconds - last > 1.5 * step:
                     failed, last = failed - 1, last + step
                     yield Damage(last, "cannot be decoded")
-                if size is None:
-                    size = image.shape[:2]
-                last = seconds
+                if before is not None and np.array_equal(image, before):
+                    # Either nothing moves, or the picture was not converted and the buffer holds the one before.
+                    with _captured_stderr() as messages:
+                        capture.retrieve()
+                        self._check_converted(messages())
+                last, before = seconds, image
                 yield Picture(seconds, image.shape[:2], partial(_to_rgb, image))
             yield from [Damage(None, "cannot be decoded")] * failed
         finally:
             capture.release()
+
+    def _check_converted(self, said: str) -> None:
+        """Raises InputError if OpenCV handed out a buffer into which it could not convert the picture."""
+        if "interlaced to progressive" in said:
+            raise InputError(
+                f"{self._name} is interlaced, which OpenCV cannot convert: {_PYAV}, or deinterlace it with "
+                "ffmpeg -i INPUT -vf bwdif=send_frame OUTPUT.mp4"
+            )
 
     def _states_frames(self) -> bool:
         """Whether the count is the file's own (mp4, mov, avi); OpenCV multiplies duration and rate elsewhere."""

@@ -25,7 +25,7 @@ from logvggt_jax.reconstruction.sources.source import (
     fingerprint,
 )
 
-_STREAM = re.compile(r"(rtsps?|rtmps?|https?|udp|tcp|rtp|srt|mms)://", re.IGNORECASE)
+_STREAM = re.compile(r"(rtsps?|rtmps?|https?|udp|tcp|rtp|srt|mms):/{1,2}(?=[^/])", re.IGNORECASE)
 # Seconds until a network stream that says nothing is given up.
 _TIMEOUT = 10.0
 # Brands of files that are built like an mp4 but hold pictures.
@@ -37,7 +37,8 @@ _ALWAYS_ALLOWED = 2
 def is_live(path: str | Path) -> bool:
     """Whether this names a camera (`0`) or a network stream (`rtsp://…`), not a file."""
     text = str(path)
-    return _STREAM.match(text) is not None or (text.isdecimal() and text.isascii() and not Path(text).exists())
+    digits = text.isdecimal() and text.isascii()
+    return (digits or _STREAM.match(text) is not None) and not Path(text).exists()
 
 
 class VideoSource(Source):
@@ -62,7 +63,7 @@ class VideoSource(Source):
     def __init__(self, path: str | Path, options: SourceOptions) -> None:
         super().__init__(Path(path), options)
         self._live = is_live(path)
-        self._name = _without_password(str(path))
+        self._name = re.sub(r"(?<=://)[^/@]*:[^/@]*@", "", _address(path))
         self._header: VideoHeader | None = None
         if not self._live:
             _check_file(self.path)
@@ -74,7 +75,7 @@ class VideoSource(Source):
             self._name = f"camera {path}"
             self._decoder = OpenCVDecoder(int(str(path)), self._name)
         else:
-            self._decoder = _decoder(str(path), self._name, _TIMEOUT)
+            self._decoder = _decoder(_address(path), self._name, _TIMEOUT)
 
     @property
     def expected_frames(self) -> int | None:
@@ -245,5 +246,6 @@ def _check_index(path: Path, file: BinaryIO, size: int) -> None:
     )
 
 
-def _without_password(address: str) -> str:
-    return re.sub(r"(?<=://)[^/@]*:[^/@]*@", "", address)
+def _address(path: str | Path) -> str:
+    """The path as text; of a stream's address, of which `Path` keeps one slash only, with both."""
+    return _STREAM.sub(r"\1://", str(path), count=1) if is_live(path) else str(path)
