@@ -486,6 +486,19 @@ def test_damaged_packets_are_skipped_and_named(tmp_path: Path, library: str) -> 
     np.testing.assert_allclose(times(frames), np.array(names(frames)) / 10, atol=1e-6)
 
 
+def test_damage_to_a_stream_without_times_is_named_where_it_is(tmp_path: Path) -> None:
+    path = write(tmp_path / "raw.h264", [busy(i) for i in range(12)], options={"bf": "0", "x264-params": "threads=1"})
+    content = bytearray(path.read_bytes())
+    position, size, stamp = packets(path)[5]
+    assert stamp is None
+    # The start code, by which packets are told apart, stays.
+    content[position + 5 : position + size] = b"\xff" * (size - 5)
+    path.write_bytes(content)
+    source = open_source(path)
+    assert names(list(source)) == [0, 1, 2, 3, 4, *range(6, 12)]
+    assert [frame.name for frame in source.skipped] == ["frame-000005"]
+
+
 @pytest.mark.parametrize("numbers", [[7, 15], [21], [22, 23]])
 def test_damage_to_large_videos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, numbers: list[int]) -> None:
     # Decoded by several threads, which the library stops early if one of the last packets is damaged.

@@ -180,8 +180,11 @@ class PyAVDecoder:
             except av.error.EOFError:
                 frames = []
             except av.FFmpegError as error:
-                failures.append(str(error.strerror))
                 frames = []
+                if packet.pts is None:
+                    yield Damage(None, str(error.strerror)), None
+                else:
+                    failures.append(str(error.strerror))
             for frame in frames:
                 if frame.pts is not None:
                     yield from ((damage, None) for damage in _missing(waiting, failures, frame.pts, stream.time_base))
