@@ -181,7 +181,7 @@ class PyAVDecoder:
                 frames = []
             except av.FFmpegError as error:
                 frames = []
-                if packet.pts is None:
+                if packet.size and packet.pts is None:
                     yield Damage(None, str(error.strerror)), None
                 else:
                     failures.append(str(error.strerror))
