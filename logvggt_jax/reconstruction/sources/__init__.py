@@ -7,10 +7,10 @@ from typing import Any
 
 from logvggt_jax.errors import InputError, MissingInput, disk_errors
 from logvggt_jax.reconstruction.sources.image_folder import IMAGE_SUFFIXES, FolderSource
-from logvggt_jax.reconstruction.sources.source import Source, SourceFrame, SourceOptions
+from logvggt_jax.reconstruction.sources.source import SkippedFrame, Source, SourceFrame, SourceOptions
 from logvggt_jax.reconstruction.sources.video import VideoSource, is_live
 
-__all__ = ["FolderSource", "Source", "SourceFrame", "SourceOptions", "VideoSource", "open_source"]
+__all__ = ["FolderSource", "SkippedFrame", "Source", "SourceFrame", "SourceOptions", "VideoSource", "open_source"]
 
 
 def open_source(path: str | Path, **options: Any) -> Source:

@@ -64,9 +64,9 @@ class FolderSource(Source):
         """(H, W) of the images."""
         return None
 
-    def fingerprint(self) -> str:
+    def fingerprint(self, count: int) -> str:
         """Digest of options and files."""
-        return fingerprint(self.options, [file for _, _, file in self._frames])
+        return fingerprint(self.options, [file for _, _, file in self._frames[:count]])
 
     def loaders(self, first: int = 0) -> Iterator[Callable[[], SourceFrame | None]]:
         """See `Source.loaders`."""

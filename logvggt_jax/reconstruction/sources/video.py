@@ -90,7 +90,7 @@ class VideoSource(Source):
         """(H, W) of the frames as they are shown; None for cameras and streams."""
         return None if self._header is None else self._header.size
 
-    def fingerprint(self) -> str:
+    def fingerprint(self, count: int) -> str:
         """Digest of options and file; a new one each time for cameras and streams, which cannot be resumed."""
         if self._live:
             return secrets.token_hex(16)
