@@ -258,6 +258,15 @@ def test_a_tail_is_the_same_as_that_of_all(tmp_path: Path, library: str, options
         assert source.skipped == skipped
 
 
+def test_another_library_gives_another_fingerprint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write(tmp_path / "clip.mp4", [grey(i) for i in range(4)])
+    first = open_source(path).fingerprint(2)
+    assert open_source(path, max_frames=3).fingerprint(2) == first
+    assert open_source(path, stride=2).fingerprint(2) != first
+    monkeypatch.setitem(sys.modules, "av", None)
+    assert open_source(path).fingerprint(2) != first
+
+
 def test_a_tail_converts_nothing_before_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = open_source(write(tmp_path / "clip.mp4", [grey(i) for i in range(8)]))
     converted = []

@@ -91,11 +91,14 @@ class VideoSource(Source):
         return None if self._header is None else self._header.size
 
     def fingerprint(self, count: int) -> str:
-        """Digest of options and file; a new one each time for cameras and streams, which cannot be resumed."""
+        """Digest of options and file, and the library, as no two give the same pixels.
+
+        A new one each time for cameras and streams, which cannot be resumed.
+        """
         if self._live:
             return secrets.token_hex(16)
         with disk_errors(self.path):
-            return fingerprint(self.options, [self.path])
+            return f"{fingerprint(self.options, [self.path])} {type(self._decoder).__name__}"
 
     def loaders(self, first: int = 0) -> Iterator[Callable[[], SourceFrame | None]]:
         """See `Source.loaders`.
