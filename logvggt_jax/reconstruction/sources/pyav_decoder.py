@@ -247,7 +247,8 @@ def _missing(waiting: list[int], failures: deque[str], shown: int, time_base: Fr
 def _likely_frames(stated: int, seconds: float | None, rate: Fraction | None) -> int | None:
     """Number of frames that are shown; an edited file states those as well that it does not show."""
     by_time = max(1, round(seconds * rate)) if seconds and rate else None
-    return min(stated, by_time) if stated and by_time else stated or by_time
+    edited = stated and by_time is not None and by_time < 0.99 * stated - 2
+    return by_time if edited or not stated else stated
 
 
 def _duration(container: av.container.InputContainer, stream: av.video.stream.VideoStream) -> float | None:
