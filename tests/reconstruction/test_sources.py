@@ -12,7 +12,6 @@ from logvggt_jax.reconstruction.sources import (
     FolderSource,
     SourceFrame,
     SourceOptions,
-    VideoSource,
     image_folder,
     open_source,
 )
@@ -23,14 +22,6 @@ def write_image(path: Path, value: int, size: tuple[int, int] = (20, 30)) -> Non
     image = np.zeros((*size, 3), np.uint8)
     image[..., 2] = value
     assert cv2.imwrite(str(path), image)
-
-
-def write_video(path: Path, count: int, *, rate: float = 10.0) -> None:
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), rate, (64, 48))
-    assert writer.isOpened()
-    for index in range(count):
-        writer.write(np.full((48, 64, 3), 10 * index, np.uint8))
-    writer.release()
 
 
 def reds(frames: list[SourceFrame]) -> list[int]:
@@ -91,15 +82,10 @@ def test_folder_reads_a_file_only_when_it_is_reached(tmp_path: Path, monkeypatch
     assert read == ["0.png", "1.png"]
 
 
-@pytest.mark.parametrize("kind", ["folder", "video"])
-def test_loaders_give_the_frames_in_whatever_order_they_are_called(tmp_path: Path, kind: str) -> None:
-    if kind == "video":
-        write_video(tmp_path / "clip.mp4", 6)
-        source = open_source(tmp_path / "clip.mp4")
-    else:
-        for number in range(6):
-            write_image(tmp_path / f"{number}.png", 10 * number)
-        source = open_source(tmp_path)
+def test_loaders_give_the_frames_in_whatever_order_they_are_called(tmp_path: Path) -> None:
+    for number in range(6):
+        write_image(tmp_path / f"{number}.png", 10 * number)
+    source = open_source(tmp_path)
     loaders = list(source.loaders())
     loaded = [load() for load in reversed(loaders)][::-1]
     for frame, expected in zip(loaded, source, strict=True):
@@ -107,57 +93,11 @@ def test_loaders_give_the_frames_in_whatever_order_they_are_called(tmp_path: Pat
         np.testing.assert_array_equal(frame.image, expected.image)
 
 
-def test_video_is_decoded_in_order_with_time(tmp_path: Path) -> None:
-    write_video(tmp_path / "clip.mp4", 12)
-    source = open_source(tmp_path / "clip.mp4")
-    assert isinstance(source, VideoSource)
-    assert source.expected_frames == 12
-    frames = list(source)
-    assert len(frames) == 12
-    assert np.abs(np.array(reds(frames)) - 10 * np.arange(12)).max() < 5
-    np.testing.assert_allclose([frame.timestamp for frame in frames], 0.1 * np.arange(12), atol=1e-6)
-    assert not hasattr(source, "__len__")
-    # Every iteration starts anew.
-    assert len(list(source)) == 12
-
-
-def test_video_stride_and_limit(tmp_path: Path) -> None:
-    write_video(tmp_path / "clip.mp4", 12)
-    source = open_source(tmp_path / "clip.mp4", stride=5, max_frames=2)
-    frames = list(source)
-    assert [frame.name for frame in frames] == ["frame-000000", "frame-000005"]
-    np.testing.assert_allclose(frames[1].timestamp, 0.5, atol=1e-6)
-    assert source.expected_frames == 2
-
-
-def test_real_video_opens_and_gives_frames(examples_dir: Path) -> None:
-    frames = list(open_source(examples_dir / "video" / "handheld_box.mp4", max_frames=3))
-    assert [frame.image.shape for frame in frames] == [(480, 640, 3)] * 3
-
-
-@pytest.mark.slow
-def test_real_video_is_counted_by_decoding(examples_dir: Path) -> None:
-    source = open_source(examples_dir / "video" / "handheld_box.mp4")
-    assert source.expected_frames == 456
-    assert sum(1 for _ in source) == 455
-
-
-def test_video_that_ends_early_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_video(tmp_path / "clip.mp4", 12)
-    source = VideoSource(tmp_path / "clip.mp4", SourceOptions())
-    monkeypatch.setattr(source, "_announced", 40)
-    with pytest.warns(UserWarning, match="12 frames decoded, its header announces 40"):
-        assert len(list(source)) == 12
-
-
 def test_missing_empty_and_wrong_sources_are_named(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="nowhere does not exist"):
         open_source(tmp_path / "nowhere")
     with pytest.raises(FileNotFoundError, match=f"no image in {tmp_path}"):
         open_source(tmp_path)
-    (tmp_path / "clip.mp4").write_text("not a video")
-    with pytest.raises(ValueError, match=r"clip\.mp4 cannot be opened as a video"):
-        open_source(tmp_path / "clip.mp4")
     write_image(tmp_path / "one.png", 1)
     with pytest.raises(ValueError, match="single image"):
         open_source(tmp_path / "one.png")

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from logvggt_jax.errors import InputError, MissingInput
+from logvggt_jax.errors import InputError, MissingInput, disk_errors
 from logvggt_jax.reconstruction.sources.image_folder import IMAGE_SUFFIXES, FolderSource
 from logvggt_jax.reconstruction.sources.source import SkippedFrame, Source, SourceFrame, SourceOptions
-from logvggt_jax.reconstruction.sources.video import VideoSource
+from logvggt_jax.reconstruction.sources.video import VideoSource, is_live
 
 __all__ = ["FolderSource", "SkippedFrame", "Source", "SourceFrame", "SourceOptions", "VideoSource", "open_source"]
 
@@ -17,7 +17,7 @@ def open_source(path: str | Path, **options: Any) -> Source:
     """A folder of images or a video as a `Source`.
 
     Args:
-      path: folder or video file.
+      path: folder or video file, number of a camera (`0`), or address of a network stream (`rtsp://…`).
       options: those of `SourceOptions`: which frames are taken.
 
     Raises:
@@ -25,9 +25,17 @@ def open_source(path: str | Path, **options: Any) -> Source:
       InputError: the file is no video, or an option is out of range.
     """
     chosen = SourceOptions(**options)
-    path = Path(path).expanduser()
-    if not path.exists():
-        raise MissingInput(f"{path} does not exist: expected a folder of images or a video file")
+    if is_live(path):
+        return VideoSource(path, chosen)
+    try:
+        path = Path(path).expanduser()
+        with disk_errors(path):
+            path.stat()
+    except MissingInput:
+        raise MissingInput(f"{path} does not exist: expected a folder of images or a video file") from None
+    except (RuntimeError, ValueError) as error:
+        # No such user, or a null character.
+        raise error if isinstance(error, InputError) else InputError(f"{path!r} is no path: {error}") from error
     if path.is_dir():
         return FolderSource(path, chosen)
     if path.suffix.lower() in IMAGE_SUFFIXES:
