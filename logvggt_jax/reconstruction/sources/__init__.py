@@ -6,7 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from logvggt_jax.errors import InputError, MissingInput
-from logvggt_jax.reconstruction.sources.image_folder import IMAGE_SUFFIXES, FolderSource
+from logvggt_jax.reconstruction.sources.image_folder import FolderSource
+from logvggt_jax.reconstruction.sources.listing import names_pictures
+from logvggt_jax.reconstruction.sources.pictures import IMAGE_SUFFIXES
 from logvggt_jax.reconstruction.sources.source import Source, SourceFrame, SourceOptions
 from logvggt_jax.reconstruction.sources.video import VideoSource
 
@@ -17,7 +19,7 @@ def open_source(path: str | Path, **options: Any) -> Source:
     """A folder of images or a video as a `Source`.
 
     Args:
-      path: folder or video file.
+      path: folder, glob (`photos/*.jpg`) or list of image files (a text file with a path a line), or video file.
       options: those of `SourceOptions`: which frames are taken.
 
     Raises:
@@ -26,10 +28,10 @@ def open_source(path: str | Path, **options: Any) -> Source:
     """
     chosen = SourceOptions(**options)
     path = Path(path).expanduser()
+    if names_pictures(path):
+        return FolderSource(path, chosen)
     if not path.exists():
         raise MissingInput(f"{path} does not exist: expected a folder of images or a video file")
-    if path.is_dir():
-        return FolderSource(path, chosen)
     if path.suffix.lower() in IMAGE_SUFFIXES:
-        raise InputError(f"{path} is a single image: give the folder that holds the sequence, or a video")
+        raise InputError(f"{path} is a single image: give the folder that holds the sequence, a glob, or a video")
     return VideoSource(path, chosen)

@@ -22,13 +22,16 @@ class SourceFrame(NamedTuple):
 
     Attributes:
       name: file name without suffix, or `frame-000123` with the position in the video.
-      timestamp: seconds from the video's start; for folders, which know no time, the position in the sorted folder.
+      timestamp: seconds from the video's start; for images the time that their names tell, or else the position in
+        the sorted folder.
       image: [H, W, 3] uint8 RGB.
+      focal_length: pixels of the image, as the camera noted it; None where it is not known.
     """
 
     name: str
     timestamp: float
     image: np.ndarray
+    focal_length: float | None = None
 
 
 class SkippedFrame(NamedTuple):
