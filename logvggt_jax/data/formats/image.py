@@ -7,6 +7,8 @@ decides (`jpeg.py`), which takes half as long again.
 
 import re
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -14,7 +16,7 @@ import numpy as np
 
 from logvggt_jax.data.errors import BrokenPicture, missing_file
 from logvggt_jax.data.formats.jpeg import JPEG_START, decode_jpeg
-from logvggt_jax.errors import one_line
+from logvggt_jax.errors import InputError, one_line
 
 PNG_START = b"\x89PNG\r\n\x1a\n"
 # Within entropy-coded data a real marker is FF followed by neither 00, a restart marker nor a fill byte.
@@ -59,15 +61,26 @@ def read_depth(path: str | Path) -> np.ndarray:
     return picture
 
 
+@contextmanager
+def decoding_errors(path: Path) -> Iterator[None]:
+    """Turns what Pillow raises over a damaged file into BrokenPicture; the system's errors pass through."""
+    try:
+        yield
+    except (InputError, MemoryError):
+        raise
+    except Exception as error:  # the plugins raise whatever their parsing stumbles over
+        if isinstance(error, OSError) and error.errno is not None:
+            raise
+        raise BrokenPicture(f"{path}: truncated or damaged picture ({one_line(error)}): fetch it again") from error
+
+
 def _decode(path: Path) -> np.ndarray:
     if not path.is_file():
         raise missing_file(path)
     data = path.read_bytes()
     if data.startswith(JPEG_START) and not _jpeg_is_regular(data):
-        try:
+        with decoding_errors(path):
             return np.array(decode_jpeg(data).convert("RGB"))[..., ::-1]
-        except (OSError, SyntaxError, ValueError) as error:
-            raise BrokenPicture(f"{path}: truncated or damaged picture ({one_line(error)}): fetch it again") from error
     if not data or (data.startswith(PNG_START) and not png_is_whole(data)):
         raise BrokenPicture(f"{path}: truncated or damaged picture of {len(data)} bytes: fetch it again")
     try:

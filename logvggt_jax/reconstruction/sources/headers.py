@@ -13,9 +13,10 @@ from typing import IO
 from PIL import ExifTags, Image, ImageFile, TiffImagePlugin
 
 from logvggt_jax.data.errors import BrokenPicture
-from logvggt_jax.data.formats.jpeg import decode_jpeg
+from logvggt_jax.data.formats.image import decoding_errors
+from logvggt_jax.data.formats.jpeg import decode_jpeg, first_scan
 from logvggt_jax.errors import InputError, disk_errors
-from logvggt_jax.reconstruction.sources.pictures import MOST_PIXELS, decoding_errors, not_colours, open_picture
+from logvggt_jax.reconstruction.sources.pictures import MOST_PIXELS, not_colours, open_picture
 
 _FILM_DIAGONAL = math.hypot(36, 24)  # mm; what "equivalent to 35 mm film" refers to (CIPA DCG-001)
 _RESOLUTION_UNITS = {2: 25.4, 3: 10.0, 4: 1.0}  # mm in the unit of FocalPlaneResolutionUnit
@@ -119,9 +120,8 @@ def _reaches_end(kind: str, picture: ImageFile.ImageFile, stream: IO[bytes]) -> 
             return True
         stream.seek(0)
         data = stream.read()
-        # Thumbnails in the header have ends of their own, and in the pixels FF is never followed by D9.
-        scan = min((tile.offset for tile in picture.tile), default=0)
-        if data.find(_JPEG_END, scan) < 0:
+        # Thumbnails in the header have ends of their own, and among coded pixels FF is never followed by D9.
+        if data.find(_JPEG_END, first_scan(data)) < 0:
             decode_jpeg(data)
         return True
     if kind == "PNG":

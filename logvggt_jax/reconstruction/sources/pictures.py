@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from types import MappingProxyType
 from typing import IO
@@ -22,9 +20,9 @@ from PIL import (
 )
 
 from logvggt_jax.data.errors import BrokenPicture
-from logvggt_jax.data.formats.image import over_white, png_is_whole
+from logvggt_jax.data.formats.image import decoding_errors, over_white, png_is_whole
 from logvggt_jax.data.formats.jpeg import decode_jpeg
-from logvggt_jax.errors import InputError, MissingPackage, disk_errors, one_line
+from logvggt_jax.errors import InputError, MissingPackage, disk_errors
 
 IMAGE_SUFFIXES = (
     *(".jpg", ".jpeg", ".jpe", ".jfif"),
@@ -140,19 +138,6 @@ def kind_of(start: bytes) -> str:
             return "AVIF"
         return "HEIC" if brands & _HEIC_BRANDS else "video"
     return next((kind for signature, kind in _SIGNATURES if start.startswith(signature)), "")
-
-
-@contextmanager
-def decoding_errors(path: Path) -> Iterator[None]:
-    """Turns what a decoder raises over a damaged file into BrokenPicture; the system's errors pass through."""
-    try:
-        yield
-    except (InputError, MemoryError):
-        raise
-    except Exception as error:  # the plugins raise whatever their parsing stumbles over
-        if isinstance(error, OSError) and error.errno is not None:
-            raise
-        raise BrokenPicture(f"{path}: truncated or damaged picture ({one_line(error)}): fetch it again") from error
 
 
 def not_colours(path: Path, values: str) -> InputError:
