@@ -18,6 +18,13 @@ _OTHER_BITS = b"".join(b"\x5a\xa5\x33\xcc" * 4 + bytes((0xFF, 0xD0 + number % 8)
 _MOST_ZEROS = 16
 
 
+class _Pixels(JpegImagePlugin.JpegImageFile):
+    """A picture whose camera data are left alone: Pillow warns on opening it if they are odd."""
+
+    def getexif(self) -> Image.Exif:
+        return Image.Exif()
+
+
 def decode_jpeg(data: bytes) -> Image.Image:
     """The pixels as stored, without orientation, in mode L, RGB or CMYK.
 
@@ -49,13 +56,13 @@ def decode_jpeg(data: bytes) -> Image.Image:
 def first_scan(data: bytes) -> int:
     """Position of the first scan's marker; thumbnails in the header lie before it. Errors as `decode_jpeg`."""
     stream = io.BytesIO(data)
-    JpegImagePlugin.JpegImageFile(stream)
+    _Pixels(stream)
     # Pillow stops behind the scan's header.
     return data.rfind(_SCAN, 0, stream.tell())
 
 
 def _decode(data: bytes) -> Image.Image:
-    picture = JpegImagePlugin.JpegImageFile(io.BytesIO(data))
+    picture = _Pixels(io.BytesIO(data))
     picture.load()
     return picture
 

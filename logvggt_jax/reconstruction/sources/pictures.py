@@ -149,10 +149,11 @@ def not_colours(path: Path, values: str) -> InputError:
 
 def _decode(path: Path, data: bytes) -> Image.Image:
     """The picture with its pixels as stored."""
+    if kind_of(data[:SIGNATURE_BYTES]) == "JPEG":
+        with decoding_errors(path):
+            return decode_jpeg(data)
     kind, picture = open_picture(path, io.BytesIO(data))
     with decoding_errors(path):
-        if kind == "JPEG":
-            return decode_jpeg(data)
         if kind == "PNG" and not png_is_whole(data):
             # Pillow looks at no checksum of the pixels.
             raise BrokenPicture(f"{path}: truncated or damaged picture (wrong checksum): fetch it again")
