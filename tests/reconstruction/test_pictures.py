@@ -21,7 +21,8 @@ from logvggt_jax.reconstruction.sources.pictures import read_picture
 
 # Corners red, green / blue, yellow, as the scene has them.
 SCENE = np.zeros((32, 48, 3), np.uint8)
-SCENE[:16, :24], SCENE[:16, 24:], SCENE[16:, :24], SCENE[16:, 24:] = (255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 0)
+SCENE[:16, :24], SCENE[:16, 24:] = (255, 0, 0), (0, 255, 0)
+SCENE[16:, :24], SCENE[16:, 24:] = (0, 0, 255), (255, 255, 0)
 # What a camera held otherwise stores, by orientation; each is the inverse of what the tag asks for.
 STORED: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     1: lambda scene: scene,
@@ -73,7 +74,7 @@ def test_heic_is_upright(tmp_path: Path, orientation: int) -> None:
     path = tmp_path / "a.heic"
     pillow_heif.register_heif_opener()
     stored = np.ascontiguousarray(STORED[orientation](SCENE))
-    Image.fromarray(stored).save(path, quality=95, exif=tags(orientation))
+    Image.fromarray(stored).save(path, quality=95, exif=tags(orientation).tobytes())
     assert_is_scene(read(path))
 
 
