@@ -82,7 +82,9 @@ def _lacks_scans(data: bytes, picture: Image.Image) -> bool:
 
 
 def _ends_flat(picture: Image.Image) -> bool:
-    """Whether the last pixels are of one colour, as those that libjpeg makes up are."""
-    width, height = picture.size
-    corner = picture.crop((max(0, width - 4), height - 1, width, height))
-    return len(corner.getcolors() or ()) == 1
+    """Whether the last coded unit is of one colour, as those that libjpeg makes up are.
+
+    Of its up to 16 x 16 pixels those that are smoothed with other units' are left out.
+    """
+    corner = [length - max(1, (length - 1) % 16 - 1) for length in picture.size]
+    return len(picture.crop((*corner, *picture.size)).getcolors() or ()) == 1

@@ -168,6 +168,8 @@ def _colours(path: Path, picture: Image.Image) -> np.ndarray:
     if picture.mode in ("I", "F"):
         raise not_colours(path, "floating point" if picture.mode == "F" else "32-bit numbers")
     with decoding_errors(path):
+        if picture.mode == "RGB" and "transparency" not in picture.info:
+            return np.array(picture)
         if picture.has_transparency_data:
             return over_white(np.asarray(picture.convert("RGBA")))
         return np.array(picture.convert("RGB"))
