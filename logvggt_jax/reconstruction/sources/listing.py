@@ -208,8 +208,9 @@ def _is_colour(file: Path) -> bool:
 def _taken_by_mistake(files: list[Path]) -> list[str]:
     """Lines on names that are taken as frames, and look like something else."""
     notes = []
-    suspects = [file for file in files if _NO_COLOURS.search(stem(file.name).lower())]
-    rest = [file for file in files if file not in set(suspects)]
+    suspects, rest = list[Path](), list[Path]()
+    for file in files:
+        (suspects if _NO_COLOURS.search(stem(file.name).lower()) else rest).append(file)
     if suspects and rest:
         suffixes = {file.suffix for file in rest}
         apart = len(suffixes) == 1 and not suffixes & {file.suffix for file in suspects}

@@ -11,6 +11,8 @@ from typing import Any
 
 _DIGITS = re.compile(r"(\d+)")
 _DECIMALS = re.compile(r"(\d+(?:\.\d+)?)")
+# Before a fraction, or a time of day.
+_NO_COUNTER = re.compile(r"\d\.$|(?:19|20)\d\d[-_.:]?[01]\d[-_.:]?[0-3]\d\D")
 _SECONDS = re.compile(r"\d+\.\d+|\d{10}")
 # Whole numbers are moments if they lie between 2001 and 2100 in one of these units (per second).
 _EPOCH_UNITS = (1, 10**3, 10**6, 10**9)
@@ -65,8 +67,7 @@ def missing_numbers(stems: Sequence[str]) -> list[str]:
     sequences: dict[tuple[str, str], dict[int, str]] = defaultdict(dict)
     for stem in set(stems):
         *_, last = [None, *re.finditer(r"\d+", stem)]
-        # Digits behind a decimal point are no counter.
-        if last is not None and not re.search(r"\d\.$", stem[: last.start()]) and int(last[0]) < _EPOCH_BEGIN:
+        if last is not None and not _NO_COUNTER.search(stem[: last.start()]) and int(last[0]) < _EPOCH_BEGIN:
             sequences[stem[: last.start()], stem[last.end() :]][int(last[0])] = stem
     lines = []
     for named in sequences.values():
