@@ -324,6 +324,13 @@ def test_two_sizes_are_listed_with_their_counts(tmp_path: Path) -> None:
     assert [frame.image.shape for frame in cropping] == [(20, 20, 3)] * 5
 
 
+def test_thumbnails_of_another_size_are_suspected(tmp_path: Path) -> None:
+    write_numbered(tmp_path, 2)
+    write_image(tmp_path / "0_thumb.png", 0, (10, 15))
+    with pytest.raises(InputError, match=r"2 sizes: .*1 of 3 names look like .*0_thumb\.png.*--pattern"):
+        open_source(tmp_path)
+
+
 def test_cropping_keeps_the_centre(tmp_path: Path) -> None:
     image = np.arange(8 * 10 * 3, dtype=np.uint8).reshape(8, 10, 3)
     Image.fromarray(image).save(tmp_path / "0.png")

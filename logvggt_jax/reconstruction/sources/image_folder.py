@@ -57,7 +57,8 @@ class FolderSource(Source):
     def __init__(self, path: Path, options: SourceOptions) -> None:
         listing = list_pictures(path, options.pattern)
         super().__init__(listing.root if is_glob(path) and not path.exists() else path, options)
-        self.notes += listing.notes
+        self.notes += listing.left_out + listing.doubts
+        self._doubts = listing.doubts
         self._lock = threading.Lock()
         files = listing.files
         if not listing.in_order:
@@ -212,6 +213,7 @@ class FolderSource(Source):
             f"{self.path} holds images of {len(counts)} sizes{sideways}: {listed}. All "
             f"frames of a sequence need one size: --size-mismatch skip keeps the {most} of {_pixels(common)}, "
             f"--size-mismatch crop cuts all to {_pixels(smallest)} from their centre"
+            + "".join(f"; {doubt}" for doubt in self._doubts)
         )
 
 

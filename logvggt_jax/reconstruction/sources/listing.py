@@ -35,13 +35,15 @@ class Listing:
       files: the files, in the order of a list of files, else by name.
       root: the folder that all lie in.
       in_order: whether the order is the user's own.
-      notes: what is left out, and what may be taken by mistake; one line a kind.
+      left_out: what is left out or missing, one line a kind.
+      doubts: what may be taken by mistake, one line a kind.
     """
 
     files: list[Path]
     root: Path
     in_order: bool
-    notes: list[str]
+    left_out: list[str]
+    doubts: list[str]
 
 
 def names_pictures(path: Path) -> bool:
@@ -90,17 +92,17 @@ def some(names: Iterable[str]) -> str:
 
 def _of_folder(folder: Path, pattern: str | None) -> Listing:
     entries = sorted(folder.iterdir())
-    files, notes = _pictures([entry for entry in entries if _matches(entry, pattern)], told=pattern is None)
+    files, left_out = _pictures([entry for entry in entries if _matches(entry, pattern)], told=pattern is None)
     if not files:
         expected = "expected a picture" if pattern is None else f"none matches --pattern {pattern!r}: expected one"
         raise MissingInput(
             f"no image in {folder}: {expected} ({', '.join(IMAGE_SUFFIXES)}), found {_contents(entries)}; give the "
-            "folder that holds the images themselves"
+            "folder that holds the images themselves, or convert them"
         )
     folders = _folders_with_pictures(entries)
     if folders and pattern is None:
-        notes.append(f"sub-folders are not searched; with images there are {folders}")
-    return Listing(files, folder, False, notes)
+        left_out.append(f"sub-folders are not searched; with images there are {folders}")
+    return Listing(files, folder, False, left_out, _doubts(files))
 
 
 def _of_glob(path: Path, pattern: str | None) -> Listing:
@@ -108,11 +110,12 @@ def _of_glob(path: Path, pattern: str | None) -> Listing:
     while is_glob(root):
         root = root.parent
     entries = sorted(root.glob(str(path.relative_to(root))))
-    files, notes = _pictures([entry for entry in entries if _matches(entry, pattern)], told=True)
+    files, left_out = _pictures([entry for entry in entries if _matches(entry, pattern)], told=True)
     if not files:
         found = f"found {_contents(entries)}" if entries else "nothing has such a name"
-        raise MissingInput(f"no image matches {path}: {found}; does the folder {root} hold them?")
-    return Listing(files, root, False, notes)
+        both = "" if pattern is None else f" and --pattern {pattern!r}"
+        raise MissingInput(f"no image matches {path}{both}: {found}; does the folder {root} hold them?")
+    return Listing(files, root, False, left_out, _doubts(files))
 
 
 def _of_list(path: Path, pattern: str | None) -> Listing:
@@ -140,7 +143,7 @@ def _of_list(path: Path, pattern: str | None) -> Listing:
     if not files:
         raise MissingInput(f"no image in {path}: expected a list of image files, one path a line")
     root = Path(os.path.commonpath([str(file.parent) for file in files]))
-    return Listing(list(files), root, True, [])
+    return Listing(list(files), root, True, [], [])
 
 
 def _matches(entry: Path, pattern: str | None) -> bool:
@@ -177,7 +180,7 @@ def _pictures(entries: list[Path], *, told: bool) -> tuple[list[Path], list[str]
         files = [file for file in files if file not in depth]
         notes.append(f"left out: {len(depth)} depth maps of colour images ({some(f.name for f in sorted(depth))})")
     gaps = missing_numbers([stem(entry.name) for entry in entries if entry.suffix.lower() in IMAGE_SUFFIXES])
-    return files, notes + gaps + _taken_by_mistake(files)
+    return files, notes + gaps
 
 
 def _kind(entry: Path) -> str:
@@ -205,7 +208,7 @@ def _is_colour(file: Path) -> bool:
     return file.name.lower().endswith(SEVEN_SCENES_COLOUR)
 
 
-def _taken_by_mistake(files: list[Path]) -> list[str]:
+def _doubts(files: list[Path]) -> list[str]:
     """Lines on names that are taken as frames, and look like something else."""
     notes = []
     suspects, rest = list[Path](), list[Path]()
