@@ -21,6 +21,7 @@ from logvggt_jax.compile import check_devices, enable_compilation_cache
 from logvggt_jax.errors import InputError, one_line
 from logvggt_jax.evaluation.report.report import print_report
 from logvggt_jax.evaluation.run import run_evaluation
+from logvggt_jax.terminal import forgiving_streams
 
 _CONFIG = config_flags.DEFINE_config_file("config", None, "what to evaluate: a file of configs/eval", lock_config=True)
 _CHECKPOINT = flags.DEFINE_string("checkpoint", None, "model folder, as training and `logvggt convert` write it")
@@ -78,4 +79,5 @@ def parse_flags(arguments: list[str]) -> list[str]:
 
 if __name__ == "__main__":
     flags.mark_flags_as_required(["config", "checkpoint", "output"])
-    app.run(main, flags_parser=parse_flags)
+    with forgiving_streams():
+        app.run(main, flags_parser=parse_flags)

@@ -24,6 +24,7 @@ from ml_collections import config_flags
 
 from logvggt_jax.compile import check_devices, enable_compilation_cache
 from logvggt_jax.errors import InputError, one_line
+from logvggt_jax.terminal import forgiving_streams
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.dry_run import described_mesh, dry_run
 from logvggt_jax.training.loop import NonFiniteTraining, train
@@ -117,4 +118,5 @@ if __name__ == "__main__":
         lambda given: given["dry_run"] or (given["workdir"] is not None and given["described"] is None),
         "a run needs --workdir; --described goes with --dry_run",
     )
-    app.run(main, flags_parser=parse_flags)
+    with forgiving_streams():
+        app.run(main, flags_parser=parse_flags)

@@ -37,7 +37,6 @@ from logvggt_jax.evaluation.costs.parts import (
     PARTS,
     PartTime,
     flops_by_part,
-    matmul_flops_per_second,
     peak_device_bytes,
     peak_host_bytes,
     sequence_parts,
@@ -48,6 +47,7 @@ from logvggt_jax.evaluation.costs.throughput import random_pictures, time_stream
 from logvggt_jax.evaluation.environment import describe_device
 from logvggt_jax.evaluation.methods.variants import VARIANTS
 from logvggt_jax.evaluation.report.figures import efficiency_plot
+from logvggt_jax.operations import matmul_flops_per_second
 from logvggt_jax.streaming import StreamSession
 
 MIB = 2**20

@@ -14,6 +14,7 @@ import argparse
 import tempfile
 import time
 from collections import deque
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from logvggt_jax.geometry import encode_poses
 from logvggt_jax.reconstruction import reconstruct
 from logvggt_jax.streaming import METHODS, Method, WindowSettings
 from logvggt_jax.streaming.results import Cameras, FrameResult, decoded_cameras
+from logvggt_jax.streaming.windows import window_program
 
 SIZE = (392, 518)
 STRIDE = 2
@@ -72,6 +74,13 @@ class ClockPredictor:
         results = self._landed(ahead=0)
         self.own_seconds += time.thread_time()
         return results
+
+    def snapshot(self) -> tuple[list[FrameResult], dict[str, np.ndarray]]:
+        """Nothing worth saving."""
+        return [], {}
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Nothing is ever saved."""
 
     def cameras(self) -> Cameras:
         """A walk along x."""
@@ -147,7 +156,9 @@ def main() -> None:
         size = write_sequence(folder, options.frames)
         print(f"{options.frames} files of 640 x 480 pixels, {size:.0f} kB each, to {SIZE[0]} x {SIZE[1]}")
         started, used = time.perf_counter(), time.process_time()
-        METHODS["clock"] = Method(lambda *_: predictor, WindowSettings, "windows", "a clock in the device's place")
+        METHODS["clock"] = Method(
+            lambda *_: predictor, WindowSettings, "windows", "a clock in the device's place", window_program
+        )
         result = reconstruct(
             folder,
             Path(scratch) / "out",

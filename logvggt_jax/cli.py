@@ -8,6 +8,7 @@ import argparse
 import contextlib
 import json
 import shutil
+import signal
 import sys
 import traceback
 import warnings
@@ -16,32 +17,48 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from logvggt_jax.errors import InputError, disk_errors, one_line
+from logvggt_jax.interruption import Interrupted
+from logvggt_jax.terminal import forgiving_streams
 
 if TYPE_CHECKING:
     from logvggt_jax.streaming import ChunkPlan
 
-BAD_INPUT, INTERRUPTED = 2, 130
+OUTPUT_LOST, BAD_INPUT, INTERRUPTED = 1, 2, 130
+SOURCE_OPTIONS = ("stride", "max_frames", "fps", "start", "end", "pattern", "size_mismatch", "strict")
 MODES = ("windows", "chunks", "offline")  # the registry of methods, which would load JAX
 PROBLEMS_FOUND = 1
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command line and returns the exit code: 0, 2 for bad input; `data check` 1 where it found problems.
+    """Runs the command line and returns the exit code.
 
-    Any exception but InputError is a fault of this package and passes through with its traceback.
+    0; 2 for bad input; 128 and its number where a signal ended the run; 1 where `data check` or `doctor` found
+    problems, or standard output could not be written. A reader of standard output that goes away is no error. Any
+    exception but InputError is a fault of this package and passes through with its traceback.
 
     Args:
       arguments: without the program's name; default `sys.argv[1:]`.
     """
-    parser = _parser()
-    options = parser.parse_args(_with_dashes(sys.argv[1:] if arguments is None else arguments))
+    with forgiving_streams() as output:
+        code = _run(sys.argv[1:] if arguments is None else arguments)
+    if output.failure is not None and not isinstance(output.failure, BrokenPipeError):
+        print(f"logvggt: error: standard output cannot be written: {one_line(output.failure)}", file=sys.stderr)
+        return code or OUTPUT_LOST
+    return code
+
+
+def _run(arguments: Sequence[str]) -> int:
+    options = _parser().parse_args(_with_dashes(arguments))
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
             return options.run(options) or 0
     except KeyboardInterrupt:
-        print("logvggt: interrupted; nothing half-written is left", file=sys.stderr)
+        print("logvggt: interrupted", file=sys.stderr)
         return INTERRUPTED
+    except Interrupted as interruption:
+        print(f"logvggt: ended by {interruption.signal}: {interruption}", file=sys.stderr)
+        return 128 + signal.Signals[interruption.signal]
     except InputError as error:
         if options.traceback:
             traceback.print_exc()
@@ -61,30 +78,44 @@ def _convert(options: argparse.Namespace) -> None:
     print(f"model: {options.output}")
 
 
-def _reconstruct(options: argparse.Namespace) -> None:
+def _reconstruct(options: argparse.Namespace) -> int:
     from logvggt_jax.compile import check_devices, enable_compilation_cache
     from logvggt_jax.model.parameters import in_compute_type
     from logvggt_jax.reconstruction.method import choose_method
     from logvggt_jax.reconstruction.point_cloud import PointFilter
-    from logvggt_jax.reconstruction.reconstruct import LONGER_EDGE, check_request, reconstruct
+    from logvggt_jax.reconstruction.reconstruct import LONGER_EDGE, reconstruct
+    from logvggt_jax.reconstruction.request import check_request, describe
     from logvggt_jax.reconstruction.sources import open_source
-    from logvggt_jax.weights.checkpoints import from_pretrained, read_provenance
+    from logvggt_jax.weights.checkpoints import from_pretrained, read_config, read_provenance
+    from logvggt_jax.weights.hub import resolve
 
     # Before the model: a misspelt path should not have to wait for gigabytes of weights.
-    source = open_source(options.source, stride=options.stride, max_frames=options.max_frames)
-    check_request(source, options.output, longer_edge=options.longer_edge, overwrite=options.overwrite)
-    check_devices()
-    enable_compilation_cache(options.compilation_cache)
+    source = open_source(options.source, **{name: getattr(options, name) for name in SOURCE_OPTIONS})
     point_filter = PointFilter(
         confidence_percentile=options.confidence_percentile,
         edge_threshold=options.edge_threshold or None,
         pixel_stride=options.pixel_stride,
         max_points=options.max_points or None,
     )
-    provenance = read_provenance(options.checkpoint)
+    target = check_request(source, options.output, longer_edge=options.longer_edge, overwrite=options.overwrite)
+    checkpoint = resolve(options.checkpoint)
+    provenance = read_provenance(checkpoint)
+    longer_edge = options.longer_edge or provenance.longer_edge or LONGER_EDGE
+    config = read_config(checkpoint, dtype=options.dtype)
+    check_devices()
+    enable_compilation_cache(options.compilation_cache)
     method = choose_method(provenance, None if options.mode == "auto" else options.mode)
     settings = _settings(options, method)
-    model, variables = from_pretrained(options.checkpoint, dtype=options.dtype)
+    needs = describe(source, target, config if options.dry_run else None, method, settings, longer_edge, point_filter)
+    if provenance.longer_edge not in (None, longer_edge):
+        source.notes.append(f"these weights were trained at {provenance.longer_edge} pixels, not {longer_edge}")
+    for note in source.notes:
+        print(f"logvggt: note: {note}", file=sys.stderr)
+    for line in needs:
+        print(line if options.dry_run else f"logvggt: {line}", file=sys.stdout if options.dry_run else sys.stderr)
+    if options.dry_run:
+        return 0
+    model, variables = from_pretrained(checkpoint, dtype=options.dtype)
     # Here rather than in the stream alone, so that nothing keeps the float32 parameters on the device.
     variables = in_compute_type(variables, model.config)
     result = reconstruct(
@@ -94,12 +125,13 @@ def _reconstruct(options: argparse.Namespace) -> None:
         variables=variables,
         method=method,
         settings=settings,
-        longer_edge=options.longer_edge or provenance.longer_edge or LONGER_EDGE,
+        longer_edge=longer_edge,
         point_filter=point_filter,
         num_previews=options.previews,
         overwrite=options.overwrite,
     )
     print(result.summary())
+    return 0 if result.complete else INTERRUPTED
 
 
 def _settings(options: argparse.Namespace, method: str) -> ChunkPlan | None:
@@ -245,6 +277,9 @@ def _parser() -> argparse.ArgumentParser:
         _reconstruct,
         "cameras, depth maps and a coloured point cloud from a folder of images or a video",
         "logvggt reconstruct walk.mp4 --stride 3 --checkpoint models/log-vggt --output runs/walk",
+        details=" The work lies in OUTPUT.partial until it is done; a run that ended early, for whatever reason, is "
+        "taken up by the same command. Ctrl-C ends the sequence at the window at hand and leaves a valid result of the "
+        "frames so far; a second one stops at once.",
     )
     sub.add_argument("source", help="folder of images (natural order; 7-Scenes: its colour images), or a video")
     sub.add_argument(
@@ -259,8 +294,22 @@ def _parser() -> argparse.ArgumentParser:
         help="resize frames so that their longer edge has this size, a multiple of 14 (default: the size that the "
         "model was trained with)",
     )
-    sub.add_argument("--stride", type=int, default=1, metavar="N", help="take every N-th frame")
-    sub.add_argument("--max-frames", type=int, default=None, metavar="N", help="stop after N frames")
+    frames = sub.add_argument_group("frames")
+    frames.add_argument("--stride", type=int, default=1, metavar="N", help="take every N-th frame")
+    frames.add_argument("--max-frames", type=int, default=None, metavar="N", help="stop after N frames")
+    frames.add_argument("--fps", type=float, default=None, metavar="N", help="take at most N frames a second")
+    frames.add_argument("--start", type=float, default=None, metavar="SECONDS", help="leave out what comes before")
+    frames.add_argument("--end", type=float, default=None, metavar="SECONDS", help="leave out what comes after")
+    frames.add_argument("--pattern", default=None, metavar="GLOB", help="take image files with such names alone")
+    frames.add_argument(
+        "--size-mismatch",
+        choices=("error", "crop", "skip"),
+        default="error",
+        help="images of several sizes: refuse them, crop all to what they share, or leave out the rarer sizes",
+    )
+    frames.add_argument(
+        "--strict", action="store_true", help="stop at a frame that cannot be read instead of leaving it out"
+    )
     sub.add_argument(
         "--dtype", choices=("float32", "bfloat16"), default=None, help="compute type instead of the checkpoint's own"
     )
@@ -302,7 +351,15 @@ def _parser() -> argparse.ArgumentParser:
         "--max-points", type=int, default=2_000_000, metavar="N", help="thin the cloud to N points; 0 keeps all"
     )
     sub.add_argument("--previews", type=int, default=8, metavar="N", help="pictures of frames beside their depth")
-    sub.add_argument("--overwrite", action="store_true", help="replace an earlier reconstruction")
+    sub.add_argument(
+        "--overwrite", action="store_true", help="begin anew and replace an earlier or unfinished reconstruction"
+    )
+    sub.add_argument(
+        "--dry-run",
+        action="store_true",
+        help="check everything that can be checked before the weights are read, compile the program, and print frames, "
+        "size, memory and time",
+    )
     sub.add_argument(
         "--compilation-cache",
         default=None,

@@ -138,9 +138,21 @@ def test_public_weights_run_in_chunks_unless_told_otherwise(
     arguments += ["--compilation-cache", "none", "--previews", "0"]
     # Only chunks take a size.
     assert main([*arguments, "--chunk-size", "4"]) == 0
-    assert capsys.readouterr().err == ""
+    assert "warning" not in capsys.readouterr().err
     assert main([*arguments, "--mode", "windows", "--overwrite"]) == 0
     assert "logvggt: warning: these weights are public VGGT's, which never learned" in capsys.readouterr().err
+
+
+def test_a_dry_run_says_what_a_run_needs_and_leaves_nothing(
+    checkpoint: Path, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("logvggt_jax.weights.checkpoints.load_model", lambda _: pytest.fail("reads the weights"))
+    arguments = ["reconstruct", str(room), "--checkpoint", str(checkpoint), "--output", str(tmp_path / "out")]
+    assert main([*arguments, "--dry-run", "--compilation-cache", "none"]) == 0
+    shown = capsys.readouterr()
+    for part in ("5 frames of 84x56 pixels, 42x28 for the model; method windows", "disk: about", "device (", "time:"):
+        assert part in shown.out
+    assert shown.err == "" and list(tmp_path.iterdir()) == []
 
 
 def test_info_counts_parameters(

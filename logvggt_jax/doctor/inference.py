@@ -13,10 +13,10 @@ import numpy as np
 
 from logvggt_jax.doctor.finding import Finding
 from logvggt_jax.doctor.subject import Subject, random_variables
-from logvggt_jax.evaluation.costs.parts import abstract_variables, matmul_flops_per_second
+from logvggt_jax.evaluation.costs.parts import abstract_variables
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.model.parameters import in_compute_type, stack_layers
-from logvggt_jax.operations import count_flops
+from logvggt_jax.operations import count_flops, matmul_flops_per_second
 
 _ATTENTION_CALLS = {"gpu": "__cudnn$fmha", "tpu": "tpu_custom_call"}
 

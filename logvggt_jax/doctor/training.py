@@ -13,8 +13,8 @@ from logvggt_jax.compile import out_of_device_memory
 from logvggt_jax.doctor.finding import Finding
 from logvggt_jax.doctor.inference import attention_calls
 from logvggt_jax.doctor.subject import Subject, random_variables
-from logvggt_jax.evaluation.costs.parts import matmul_flops_per_second
 from logvggt_jax.model.parameters import stack_layers
+from logvggt_jax.operations import matmul_flops_per_second
 from logvggt_jax.training.config import LossConfig, OptimizerConfig
 from logvggt_jax.training.dry_run import step_flops
 from logvggt_jax.training.optimizer import make_optimizer

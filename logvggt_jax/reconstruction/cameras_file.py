@@ -26,6 +26,8 @@ def write_cameras(
     image_size: tuple[int, int],
     model_intrinsics: np.ndarray,
     model_size: tuple[int, int],
+    complete: bool = True,
+    skipped: Sequence[tuple[str, str]] = (),
 ) -> None:
     """Writes all cameras as one JSON file.
 
@@ -38,6 +40,8 @@ def write_cameras(
       image_size: (H, W) of the original images.
       model_intrinsics: [N, 3, 3], pixels of the depth maps.
       model_size: (H, W) of the depth maps.
+      complete: whether the sequence was read to its end.
+      skipped: frames that could not be read, with the reason.
     """
     frames: list[dict[str, Any]] = [
         {
@@ -57,9 +61,19 @@ def write_cameras(
         "integers",
         "image_size": list(image_size),
         "depth_size": list(model_size),
+        "complete": complete,
+        "skipped": [{"name": name, "reason": reason} for name, reason in skipped],
         "frames": frames,
     }
     write_text(path, json.dumps(document, indent=1) + "\n")
+
+
+def is_complete(path: Path) -> bool:
+    """Whether a cameras file is there that does not say that its run was ended early."""
+    try:
+        return json.loads(path.read_text()).get("complete", True) is True
+    except (OSError, ValueError, AttributeError):
+        return False
 
 
 def read_cameras(path: str | Path) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import dataclasses
 import functools
 import re
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -140,6 +140,34 @@ class PointSelection:
         with self._lock:
             self._histogram += counts
             self._samples[frame] = sample
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All that was seen, for `restore`."""
+        frames = sorted(self._samples)
+        samples = [self._samples[frame] for frame in frames]
+        points = [sample.points for sample in samples]
+        return {
+            "histogram": self._histogram,
+            "sample_size": np.array([self._sample_size]),
+            "frames": np.array(frames, np.int64),
+            "candidates": np.array([sample.candidates for sample in samples], np.int64),
+            "lengths": np.array([len(sample.bins) for sample in samples], np.int64),
+            "bins": np.concatenate([sample.bins for sample in samples] or [np.zeros(0, np.uint16)]),
+            "indices": np.concatenate([each.indices for each in points] or [np.zeros(0, np.int64)]),
+            "depth": np.concatenate([each.depth for each in points] or [np.zeros(0, np.float32)]),
+            "colours": np.concatenate([each.colours for each in points] or [np.zeros((0, 3), np.uint8)]),
+        }
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Takes up what `arrays` gave."""
+        self._histogram, self._sample_size = arrays["histogram"].copy(), int(arrays["sample_size"][0])
+        ends = np.cumsum(arrays["lengths"])
+        for frame, stop, length, candidates in zip(
+            arrays["frames"].tolist(), ends, arrays["lengths"], arrays["candidates"].tolist(), strict=True
+        ):
+            part = slice(stop - length, stop)
+            points = FramePoints(*(arrays[name][part] for name in FramePoints._fields))
+            self._samples[frame] = _Sample(points, arrays["bins"][part], candidates)
 
     @functools.cached_property
     def threshold_bin(self) -> int:

@@ -33,6 +33,8 @@ class Reconstruction:
       depth_intrinsics: [N, 3, 3] float64, pixels of depth, confidence and image; centres at integers.
       image_size: (H, W) of the original images.
       depth_size: (h, w) of depth, confidence and image.
+      complete: False if the run was ended before the end of its source.
+      skipped: names of frames that could not be read and are left out.
       seconds: from the first frame to the last depth map, compilation included; None for a folder opened later.
     """
 
@@ -44,6 +46,8 @@ class Reconstruction:
     depth_intrinsics: np.ndarray
     image_size: tuple[int, int]
     depth_size: tuple[int, int]
+    complete: bool = True
+    skipped: tuple[str, ...] = ()
     seconds: float | None = None
 
     @classmethod
@@ -83,6 +87,8 @@ class Reconstruction:
             depth_intrinsics=stacked("depth_intrinsics"),
             image_size=tuple(document["image_size"]),
             depth_size=tuple(document["depth_size"]),
+            complete=document.get("complete", True),
+            skipped=tuple(frame["name"] for frame in document.get("skipped", ())),
         )
 
     @property
@@ -129,8 +135,11 @@ class Reconstruction:
         took = ""
         if self.seconds:
             took = f" in {self.seconds:.1f} s ({self.num_frames / self.seconds:.2f} frames/s)"
+        notes = [] if self.complete else ["ended early: the same command goes on from here"]
+        if self.skipped:
+            notes.append(f"{len(self.skipped)} frames left out: {', '.join(self.skipped[:5])}")
         return "\n".join(
-            [f"{self.num_frames} frames{took}", *(f"  {self.folder / name}: {what}" for name, what in lines)]
+            [f"{self.num_frames} frames{took}", *notes, *(f"  {self.folder / name}: {what}" for name, what in lines)]
         )
 
 

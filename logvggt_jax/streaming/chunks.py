@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 
 import jax
@@ -21,7 +21,8 @@ from logvggt_jax.errors import InputError
 from logvggt_jax.geometry import Similarity, robust_similarity, unproject_pixels
 from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.model.parameters import in_compute_type
-from logvggt_jax.streaming.offline import FinalFrames, PlainPrediction, predict_plain
+from logvggt_jax.streaming.offline import FinalFrames, PlainPrediction, plain_program, predict_plain
+from logvggt_jax.streaming.program import Program
 from logvggt_jax.streaming.results import Cameras, FrameResult, PredictionError, checked_frames, device_memory
 
 PredictChunk = Callable[[np.ndarray], PlainPrediction]
@@ -99,6 +100,20 @@ class ChunkChain:
         self._images, self._shared = [], None
         return last
 
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The images held and the last chunk's prediction of those it shares, for `restore`."""
+        arrays = {"images": np.stack(self._images), "first": np.array([self._first])} if self._images else {}
+        shared = {} if self._shared is None else self._shared._asdict()
+        return arrays | {f"shared/{name}": value for name, value in shared.items() if value is not None}
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Takes up what `arrays` gave."""
+        if "images" in arrays:
+            self._images, self._first = list(arrays["images"]), int(arrays["first"][0])
+        if "shared/depth" in arrays:
+            found = {name: arrays.get(f"shared/{name}") for name in PlainPrediction._fields}
+            self._shared = PlainPrediction(**found)  # type: ignore[arg-type]
+
     def _next_chunk(self) -> PlainPrediction:
         chunk = self._predict(np.stack(self._images))
         if self._shared is None:
@@ -112,6 +127,13 @@ class ChunkChain:
                 f"the one before on the {shared} frames they share ({error}); take larger chunks with more overlap"
             ) from error
         return move(chunk, similarity)
+
+
+def chunk_program(model: LogVGGT, image_size: tuple[int, int], plan: ChunkPlan, num_frames: int | None) -> Program:
+    """A full chunk, or the whole of a shorter sequence; all but the overlap become final with it."""
+    size = min(plan.size, num_frames or plan.size)
+    final = size - plan.overlap if size == plan.size else size
+    return plain_program(model, image_size, size)._replace(frames=final)
 
 
 class ChunkSession:
@@ -156,6 +178,18 @@ class ChunkSession:
         self._closed, self._newest = True, None
         with self._memory():
             return self._final.add(self._chain.close())
+
+    def snapshot(self) -> tuple[list[FrameResult], dict[str, np.ndarray]]:
+        """See `Predictor.snapshot`: the images of the chunk to come, and what the next is aligned with."""
+        final = {f"final/{name}": array for name, array in self._final.arrays().items()}
+        return [], {**final, **self._chain.arrays()}
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """See `Predictor.restore`."""
+        self._final.restore({name.removeprefix("final/"): x for name, x in arrays.items() if name.startswith("final/")})
+        self._chain.restore(arrays)
+        if "images" in arrays:
+            self._newest = arrays["images"][-1]
 
     def cameras(self) -> Cameras:
         """Cameras of the frames handed out so far; all are final."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import jax
@@ -14,6 +14,7 @@ from logvggt_jax.config import WindowConfig, require_counts
 from logvggt_jax.geometry import encode_poses
 from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.model.parameters import in_compute_type
+from logvggt_jax.streaming.program import Program, abstract_variables, flops_of
 from logvggt_jax.streaming.results import Cameras, FrameResult, PredictionError, checked_frames, device_memory
 
 
@@ -68,6 +69,14 @@ def _predict(model: LogVGGT, variables: Variables, images: jax.Array) -> PlainPr
     return jax.tree.map(lambda x: x[0], PlainPrediction(**wanted))
 
 
+def plain_program(model: LogVGGT, image_size: tuple[int, int], num_frames: int) -> Program:
+    """`predict_plain` of so many frames."""
+    plain, variables = plain_vggt(model, num_frames), abstract_variables(model.config)
+    images = jax.ShapeDtypeStruct((num_frames, *image_size, 3), np.uint8)
+    flops = flops_of(plain, lambda chosen: lambda v, i: chosen.apply(v, i[None]), variables, images)
+    return Program(_predict.lower(plain, variables, images), flops, num_frames)
+
+
 class FinalFrames:
     """Frames of plain VGGT that are handed out, and their cameras; all are final."""
 
@@ -100,6 +109,19 @@ class FinalFrames:
             )
             for i in range(len(encodings))
         ]
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All cameras added so far, for `restore`; nothing where there is none."""
+        if not len(self):
+            return {}
+        lists = {"encodings": self._encodings, "extrinsics": self._extrinsics, "intrinsics": self._intrinsics}
+        return {name: np.stack(values) for name, values in lists.items()}
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Takes up what `arrays` gave."""
+        self._encodings = list(arrays.get("encodings", ()))
+        self._extrinsics = list(arrays.get("extrinsics", ()))
+        self._intrinsics = list(arrays.get("intrinsics", ()))
 
     def cameras(self) -> Cameras:
         """Cameras of all frames added so far."""
@@ -169,6 +191,21 @@ class OfflineSession:
         ):
             return self._final.add(predict_plain(self._model, self._variables, np.stack(images)))
 
+    def snapshot(self) -> tuple[list[FrameResult], dict[str, np.ndarray]]:
+        """See `Predictor.snapshot`: the frames, since nothing is computed before the end."""
+        return [], {"images": np.stack(self._images)} if self._images else {}
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """See `Predictor.restore`."""
+        self._images = list(arrays.get("images", ()))
+
     def cameras(self) -> Cameras:
         """Cameras of the frames handed out so far."""
         return self._final.cameras()
+
+
+def offline_program(
+    model: LogVGGT, image_size: tuple[int, int], settings: OfflineSettings, num_frames: int | None
+) -> Program:
+    """All frames at once; of a sequence whose length is not known, as many as are allowed."""
+    return plain_program(model, image_size, num_frames or settings.max_frames or 1)

@@ -6,7 +6,7 @@ number is a number of the code that users run. A new method is a file of this fo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -14,10 +14,11 @@ import numpy as np
 
 from logvggt_jax.errors import InputError
 from logvggt_jax.model.logvggt import LogVGGT, Variables
-from logvggt_jax.streaming.chunks import ChunkPlan, ChunkSession
-from logvggt_jax.streaming.offline import OfflineSession, OfflineSettings
+from logvggt_jax.streaming.chunks import ChunkPlan, ChunkSession, chunk_program
+from logvggt_jax.streaming.offline import OfflineSession, OfflineSettings, offline_program
+from logvggt_jax.streaming.program import Program
 from logvggt_jax.streaming.results import Cameras, FrameResult
-from logvggt_jax.streaming.windows import StreamSession, WindowSettings
+from logvggt_jax.streaming.windows import StreamSession, WindowSettings, window_program
 
 
 class Predictor(Protocol):
@@ -45,6 +46,17 @@ class Predictor(Protocol):
         """Ends the sequence: the frames still held, oldest first. Afterwards every pose is final."""
         ...
 
+    def snapshot(self) -> tuple[list[FrameResult], dict[str, np.ndarray]]:
+        """Waits for the device; the frames that are final by now, oldest first, and what `restore` needs to go on.
+
+        A snapshot changes no number: a stream that goes on from one gives what it would have given.
+        """
+        ...
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Takes up a snapshot of the same method, model and settings; for a predictor that has seen no frame."""
+        ...
+
     def cameras(self) -> Cameras:
         """Cameras of the frames whose pose is final."""
         ...
@@ -58,12 +70,15 @@ class Method(NamedTuple):
       settings: the frozen dataclass of what can be set, all fields with defaults.
       trained_for: what its weights have to be trained for: `windows` (LoG-VGGT) or `vggt` (plain VGGT).
       summary: what the method does, in a few words.
+      program: model, (H, W) of the images, settings and number of frames (None: not known) to the program in which the
+        method spends its time.
     """
 
     open: Callable[[LogVGGT, Variables, Any], Predictor]
     settings: type
     trained_for: str
     summary: str
+    program: Callable[[LogVGGT, tuple[int, int], Any, int | None], Program]
 
 
 METHODS: dict[str, Method] = {
@@ -72,12 +87,21 @@ METHODS: dict[str, Method] = {
         WindowSettings,
         "windows",
         "LoG-VGGT: overlapping windows that hand tokens on, poses refined globally",
+        window_program,
     ),
     "offline": Method(
-        OfflineSession, OfflineSettings, "vggt", "plain VGGT: all frames in one window of full global attention"
+        OfflineSession,
+        OfflineSettings,
+        "vggt",
+        "plain VGGT: all frames in one window of full global attention",
+        offline_program,
     ),
     "chunks": Method(
-        ChunkSession, ChunkPlan, "vggt", "plain VGGT on overlapping chunks, chained by robust similarities"
+        ChunkSession,
+        ChunkPlan,
+        "vggt",
+        "plain VGGT on overlapping chunks, chained by robust similarities",
+        chunk_program,
     ),
 }
 

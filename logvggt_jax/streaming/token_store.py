@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Mapping
 from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from logvggt_jax.model.gccr import RegisterKeys
 
@@ -74,6 +76,24 @@ class TokenStore:
             wanted *= 2
         buffers = (self.camera, self.refined, self.registers)
         self.camera, self.refined, self.registers = _grown(buffers, room=wanted - self.capacity)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The stored frames and the capacity, on the host, for `restore`."""
+        found = {"camera": self.camera, "refined": self.refined}
+        if self.registers is not None:
+            found |= {"key": self.registers.key, "value": self.registers.value}
+        stored = {name: np.asarray(array[:, : self.count]) for name, array in found.items() if array is not None}
+        return {**stored, "capacity": np.array([self.capacity])}
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Takes up what `arrays` gave, in buffers of the same capacity, so that no program compiles for another."""
+        placed = {name: jnp.asarray(array) for name, array in arrays.items() if name != "capacity"}
+        self.camera, self.refined = placed["camera"], placed["refined"]
+        if "key" in placed:
+            self.registers = RegisterKeys(placed["key"], placed["value"])
+        self.count = self.camera.shape[1]
+        buffers = (self.camera, self.refined, self.registers)
+        self.camera, self.refined, self.registers = _grown(buffers, room=int(arrays["capacity"][0]) - self.count)
 
     def trim(self) -> None:
         """Gives back the room beyond the last frame, in steps of the first capacity."""

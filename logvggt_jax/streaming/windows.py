@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import NamedTuple
 
@@ -19,6 +19,7 @@ from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.model.parameters import in_compute_type
 from logvggt_jax.model.refinement import Span
 from logvggt_jax.model.windows import WindowState
+from logvggt_jax.streaming.program import Program, abstract_variables, flops_of
 from logvggt_jax.streaming.results import Cameras, FrameResult, checked_frames, decoded_cameras, device_memory
 from logvggt_jax.streaming.token_store import TokenStore
 from logvggt_jax.types import WindowOutput
@@ -69,6 +70,29 @@ def _fire_all(
     model: LogVGGT, variables: Variables, camera_tokens: jax.Array, registers: RegisterKeys | None, count: jax.Array
 ) -> jax.Array:
     return model.refinement.fire_all(variables, camera_tokens, registers, count[None])[0, :, -1]
+
+
+def window_program(
+    model: LogVGGT, image_size: tuple[int, int], settings: WindowSettings, num_frames: int | None
+) -> Program:
+    """The step of a stream whose frames are all real."""
+    plain, config = _without_refinement(model), model.config.windows
+    variables = abstract_variables(model.config)
+
+    def frames(count: int) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct((1, count, *image_size, 3), jnp.uint8)
+
+    state = jax.eval_shape(lambda v, f: plain.start(v, f, None), variables, frames(config.size - config.stride))
+    arguments = (variables, state, frames(config.stride))
+    flops = flops_of(plain, lambda chosen: lambda v, s, f: chosen.step(v, s, f, None), *arguments)
+    return Program(_step.lower(plain, *arguments, None), flops, config.stride)
+
+
+def _without_refinement(model: LogVGGT) -> LogVGGT:
+    """The model with one mode of refinement for all, so that sessions which differ in it share their programs: windows
+    know nothing of it."""
+    plain = dataclasses.replace(model.config.refinement, enabled=True, period=None, context=None)
+    return LogVGGT(dataclasses.replace(model.config, refinement=plain))
 
 
 class _Flight(NamedTuple):
@@ -140,9 +164,7 @@ class StreamSession:
         self._model, self._settings = model, WindowSettings(provisional, ahead, first_capacity)
         # Once, not at every call: cast, and brought to the device where they are numpy arrays.
         self._variables = jax.device_put(in_compute_type(variables, model.config))
-        # Windows know nothing of refinement: sessions that differ in its mode share their programs.
-        plain = dataclasses.replace(model.config.refinement, enabled=True, period=None, context=None)
-        self._windows = LogVGGT(dataclasses.replace(model.config, refinement=plain))
+        self._windows = _without_refinement(model)
         self._store = TokenStore(first_capacity=first_capacity)
         self._pending: list[np.ndarray] = []
         self._state: WindowState | None = None
@@ -207,6 +229,43 @@ class StreamSession:
             self._take_off(_finish(self._windows, self._variables, self._state))
             self._state = self._newest = None
             return self._landed(0)
+
+    def snapshot(self) -> tuple[list[FrameResult], dict[str, np.ndarray]]:
+        """See `Predictor.snapshot`: cache, held and compact tokens, poses, and frames not yet in a window."""
+        with self._memory():
+            results = self._landed(0)
+        if self._newest is None:
+            return results, {}
+        arrays = {f"tokens/{name}": array for name, array in self._store.arrays().items()} if self._store.count else {}
+        if self._state is not None:
+            fields = dataclasses.fields(self._state)
+            arrays |= {f"state/{field.name}": np.asarray(getattr(self._state, field.name)) for field in fields}
+        if self._pending:
+            arrays["pending"] = np.stack(self._pending)
+        counts = (self._received, self._refined, self._handed_out)
+        return results, {
+            **arrays,
+            "newest": self._newest,
+            "counts": np.array(counts, np.int64),
+            "encodings": self._encodings,
+        }
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """See `Predictor.restore`."""
+        if not arrays:
+            return
+        self._newest = arrays["newest"]
+        self._image_size = (self._newest.shape[0], self._newest.shape[1])
+        self._pending = list(arrays.get("pending", ()))
+        self._received, self._refined, self._handed_out = (int(count) for count in arrays["counts"])
+        self._encodings = arrays["encodings"]
+        if tokens := {name.removeprefix("tokens/"): x for name, x in arrays.items() if name.startswith("tokens/")}:
+            self._store.restore(tokens)
+        if fields := {name.removeprefix("state/"): x for name, x in arrays.items() if name.startswith("state/")}:
+            del fields["image_size"]
+            self._state = WindowState(
+                image_size=self._image_size, **{name: jnp.asarray(array) for name, array in fields.items()}
+            )
 
     def cameras(self, *, provisional: bool = False) -> Cameras:
         """Cameras of the frames whose pose is final; with `provisional` of all frames handed out."""

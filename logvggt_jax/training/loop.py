@@ -16,6 +16,7 @@ from logvggt_jax.compile import device_bytes, out_of_device_memory
 from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.data.feeding.batches import BatchIterator
 from logvggt_jax.errors import InputError, one_line
+from logvggt_jax.interruption import StopRequest
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.model.parameters import stack_layers
 from logvggt_jax.training.batches import open_sources, stage_batches
@@ -23,7 +24,6 @@ from logvggt_jax.training.checkpoints import Position, RunCheckpoints
 from logvggt_jax.training.config import StageConfig, TrainConfig
 from logvggt_jax.training.device_batches import DeviceBatches
 from logvggt_jax.training.initialization import initial_parameters
-from logvggt_jax.training.interruption import StopRequest
 from logvggt_jax.training.metrics_log import MetricsLog
 from logvggt_jax.training.processes import ASK_EVERY, any_process, check_agreement
 from logvggt_jax.training.program import make_program
@@ -56,7 +56,7 @@ def train(config: TrainConfig, workdir: Path, *, mesh: Mesh, resume_step: int | 
     for stage in config.stages:
         check_batch_size(stage, mesh)
     run = _Run(config, workdir, mesh)
-    with run.checkpoints, StopRequest() as stop:
+    with run.checkpoints, StopRequest("SIGTERM", "SIGINT") as stop:
         first, position = run.start(resume_step)
         check_agreement("the checkpoints", first)
         validation = None if config.validation is None else config.validation.source

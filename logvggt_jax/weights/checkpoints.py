@@ -140,6 +140,18 @@ def read_provenance(path_or_repo: str | Path) -> Provenance:
         return from_mapping(Provenance, description.get("provenance", {}), "provenance")
 
 
+def read_config(path: str | Path, *, dtype: str | None = None, point_head: bool = False) -> ModelConfig:
+    """The sizes of the model that `from_pretrained` would give; reads no parameter. `path` is local, see `resolve`."""
+    path = Path(path)
+    if path.is_dir() and _is_model_folder(path):
+        with _naming(path / "config.json"):
+            config = ModelConfig.from_dict(_read_description(path)["config"])
+    else:
+        with open_state_dict(path) as state_dict, _naming(path):
+            config = config_from_vggt(state_dict, point_head=point_head)
+    return config if dtype is None else dataclasses.replace(config, dtype=dtype)
+
+
 def from_pretrained(
     path_or_repo: str | Path, *, dtype: str | None = None, point_head: bool = False
 ) -> tuple[LogVGGT, dict[str, Any]]:

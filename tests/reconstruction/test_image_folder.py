@@ -383,23 +383,28 @@ def test_a_folder_of_broken_pictures_alone_is_refused(tmp_path: Path) -> None:
 def test_pictures_that_change_after_the_source_was_opened_are_told(tmp_path: Path) -> None:
     write_numbered(tmp_path, 3)
     source = open_source(tmp_path)
-    before = source.fingerprint()
+    before = source.fingerprint(3)
     write_image(tmp_path / "1.png", 9, (24, 30))
     assert names(source) == ["0", "2"] and "was 30 x 20" in source.skipped[0].reason
-    assert source.fingerprint() != before
+    assert source.fingerprint(3) != before and source.fingerprint(0)
     (tmp_path / "0.png").unlink()
     with pytest.raises(MissingInput, match=r"0\.png was there when the source was opened"):
         list(source)
     with pytest.raises(MissingInput, match=r"0\.png|No such file"):
-        source.fingerprint()
+        source.fingerprint(3)
 
 
 def test_the_fingerprint_covers_files_and_options(tmp_path: Path) -> None:
     write_numbered(tmp_path, 3)
-    digests = [open_source(tmp_path, **options).fingerprint() for options in ({}, {}, {"stride": 2})]
+    digests = [open_source(tmp_path, **options).fingerprint(2) for options in ({}, {"max_frames": 2}, {"stride": 2})]
     assert digests[0] == digests[1] != digests[2]
+    write_image(tmp_path / "3.png", 3, (10, 10))
+    cropped = [open_source(tmp_path, size_mismatch="crop", max_frames=n).fingerprint(2) for n in (3, 4)]
+    assert cropped[0] != cropped[1], "the last picture makes the others smaller"
+    (tmp_path / "3.png").unlink()
+    assert open_source(tmp_path).fingerprint(2) == digests[0]
     os.utime(tmp_path / "1.png", (0, 0))
-    assert open_source(tmp_path).fingerprint() != digests[0]
+    assert open_source(tmp_path).fingerprint(2) != digests[0]
 
 
 def test_heic_without_its_extra_is_left_out_with_a_note(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

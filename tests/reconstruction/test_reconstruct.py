@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import importlib
 import threading
 import weakref
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from recorder import Recorder, reconstruct_recorded
 
 from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.data.feeding.transforms import preprocess, resize
 from logvggt_jax.errors import DiskError
 from logvggt_jax.geometry import decode_poses, unproject
+from logvggt_jax.reconstruction import run as run_module
 from logvggt_jax.reconstruction.cameras_file import read_cameras
 from logvggt_jax.reconstruction.depth_files import read_depth
 from logvggt_jax.reconstruction.exporters.tum import read_trajectory
@@ -24,14 +24,9 @@ from logvggt_jax.reconstruction.reconstruct import reconstruct
 from logvggt_jax.reconstruction.result import Reconstruction
 from logvggt_jax.reconstruction.room_sequence import write_room_sequence
 from logvggt_jax.reconstruction.sources import open_source
-from logvggt_jax.streaming import METHODS, Method, WindowSettings
 from logvggt_jax.streaming.chunks import ChunkPlan
 from logvggt_jax.streaming.offline import predict_plain
-from logvggt_jax.streaming.results import Cameras, FrameResult, decoded_cameras
 from logvggt_jax.streaming.windows import StreamSession
-
-# The package exports a function of the module's name.
-reconstruct_module = importlib.import_module("logvggt_jax.reconstruction.reconstruct")
 
 COUNT, LONGER_EDGE = 7, 42
 
@@ -199,19 +194,18 @@ def test_a_limit_on_points_holds(model: LogVGGT, variables: dict, room: Path, tm
     assert read_trajectory(tmp_path / "out" / "trajectory.txt")[0].tolist() == [0, 2, 4]
 
 
-@pytest.mark.parametrize("broken", [1, 6])
-def test_a_broken_frame_leaves_nothing_behind(
-    model: LogVGGT, variables: dict, room: Path, tmp_path: Path, broken: int
+def test_a_source_that_breaks_off_before_anything_is_final_leaves_nothing_behind(
+    model: LogVGGT, variables: dict, room: Path, tmp_path: Path
 ) -> None:
     source = tmp_path / "source"
     source.mkdir()
     for file in room.glob("*.color.png"):
         (source / file.name).write_bytes(file.read_bytes())
-    path = source / f"frame-{broken:06d}.color.png"
+    path = source / "frame-000001.color.png"
     path.write_bytes(path.read_bytes()[:200])
     with pytest.raises(ValueError, match=path.name):
         reconstruct(
-            source,
+            open_source(source, strict=True),
             tmp_path / "out",
             model=model,
             variables=variables,
@@ -219,44 +213,6 @@ def test_a_broken_frame_leaves_nothing_behind(
             progress=False,
         )
     assert [entry.name for entry in tmp_path.iterdir()] == ["source"]
-
-
-class Recorder:
-    """A predictor of two frames at a time whose depth follows from the frames' numbers alone."""
-
-    def __init__(self) -> None:
-        self.frames: list[np.ndarray] = []
-        self.threads: set[int] = set()
-        self.num_frames = 0
-
-    def push(self, frame: np.ndarray) -> list[FrameResult]:
-        self.threads.add(threading.get_ident())
-        self.frames.append(frame)
-        return self.close() if len(self.frames) == 2 else []
-
-    def close(self) -> list[FrameResult]:
-        results = []
-        for frame in self.frames:
-            generator = np.random.default_rng(self.num_frames)
-            depth = generator.uniform(1, 1.2, frame.shape[:2]).astype(np.float32)
-            results.append(FrameResult(self.num_frames, depth, 1 + depth**9, None, False, None, None))
-            self.num_frames += 1
-        self.frames = []
-        return results
-
-    def cameras(self) -> Cameras:
-        encodings = np.tile(np.array([0, 0, 0, 0, 0, 0, 1, 1, 1.2], np.float32), (self.num_frames, 1))
-        encodings[:, 0] = np.arange(self.num_frames)
-        return decoded_cameras(encodings, (28, 42), final=self.num_frames)
-
-
-def reconstruct_recorded(predictor: Recorder, source: Path, output: Path, **options: Any) -> Reconstruction:
-    """A reconstruction by a method whose predictor this is."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(METHODS, "recorder", Method(lambda *_: predictor, WindowSettings, "windows", "records"))
-        return reconstruct(
-            source, output, model=LogVGGT(), variables={}, method="recorder", longer_edge=LONGER_EDGE, **options
-        )
 
 
 @pytest.fixture
@@ -292,14 +248,14 @@ def test_a_full_disk_stops_the_run_with_its_own_error(
     walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, written: str
 ) -> None:
     """What a worker cannot write is raised where frames are fed, long before the end, and nothing is left."""
-    original = getattr(reconstruct_module, written)
+    original = getattr(run_module, written)
 
     def failing(path: Path, *arrays: np.ndarray) -> object:
         if path.stem == "003":
             raise DiskError(f"{path}: No space left on device")
         return original(path, *arrays)
 
-    monkeypatch.setattr(reconstruct_module, written, failing)
+    monkeypatch.setattr(run_module, written, failing)
     predictor = Recorder()
     with pytest.raises(DiskError, match=r"003\.\w+: No space left"):
         reconstruct_recorded(predictor, walk, tmp_path / "out", progress=False, workers=1)
@@ -336,7 +292,7 @@ def test_each_frame_is_resized_once_and_few_are_alive(
         alive.append(sum(reference() is not None for reference in made))
         return image, transform
 
-    monkeypatch.setattr(reconstruct_module, "resize", watched)
+    monkeypatch.setattr(run_module, "resize", watched)
     reconstruct_recorded(Recorder(), walk, tmp_path / "out", progress=False, workers=2)
     assert len(made) == 40
     # Six ahead, two in the predictor, one in either worker.

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from logvggt_jax.errors import InputError
+from logvggt_jax.interruption import StopRequest
 from logvggt_jax.training import loop
 from logvggt_jax.training.checkpoints import Position, RunCheckpoints
 from logvggt_jax.training.config import SourceConfig, TrainConfig, ValidationConfig
-from logvggt_jax.training.interruption import StopRequest
 from logvggt_jax.training.loop import NonFiniteTraining, train
 from logvggt_jax.training.metrics_log import MetricsLog, read_metrics
 from logvggt_jax.training.sharding import data_mesh
@@ -111,7 +111,7 @@ def test_second_ctrl_c_is_not_held_back() -> None:
     # A job started in the background may ignore SIGINT, and then a second one is ignored as well.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        with StopRequest() as stop:
+        with StopRequest("SIGTERM", "SIGINT") as stop:
             os.kill(os.getpid(), signal.SIGINT)
             assert stop.reason == "SIGINT"
             with pytest.raises(KeyboardInterrupt):

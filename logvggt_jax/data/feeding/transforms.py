@@ -112,13 +112,19 @@ def resize(
     height, width = frame.shape[:2]
     if not height or not width:
         raise ValueError(f"{name} is empty: its size is {(height, width)}")
-    longer = max(height, width)
-    rows, columns = (
-        longer_edge if edge == longer else max(PATCH, PATCH * round(edge * longer_edge / longer / PATCH))
-        for edge in (height, width)
-    )
+    rows, columns = resized_size((height, width), longer_edge)
     resized = Image.fromarray(frame).resize((columns, rows), Image.Resampling.BICUBIC)
     return np.asarray(resized), ResizeTransform(original_size=(height, width), size=(rows, columns))
+
+
+def resized_size(size: tuple[int, int], longer_edge: int) -> tuple[int, int]:
+    """(h, w) that `preprocess` gives to pictures of (H, W) pixels."""
+    longer = max(size)
+    rows, columns = (
+        longer_edge if edge == longer else max(PATCH, PATCH * round(edge * longer_edge / longer / PATCH))
+        for edge in size
+    )
+    return rows, columns
 
 
 def nearest_size(size: tuple[int, int], sizes: Sequence[tuple[int, int]]) -> tuple[int, int]:

@@ -156,23 +156,6 @@ def time_part(part: Part, variables: Any, *, rounds: int = 3, least_seconds: flo
     )
 
 
-def matmul_flops_per_second(dtype: str, *, size: int | None = None, rounds: int = 5) -> float:
-    """The fastest of `rounds` large products of square matrices of `dtype`: a peak that programs can be held against.
-
-    `size` is their side; None takes 1536 on CPUs and 8192 elsewhere.
-    """
-    side = size or (1536 if jax.default_backend() == "cpu" else 8192)
-    factor = jnp.ones((side, side), dtype)
-    product = jax.jit(lambda x: x @ x)
-    jax.block_until_ready(product(factor))
-    seconds = []
-    for _ in range(rounds):
-        started = time.perf_counter()
-        jax.block_until_ready(product(factor))
-        seconds.append(time.perf_counter() - started)
-    return 2 * side**3 / min(seconds)
-
-
 def peak_device_bytes() -> int | None:
     """Most bytes in use on the default device so far; None where the back end does not say (CPU)."""
     statistics_ = jax.devices()[0].memory_stats() or {}

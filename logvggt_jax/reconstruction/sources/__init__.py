@@ -9,10 +9,10 @@ from logvggt_jax.errors import InputError, MissingInput
 from logvggt_jax.reconstruction.sources.image_folder import FolderSource
 from logvggt_jax.reconstruction.sources.listing import names_pictures
 from logvggt_jax.reconstruction.sources.pictures import IMAGE_SUFFIXES
-from logvggt_jax.reconstruction.sources.source import Source, SourceFrame, SourceOptions
+from logvggt_jax.reconstruction.sources.source import SkippedFrame, Source, SourceFrame, SourceOptions
 from logvggt_jax.reconstruction.sources.video import VideoSource
 
-__all__ = ["FolderSource", "Source", "SourceFrame", "SourceOptions", "VideoSource", "open_source"]
+__all__ = ["FolderSource", "SkippedFrame", "Source", "SourceFrame", "SourceOptions", "VideoSource", "open_source"]
 
 
 def open_source(path: str | Path, **options: Any) -> Source:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import json
 import threading
 import unicodedata
 from collections import Counter
@@ -87,10 +89,13 @@ class FolderSource(Source):
         """(H, W) of the upright images, after cropping."""
         return self._size
 
-    def fingerprint(self) -> str:
-        """Digest of options and files."""
+    def fingerprint(self, count: int) -> str:
+        """See `Source.fingerprint`. What files further on may change, as sizes and time stamps, is part of it."""
+        pictures = self._pictures[:count]
         with disk_errors(self.path):
-            return fingerprint(self.options, [picture.file for picture in self._pictures])
+            of_files = fingerprint(self.options, [picture.file for picture in pictures])
+        text = json.dumps([of_files, self._size, [(picture.name, picture.timestamp) for picture in pictures]])
+        return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
     def loaders(self, first: int = 0) -> Iterator[Callable[[], SourceFrame | None]]:
         """See `Source.loaders`; pictures before the first are not read."""

@@ -6,7 +6,7 @@ import abc
 import dataclasses
 import hashlib
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -110,8 +110,9 @@ class Source(abc.ABC):
         """(H, W) of the frames as they will be handed out; None where it is known with the first frame only."""
 
     @abc.abstractmethod
-    def fingerprint(self) -> str:
-        """Digest of what decides the frames: options, and names, sizes and times of change of the files."""
+    def fingerprint(self, count: int) -> str:
+        """Digest of what decides the first `count` loaders' frames: options, and names, sizes and times of change of
+        their files. More frames may follow than last time."""
 
     @abc.abstractmethod
     def loaders(self, first: int = 0) -> Iterator[Callable[[], SourceFrame | None]]:
@@ -122,8 +123,9 @@ class Source(abc.ABC):
         """
 
 
-def fingerprint(options: SourceOptions, files: list[Path]) -> str:
+def fingerprint(options: SourceOptions, files: Sequence[Path]) -> str:
     """Digest of options and files, see `Source.fingerprint`."""
-    stated = [(str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
-    text = json.dumps([dataclasses.asdict(options), stated])
+    stated = [(str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
+    # Where a sequence ends says nothing of the frames before.
+    text = json.dumps([{**dataclasses.asdict(options), "max_frames": None, "end": None}, stated])
     return hashlib.blake2b(text.encode(errors="surrogateescape"), digest_size=16).hexdigest()

@@ -51,7 +51,7 @@ class VideoSource(Source):
         """(H, W) of the frames."""
         return None
 
-    def fingerprint(self) -> str:
+    def fingerprint(self, count: int) -> str:
         """Digest of options and file."""
         return fingerprint(self.options, [self.path])
 

@@ -14,11 +14,10 @@ from logvggt_jax.evaluation.costs.parts import (
     abstract_variables,
     flops_by_part,
     live_device_bytes,
-    matmul_flops_per_second,
     sequence_parts,
     time_part,
 )
-from logvggt_jax.operations import count_flops
+from logvggt_jax.operations import count_flops, matmul_flops_per_second
 
 ROOT = Path(__file__).parents[2]
 TINY_SIZE = (56, 70)

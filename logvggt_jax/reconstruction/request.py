@@ -1,0 +1,146 @@
+"""What can be checked before a model is loaded: output, free space, size; and what a run will need."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from logvggt_jax.config import ModelConfig
+from logvggt_jax.data.feeding.transforms import check_longer_edge, resized_size
+from logvggt_jax.errors import DiskError, InputError
+from logvggt_jax.files import check_output
+from logvggt_jax.model.logvggt import LogVGGT
+from logvggt_jax.operations import matmul_flops_per_second
+from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE
+from logvggt_jax.reconstruction.point_cloud import VERTEX, PointFilter
+from logvggt_jax.reconstruction.sources import Source
+from logvggt_jax.reconstruction.work_folder import is_unfinished
+from logvggt_jax.streaming import METHODS
+from logvggt_jax.streaming.program import abstract_variables
+
+# Of a photograph at the quality that images are kept at, measured on 7-Scenes and procedural rooms; noise takes more.
+_JPEG_BYTES_PER_PIXEL = 1.0
+# Depth and confidence, float16.
+_DEPTH_BYTES_PER_PIXEL = 4.0
+# Of the rate of large matrix products; an H100 reaches half, see the README.
+_REACHED = 1 / 3
+
+
+def check_request(source: Source, output: str | Path, *, longer_edge: int | None, overwrite: bool) -> Path:
+    """The absolute path of the output, if `reconstruct` can begin; for callers that want to know before they load a
+    large model. Arguments and errors as in `reconstruct`.
+    """
+    if longer_edge is not None:
+        check_longer_edge(longer_edge)
+    target = Path(output).expanduser().resolve()
+    if target in (source.path.resolve(), *source.path.resolve().parents):
+        raise InputError(f"output {output} contains the source {source.path}: choose another output")
+    if overwrite or not is_unfinished(target):
+        check_output(target, overwrite=overwrite, marker=CAMERAS_FILE)
+    parent = existing_parent(target)
+    if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
+        raise DiskError(f"{parent}: no folder can be made there; choose another output or mend its permissions")
+    return target
+
+
+def disk_bytes(num_frames: int | None, size: tuple[int, int], point_filter: PointFilter) -> tuple[int, int]:
+    """Bytes that a result of frames of `size` (h, w) needs on the disk: a frame, and in all (None: of one frame)."""
+    height, width = size
+    frame = int(height * width * (_JPEG_BYTES_PER_PIXEL + _DEPTH_BYTES_PER_PIXEL))
+    frames = num_frames or 1
+    pixels = frames * height * width // point_filter.pixel_stride**2
+    points = min(pixels, point_filter.max_points or pixels) * VERTEX.itemsize
+    return frame, frames * frame + points
+
+
+def check_free_space(output: Path, needed: int) -> int:
+    """Free bytes where `output` will lie; InputError where they are fewer than `needed`."""
+    parent = existing_parent(output)
+    free = shutil.disk_usage(parent).free
+    if free < needed:
+        raise InputError(
+            f"{parent}: {free / 1e9:.1f} GB are free, about {needed / 1e9:.1f} GB are needed; make room, choose "
+            "another output, or take fewer frames (--stride, --max-frames) or a smaller --longer-edge"
+        )
+    return free
+
+
+@dataclasses.dataclass(frozen=True)
+class DeviceNeeds:
+    """What a method's program needs on the device at hand.
+
+    Attributes:
+      parameters: bytes.
+      working: bytes of everything else while it runs, by the compiler's account; None where it does not say.
+      seconds_a_frame: an estimate, as if a third of the rate of a large matrix product were reached.
+    """
+
+    parameters: int
+    working: int | None
+    seconds_a_frame: float
+
+
+def describe(
+    source: Source,
+    output: Path,
+    config: ModelConfig | None,
+    method: str,
+    settings: Any,
+    longer_edge: int,
+    point_filter: PointFilter,
+) -> list[str]:
+    """Frames, size and disk of a run in a few lines; with the model's sizes also memory and time on the device at hand.
+
+    Raises:
+      InputError: the disk is too small.
+    """
+    frames = source.expected_frames
+    count = "an unknown number of" if frames is None else f"{frames:,}"
+    if source.image_size is None:
+        return [f"{count} frames of a size that is known with the first one; method {method}"]
+    size = resized_size(source.image_size, longer_edge)
+    frame, whole = disk_bytes(frames, size, point_filter)
+    free = check_free_space(output, whole)
+    needed = f"{whole / 1e9:.2f} GB" if frames is not None else f"{frame / 1e6:.1f} MB a frame"
+    original = "x".join(map(str, source.image_size[::-1]))
+    lines = [
+        f"{count} frames of {original} pixels, {size[1]}x{size[0]} for the model; method {method}",
+        f"disk: about {needed}, {free / 1e9:.1f} GB are free at {existing_parent(output)}",
+    ]
+    if config is not None:
+        needs = device_needs(method, LogVGGT(config), settings, size, frames)
+        kept = "" if needs.working is None else f", {needs.working / 1e9:.2f} GB to work with"
+        lines.append(f"device ({jax.devices()[0].device_kind}): {needs.parameters / 1e9:.2f} GB of parameters{kept}")
+        seconds = needs.seconds_a_frame
+        lines.append(
+            f"time: about {seconds:.2g} s a frame"
+            + ("" if frames is None else f", {frames * seconds / 60:.1f} minutes in all")
+            + ", as if the device reached a third of its rate for matrix products; compilation comes first"
+        )
+    return lines
+
+
+def device_needs(
+    method: str, model: LogVGGT, settings: Any, size: tuple[int, int], num_frames: int | None
+) -> DeviceNeeds:
+    """Compiles the method's program for images of `size` (h, w); the compilation cache keeps it for the run itself."""
+    chosen = METHODS[method]
+    program = chosen.program(model, size, chosen.settings() if settings is None else settings, num_frames)
+    parameters = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(abstract_variables(model.config)))
+    memory: Any = program.lowered.compile().memory_analysis()
+    working = None
+    if memory is not None:
+        whole = memory.argument_size_in_bytes + memory.output_size_in_bytes + memory.temp_size_in_bytes
+        working = whole - memory.alias_size_in_bytes - parameters
+    rate = _REACHED * matmul_flops_per_second(model.config.dtype)
+    return DeviceNeeds(parameters, working, program.flops / program.frames / rate)
+
+
+def existing_parent(path: Path) -> Path:
+    """The innermost folder above `path` that is there."""
+    return next(parent for parent in path.parents if parent.exists())

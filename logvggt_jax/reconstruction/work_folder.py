@@ -1,0 +1,183 @@
+"""The folder in which a reconstruction grows, so that a run that ends early can be taken up where it was."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NamedTuple
+
+import numpy as np
+from filelock import FileLock, Timeout
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+
+from logvggt_jax.errors import InputError, OutputExists, disk_errors, one_line
+from logvggt_jax.files import atomic_file, check_output, write_text
+from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE, is_complete
+
+_PROGRESS = ".progress"
+_REQUEST, _STATE, _LOCK, _OWNER = "request.json", "state.safetensors", "lock", "owner"
+_MEND = "pass --overwrite to start anew"
+
+
+class Progress(NamedTuple):
+    """Where a run was: arrays by name, and what else there is to know, as JSON takes it."""
+
+    arrays: dict[str, np.ndarray]
+    facts: dict[str, Any]
+
+
+class WorkFolder:
+    """`<output>.partial`, which one run at a time fills and which becomes `output` at the end.
+
+    What was asked for and how far the work has come lie in its `.progress`. The same request takes up what another
+    run has left; another request is refused, so that nobody's frames are lost unasked. The lock goes with its process,
+    however that ends.
+
+    Args:
+      output: absolute path of the result.
+      request: what decides the result, names to strings.
+      overwrite: begin anew whatever is there, and replace `output` at the end.
+
+    Raises:
+      OutputExists: a result is at `output`, or an unfinished one of another request beside it.
+      InputError: another run is at work there.
+    """
+
+    def __init__(self, output: Path, request: Mapping[str, str], *, overwrite: bool) -> None:
+        self._output, self._request, self._overwrite = output, dict(request), overwrite
+        self.path = work_path(output)
+        self._progress = self.path / _PROGRESS
+        self._lock = FileLock(self._progress / _LOCK)
+
+    def __enter__(self) -> WorkFolder:
+        with disk_errors(self.path):
+            if not self._overwrite and is_unfinished(self._output) and not self.path.exists():
+                _check_request(self._output, self._request)
+                self._output.rename(self.path)
+            check_output(self._output, overwrite=self._overwrite, marker=CAMERAS_FILE)
+            if self.path.exists() and not self._progress.is_dir() and any(self.path.iterdir()):
+                raise OutputExists(f"{self.path} is in the way and was not made by this program: move it elsewhere")
+            self._progress.mkdir(parents=True, exist_ok=True)
+            try:
+                self._lock.acquire(timeout=0)
+            except Timeout:
+                raise InputError(f"{self.path}: {_owner(self._progress)} is writing there; let it end first") from None
+        try:
+            with disk_errors(self.path):
+                self._take_over()
+        except BaseException:
+            self._lock.release()
+            raise
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: object, trace: TracebackType | None) -> None:
+        """Lets go of the folder; without a saved state nobody can use it, and it goes."""
+        if self._progress.is_dir() and not (self._progress / _STATE).is_file():
+            shutil.rmtree(self.path, ignore_errors=True)
+        self._lock.release()
+
+    def _take_over(self) -> None:
+        stored = self._progress / _REQUEST
+        if stored.exists() and not self._overwrite:
+            _check_request(self.path, self._request)
+        if self._overwrite or not (self._progress / _STATE).is_file():
+            for entry in self.path.iterdir():
+                if entry != self._progress:
+                    shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+            (self._progress / _STATE).unlink(missing_ok=True)
+        write_text(stored, json.dumps(self._request, indent=1))
+        write_text(self._progress / _OWNER, f"process {os.getpid()} on {os.uname().nodename}")
+
+    def saved(self) -> Progress | None:
+        """What the last `save` stored; None for a new run. InputError where the file is damaged."""
+        file = self._progress / _STATE
+        if not file.is_file():
+            return None
+        try:
+            with disk_errors(file), safe_open(file, "numpy") as stored:
+                described = stored.metadata()
+                arrays = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118
+            if described["digest"] != _digest(described["facts"], arrays):
+                raise ValueError("its digest differs")
+        except (SafetensorError, ValueError, KeyError, TypeError) as error:
+            if isinstance(error, InputError):
+                raise
+            raise InputError(f"{file}: damaged ({one_line(error)}); {_MEND}") from error
+        return Progress(arrays, json.loads(described["facts"]))
+
+    def save(self, progress: Progress, files: Iterable[Path]) -> None:
+        """Stores where the run is, once what it rests on, `files`, is on the disk."""
+        with disk_errors(self.path):
+            for file in files:
+                _to_disk(file)
+        arrays = {name: np.ascontiguousarray(array) for name, array in progress.arrays.items()}
+        facts = json.dumps(progress.facts)
+        with atomic_file(self._progress / _STATE) as temporary:
+            save_file(arrays, temporary, metadata={"facts": facts, "digest": _digest(facts, arrays)})
+            _to_disk(temporary)
+
+    def commit(self, *, complete: bool) -> None:
+        """Puts the folder in the result's place; an incomplete one can still be taken up."""
+        with disk_errors(self._output):
+            aside = self._output.with_name(f".{self._output.name}.{os.getpid()}.old")
+            if self._output.exists():
+                check_output(self._output, overwrite=self._overwrite, marker=CAMERAS_FILE)
+                self._output.rename(aside)
+            self.path.rename(self._output)
+        shutil.rmtree(aside, ignore_errors=True)
+        if complete:
+            shutil.rmtree(self._output / _PROGRESS, ignore_errors=True)
+
+
+def work_path(output: Path) -> Path:
+    """Where the work on a result lies until it is finished."""
+    return output.with_name(f"{output.name}.partial")
+
+
+def is_unfinished(folder: Path) -> bool:
+    """Whether a result folder was left early and can be taken up."""
+    return (folder / _PROGRESS / _STATE).is_file() and not is_complete(folder / CAMERAS_FILE)
+
+
+def _check_request(folder: Path, request: Mapping[str, str]) -> None:
+    file = folder / _PROGRESS / _REQUEST
+    try:
+        stored = json.loads(file.read_text())
+        others = sorted(name for name in stored.keys() | request.keys() if stored.get(name) != request.get(name))
+    except (ValueError, AttributeError) as error:
+        raise InputError(f"{file}: damaged ({one_line(error)}); {_MEND}") from error
+    if others:
+        raise OutputExists(
+            f"{folder} holds an unfinished reconstruction that differs in {', '.join(others)}; give its options to go "
+            f"on with it, choose another output, or {_MEND}"
+        )
+
+
+def _owner(progress: Path) -> str:
+    try:
+        return (progress / _OWNER).read_text()
+    except OSError:
+        return "another run"
+
+
+def _digest(facts: str, arrays: Mapping[str, np.ndarray]) -> str:
+    digest = hashlib.blake2b(facts.encode(), digest_size=16)
+    for name in sorted(arrays):
+        digest.update(f"{name} {arrays[name].dtype.name} {arrays[name].shape}".encode())
+        digest.update(arrays[name].tobytes())
+    return digest.hexdigest()
+
+
+def _to_disk(file: Path) -> None:
+    """Survives a loss of power from here on."""
+    descriptor = os.open(file, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

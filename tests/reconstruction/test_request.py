@@ -1,0 +1,71 @@
+"""What can be known before the weights are read is known, and stands to what a run then does."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+import pytest
+from PIL import Image
+from recorder import LONGER_EDGE, Recorder, reconstruct_recorded
+
+from logvggt_jax import LogVGGT, ModelConfig
+from logvggt_jax.errors import DiskError, InputError
+from logvggt_jax.reconstruction import PointFilter, open_source
+from logvggt_jax.reconstruction.request import check_free_space, check_request, device_needs, disk_bytes
+from logvggt_jax.streaming import METHODS, ChunkPlan
+
+
+@pytest.fixture
+def walk(tmp_path: Path) -> Path:
+    """Twelve frames of noise, which compresses worse than any photograph."""
+    folder = tmp_path / "walk"
+    folder.mkdir()
+    pictures = np.random.default_rng(0).integers(0, 256, (12, 112, 168, 3), np.uint8)
+    for index, picture in enumerate(pictures):
+        Image.fromarray(picture).save(folder / f"{index:03d}.png")
+    return folder
+
+
+def test_a_result_fits_into_what_was_estimated(walk: Path, tmp_path: Path) -> None:
+    result = reconstruct_recorded(Recorder(), walk, tmp_path / "out", num_previews=0, progress=False)
+    written = sum(file.stat().st_size for file in result.folder.rglob("*") if file.is_file())
+    _, estimate = disk_bytes(12, result.depth_size, PointFilter())
+    # At so few pixels the names and headers of files weigh as much as what is in them.
+    overhead = 12 * 700 + 12_000
+    assert estimate * 0.5 < written < estimate * 1.25 + overhead
+    assert disk_bytes(None, (392, 518), PointFilter())[0] == 392 * 518 * 5
+
+
+def test_a_disk_that_is_too_small_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=3_000_000_000))
+    assert check_free_space(tmp_path / "new" / "out", 2_900_000_000) == 3_000_000_000
+    with pytest.raises(InputError, match=r"3\.0 GB are free, about 4\.5 GB are needed.*--stride"):
+        check_free_space(tmp_path / "new" / "out", 4_500_000_000)
+
+
+def test_an_output_that_cannot_be_made_is_refused(walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").write_text("x")
+    source = open_source(walk)
+    options = {"longer_edge": LONGER_EDGE, "overwrite": False}
+    assert check_request(source, tmp_path / "new" / "out", **options) == tmp_path / "new" / "out"
+    with pytest.raises(DiskError, match=r"file: no folder can be made there"):
+        check_request(source, tmp_path / "file" / "out", **options)
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    with pytest.raises(DiskError, match="permissions"):
+        check_request(source, tmp_path / "new" / "out", **options)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_device_needs_its_parameters_and_something_to_work_with(small_config: ModelConfig, method: str) -> None:
+    model = LogVGGT(small_config)
+    settings = ChunkPlan(4, 2) if method == "chunks" else None
+    needs = device_needs(method, model, settings, (28, 42), 6)
+    shapes = jax.eval_shape(model.init, jax.random.key(0), np.zeros((1, 1, 28, 42, 3), np.float32))
+    assert needs.parameters == 4 * sum(leaf.size for leaf in jax.tree.leaves(shapes))
+    assert needs.working is not None and needs.working > 28 * 42 * 4
+    assert 0 < needs.seconds_a_frame < 60

@@ -1,0 +1,304 @@
+"""What is final is never lost: a run that ended early is taken up where it was and gives the same bytes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from recorder import LONGER_EDGE, Recorder, reconstruct_recorded
+
+from logvggt_jax import LogVGGT, ModelConfig
+from logvggt_jax.errors import InputError, OutputExists
+from logvggt_jax.interruption import Interrupted
+from logvggt_jax.reconstruction import PointFilter, Reconstruction, open_source, reconstruct
+from logvggt_jax.reconstruction.work_folder import Progress, WorkFolder
+from logvggt_jax.streaming import ChunkPlan
+from logvggt_jax.streaming.chunks import ChunkSession
+from logvggt_jax.streaming.windows import StreamSession
+
+COUNT, THINNED = 12, PointFilter(max_points=3000)
+
+
+@pytest.fixture(autouse=True)
+def saved_after_every_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With `save_seconds=0`, whatever the share of the time that saving takes."""
+    monkeypatch.setattr("logvggt_jax.reconstruction.run._SAVING", 1e9)
+
+
+@pytest.fixture
+def walk(tmp_path: Path) -> Path:
+    """Twelve frames of noise."""
+    folder = tmp_path / "walk"
+    folder.mkdir()
+    pictures = np.random.default_rng(0).integers(0, 256, (COUNT, 28, 42, 3), np.uint8)
+    for index, picture in enumerate(pictures):
+        Image.fromarray(picture).save(folder / f"{index:03d}.png")
+    return folder
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+
+
+def run(predictor: Recorder, walk: Path, output: Path, **options: object) -> Reconstruction:
+    options = {"point_filter": THINNED, "save_seconds": 0.0, "progress": False, **options}
+    return reconstruct_recorded(predictor, walk, output, **options)
+
+
+def die_at(frame: int) -> Callable[[int], None]:
+    def on_push(count: int) -> None:
+        if count == frame:
+            raise KeyboardInterrupt
+
+    return on_push
+
+
+def send_at(frame: int, *signals: int) -> Callable[[int], None]:
+    def on_push(count: int) -> None:
+        if count == frame:
+            for number in signals:
+                os.kill(os.getpid(), number)
+
+    return on_push
+
+
+@pytest.fixture
+def straight(walk: Path, tmp_path: Path) -> dict[str, bytes]:
+    return contents(run(Recorder(), walk, tmp_path / "straight").folder)
+
+
+def test_a_run_that_died_twice_gives_the_bytes_of_one_that_did_not(
+    walk: Path, tmp_path: Path, straight: dict[str, bytes]
+) -> None:
+    output = tmp_path / "out"
+    for frame in (6, 4):
+        with pytest.raises(KeyboardInterrupt):
+            run(Recorder(die_at(frame)), walk, output)
+        assert not output.exists()
+    last = Recorder()
+    run(last, walk, output)
+    assert last.num_pushed == COUNT - 5 - 3
+    assert contents(output) == straight
+    assert not (tmp_path / "out.partial").exists()
+
+
+@pytest.mark.filterwarnings("ignore:.*no field of view")
+@pytest.mark.parametrize("method", ["windows", "chunks"])
+def test_the_model_goes_on_with_the_same_numbers(
+    method: str, small_config: ModelConfig, small_variables: dict, walk: Path, tmp_path: Path, monkeypatch
+) -> None:
+    def reconstructed(output: Path) -> dict[str, bytes]:
+        return contents(
+            reconstruct(
+                walk,
+                output,
+                model=LogVGGT(small_config),
+                variables=small_variables,
+                method=method,
+                settings=ChunkPlan(4, 2) if method == "chunks" else None,
+                longer_edge=LONGER_EDGE,
+                point_filter=THINNED,
+                progress=False,
+                save_seconds=0.0,
+            ).folder
+        )
+
+    straight = reconstructed(tmp_path / "straight")
+    session = {"windows": StreamSession, "chunks": ChunkSession}[method]
+    original, pushed = session.push, []
+
+    def push(self, frame: np.ndarray) -> list:
+        pushed.append(frame)
+        if len(pushed) == 8:
+            raise KeyboardInterrupt
+        return original(self, frame)
+
+    monkeypatch.setattr(session, "push", push)
+    with pytest.raises(KeyboardInterrupt):
+        reconstructed(tmp_path / "out")
+    assert reconstructed(tmp_path / "out") == straight
+    assert len(pushed) == COUNT + 1
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_saves_and_ends(walk: Path, tmp_path: Path, straight: dict[str, bytes], number: int) -> None:
+    output = tmp_path / "out"
+    with pytest.raises(Interrupted, match=r"4 frames are kept in .*out\.partial") as caught:
+        run(Recorder(send_at(5, number)), walk, output, save_seconds=1e9)
+    assert caught.value.signal == signal.Signals(number).name
+    assert not output.exists()
+    last = Recorder()
+    run(last, walk, output)
+    assert last.num_pushed == COUNT - 5
+    assert contents(output) == straight
+
+
+def test_ctrl_c_leaves_a_valid_result_that_can_be_taken_up(
+    walk: Path, tmp_path: Path, straight: dict[str, bytes]
+) -> None:
+    output = tmp_path / "out"
+    result = run(Recorder(send_at(5, signal.SIGINT)), walk, output, save_seconds=1e9)
+    assert not result.complete and not Reconstruction.open(output).complete
+    assert result.num_frames == 5 and result.num_points > 0
+    assert "ended early" in result.summary()
+    assert not (tmp_path / "out.partial").exists()
+    last = Recorder()
+    assert run(last, walk, output).complete
+    assert last.num_pushed == COUNT - 5
+    assert contents(output) == straight
+
+
+def test_a_second_ctrl_c_stops_at_once_and_keeps_what_was_saved(walk: Path, tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        run(Recorder(send_at(5, signal.SIGINT, signal.SIGINT)), walk, tmp_path / "out")
+    last = Recorder()
+    assert run(last, walk, tmp_path / "out").num_frames == COUNT
+    assert last.num_pushed == COUNT - 4
+
+
+def test_ctrl_c_before_the_first_frame_leaves_nothing(walk: Path, tmp_path: Path, monkeypatch) -> None:
+    waiting = [signal.SIGINT]
+
+    def interrupted(*_: object) -> None:
+        if waiting:
+            os.kill(os.getpid(), waiting.pop())
+
+    monkeypatch.setattr("logvggt_jax.reconstruction.run.Run._prepare", interrupted)
+    with pytest.raises(Interrupted, match="no frame"):
+        run(Recorder(), walk, tmp_path / "out")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["walk"]
+
+
+def test_another_request_is_refused_and_overwrite_starts_anew(
+    walk: Path, tmp_path: Path, straight: dict[str, bytes]
+) -> None:
+    output = tmp_path / "out"
+    with pytest.raises(KeyboardInterrupt):
+        run(Recorder(die_at(6)), walk, output)
+    before = contents(tmp_path / "out.partial")
+    with pytest.raises(OutputExists, match=r"unfinished.*differs in point_filter.*--overwrite"):
+        run(Recorder(), walk, output, point_filter=PointFilter(max_points=10))
+    assert contents(tmp_path / "out.partial").keys() == before.keys()
+    anew = Recorder()
+    run(anew, walk, output, overwrite=True)
+    assert anew.num_pushed == COUNT
+    assert contents(output) == straight
+    with pytest.raises(OutputExists, match="exists"):
+        run(Recorder(), walk, output)
+
+
+def test_frames_that_changed_are_noticed_and_later_ones_may_come(walk: Path, tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    with pytest.raises(KeyboardInterrupt):
+        run(Recorder(die_at(6)), walk, output)
+    Image.new("RGB", (42, 28)).save(walk / "012.png")
+    Image.new("RGB", (42, 28)).save(walk / "002.png")
+    with pytest.raises(InputError, match=r"walk has changed.*--overwrite"):
+        run(Recorder(), walk, output)
+    assert (tmp_path / "out.partial").is_dir()
+
+
+def test_a_sequence_may_grow_while_its_run_waits(walk: Path, tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        run(Recorder(die_at(6)), walk, tmp_path / "out")
+    Image.new("RGB", (42, 28)).save(walk / "012.png")
+    last = Recorder()
+    assert run(last, walk, tmp_path / "out").num_frames == COUNT + 1
+    assert last.num_pushed == COUNT + 1 - 5
+
+
+def test_a_source_that_breaks_off_keeps_its_frames(walk: Path, tmp_path: Path) -> None:
+    file, output = walk / "007.png", tmp_path / "out"
+    whole = file.read_bytes()
+
+    def damage(count: int) -> None:
+        if count == 1:
+            file.write_bytes(whole[: len(whole) // 2])
+
+    with pytest.warns(UserWarning, match=r"6 frames are kept"), pytest.raises(InputError, match=r"007\.png"):
+        run(Recorder(damage), open_source(walk, strict=True), output, workers=1)  # type: ignore[arg-type]
+    file.write_bytes(whole)
+    assert run(Recorder(), open_source(walk, strict=True), output).num_frames == COUNT  # type: ignore[arg-type]
+
+
+def test_one_run_at_a_time(tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    with WorkFolder(output, {"method": "windows"}, overwrite=False) as work:
+        work.save(Progress({}, {}), [])
+        for overwrite in (False, True):
+            with (
+                pytest.raises(InputError, match=f"process {os.getpid()} on .* is writing there"),
+                WorkFolder(output, {"method": "windows"}, overwrite=overwrite),
+            ):
+                pass
+        assert work.saved() is not None
+
+
+def test_every_damage_of_a_saved_state_is_noticed(tmp_path: Path) -> None:
+    output, request = tmp_path / "out", {"method": "windows"}
+    arrays = {"tokens": np.arange(6, dtype=np.float32).reshape(2, 3), "pending": np.zeros((0, 3), np.uint8)}
+    with WorkFolder(output, request, overwrite=False) as work:
+        work.save(Progress(arrays, {"names": ["a"]}), [])
+    file = work.path / ".progress" / "state.safetensors"
+    sound = file.read_bytes()
+    with WorkFolder(output, request, overwrite=False) as work:
+        saved = work.saved()
+        assert saved is not None and saved.facts == {"names": ["a"]}
+        np.testing.assert_array_equal(saved.arrays["tokens"], arrays["tokens"])
+        for position in range(len(sound)):
+            damaged = bytearray(sound)
+            damaged[position] ^= 1 << position % 8
+            file.write_bytes(damaged)
+            try:
+                found = work.saved()
+            except InputError as error:
+                assert "state.safetensors" in str(error) and "--overwrite" in str(error)
+            else:
+                assert found is not None and found.facts == saved.facts and found.arrays.keys() == arrays.keys()
+        file.write_bytes(sound)
+
+
+def test_a_folder_of_somebody_else_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "out.partial").mkdir()
+    (tmp_path / "out.partial" / "thesis.tex").write_text("x")
+    with (
+        pytest.raises(OutputExists, match="was not made by this program"),
+        WorkFolder(tmp_path / "out", {}, overwrite=True),
+    ):
+        pass
+    assert (tmp_path / "out.partial" / "thesis.tex").read_text() == "x"
+
+
+def test_a_killed_process_can_be_taken_up(walk: Path, tmp_path: Path, straight: dict[str, bytes]) -> None:
+    """The lock of a process that is gone binds nobody, and what it had saved is used."""
+    output = tmp_path / "out"
+    script = (
+        "import sys; sys.path.insert(0, sys.argv[1])\n"
+        "from pathlib import Path; import time\n"
+        "from recorder import Recorder, reconstruct_recorded\n"
+        "from logvggt_jax.reconstruction import PointFilter\n"
+        "from logvggt_jax.reconstruction import run; run._SAVING = 1e9\n"
+        "wait = lambda count: count > 7 and (print('waiting', flush=True), time.sleep(60))\n"
+        "reconstruct_recorded(Recorder(wait), Path(sys.argv[2]), Path(sys.argv[3]), progress=False, save_seconds=0.0,\n"
+        "                     point_filter=PointFilter(max_points=3000))\n"
+    )
+    arguments = [sys.executable, "-c", script, str(Path(__file__).parent), str(walk), str(output)]
+    with subprocess.Popen(arguments, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None and process.stdout.readline() == b"waiting\n"
+        with pytest.raises(InputError, match=f"process {process.pid} on"):
+            run(Recorder(), walk, output)
+        process.kill()
+        process.wait()
+    started = time.monotonic()
+    last = Recorder()
+    run(last, walk, output)
+    assert last.num_pushed == COUNT - 7 and time.monotonic() - started < 60
+    assert contents(output) == straight
