@@ -114,19 +114,28 @@ def test_everything_that_is_left_out_is_said(some_left_out: Path) -> None:
 
 
 def test_seven_scenes_folder_gives_colour_images_only(tmp_path: Path) -> None:
-    for index in range(3):
+    depth = np.full((20, 30), 1000, np.uint16)
+    for index in range(4):
         write_image(tmp_path / f"frame-00000{index}.color.png", index + 1)
-        depth = np.full((20, 30), 1000, np.uint16)
         assert cv2.imwrite(str(tmp_path / f"frame-00000{index}.depth.png"), depth)
+        (tmp_path / f"frame-00000{index}.pose.txt").touch()
+    assert cv2.imwrite(str(tmp_path / "frame-000002.depth.proj.png"), depth)
     source = open_source(tmp_path)
-    assert reds(list(source)) == [1, 2, 3]
-    assert names(source) == ["frame-000000", "frame-000001", "frame-000002"]
-    assert len(source.notes) == 1 and "3 depth maps of colour images" in source.notes[0]
+    assert reds(list(source)) == [1, 2, 3, 4] and source.notes == []
+    assert names(source) == ["frame-000000", "frame-000001", "frame-000002", "frame-000003"]
+    (tmp_path / "frame-000001.color.png").unlink()
+    damaged = open_source(tmp_path)
+    assert reds(list(damaged)) == [1, 3, 4]
+    for said in (r"1 depth maps without .*000001\.depth\.png", "number 1 is missing"):
+        assert sum(re.search(said, note) is not None for note in damaged.notes) == 1, said
 
 
-def test_a_stray_colour_image_hides_nothing(tmp_path: Path) -> None:
+@pytest.mark.parametrize("companion", [None, "sample.pose.txt"])
+def test_a_stray_colour_image_hides_nothing(tmp_path: Path, companion: str | None) -> None:
     write_numbered(tmp_path, 3)
     write_image(tmp_path / "sample.color.png", 9)
+    if companion is not None:
+        (tmp_path / companion).touch()
     assert reds(list(open_source(tmp_path))) == [0, 1, 2, 9]
 
 

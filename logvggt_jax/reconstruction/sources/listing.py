@@ -8,7 +8,7 @@ import glob
 import os
 import re
 import stat
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -19,7 +19,9 @@ from logvggt_jax.reconstruction.sources.pictures import IMAGE_SUFFIXES
 
 LIST_SUFFIXES = (".txt", ".lst", ".list")
 SEVEN_SCENES_COLOUR = (".color.png", ".color.jpg")
-_SEVEN_SCENES_DEPTH = re.compile(r"(.*)\.depth(\.\w+)?\.png", re.IGNORECASE)
+_SEVEN_SCENES = re.compile(
+    r"(?P<name>.+)\.(?P<part>color(?=\.(?:png|jpg)$)|depth(?=(?:\.\w+)?\.png$)|pose(?=\.txt$))\..+", re.IGNORECASE
+)
 _NO_COLOURS = re.compile(
     r"mask|depth|thumb"
     r"|(?:^|[^a-z])(?:seg|segmentation|semantic|labels?|disp|disparity|normals?|matte|alpha|albedo|flow|conf|confidence)"
@@ -153,34 +155,56 @@ def _matches(entry: Path, pattern: str | None) -> bool:
 def _pictures(entries: list[Path], *, told: bool) -> tuple[list[Path], list[str]]:
     """The files among these that are pictures by their names, and lines on the others.
 
-    Those that are no pictures by their names are told where the user did not choose by a pattern.
+    Those that are no pictures by their names are told where the user did not choose by a pattern. Depth maps, poses and
+    lists of a 7-Scenes sequence are no news.
     """
-    files, left = [], dict[str, list[Path]]()
-    others: list[Path] = []
+    companions, orphans = _of_seven_scenes(entries)
+    files, others = list[Path](), list[Path]()
+    left: dict[str, list[Path]] = defaultdict(list)
     for entry in entries:
         kind = _kind(entry)
         named = entry.suffix.lower() in IMAGE_SUFFIXES
+        if kind == "file" and entry in companions:
+            continue
         if named and entry.name.startswith("."):
-            left.setdefault("hidden file", []).append(entry)
+            left["hidden file"].append(entry)
         elif named and kind != "file":
-            left.setdefault(kind, []).append(entry)
-        elif named:
+            left[kind].append(entry)
+        elif named and entry not in orphans:
             files.append(entry)
-        elif kind == "file" and not entry.name.startswith("."):
+        elif kind == "file" and not named and not entry.name.startswith("."):
             others.append(entry)
-    notes = [
+    if companions:
+        others = [entry for entry in others if entry.suffix.lower() != ".txt"]
+    lines = [
         f"left out: {len(those)} {kind}{'s' if len(those) > 1 else ''} with an image's name "
         f"({some(each.name for each in those)})"
         for kind, those in left.items()
     ]
     if others and told:
-        notes.insert(0, f"left out: {len(others)} without an image's suffix ({_suffixes(others)})")
-    depth = _depth_of_seven_scenes(entries, files)
-    if depth:
-        files = [file for file in files if file not in depth]
-        notes.append(f"left out: {len(depth)} depth maps of colour images ({some(f.name for f in sorted(depth))})")
+        lines.append(f"left out: {len(others)} without an image's suffix ({_suffixes(others)})")
+    if orphans:
+        lines.append(
+            f"left out: {len(orphans)} depth maps without their colour image "
+            f"({some(sorted(orphan.name for orphan in orphans))})"
+        )
     gaps = missing_numbers([stem(entry.name) for entry in entries if entry.suffix.lower() in IMAGE_SUFFIXES])
-    return files, notes + gaps
+    return files, lines + gaps
+
+
+def _of_seven_scenes(entries: list[Path]) -> tuple[set[Path], set[Path]]:
+    """What belongs to a `NAME.color.png` of the same name, and depth maps that ought to and whose colour is missing."""
+    frames: dict[tuple[Path, str], dict[str, list[Path]]] = defaultdict(lambda: defaultdict(list))
+    for entry in entries:
+        if found := _SEVEN_SCENES.fullmatch(entry.name):
+            frames[entry.parent, found["name"].lower()][found["part"].lower()].append(entry)
+    companions, orphans = set[Path](), set[Path]()
+    for parts in frames.values():
+        if "color" in parts:
+            companions.update(parts["depth"], parts["pose"])
+        else:
+            orphans.update(parts["depth"])
+    return companions, orphans if companions else set()
 
 
 def _kind(entry: Path) -> str:
@@ -192,20 +216,6 @@ def _kind(entry: Path) -> str:
         return kinds.get(error.errno or 0, f"unreadable entry ({error.strerror})")
     kinds = {stat.S_IFREG: "file", stat.S_IFDIR: "folder", stat.S_IFIFO: "pipe", stat.S_IFSOCK: "socket"}
     return kinds.get(stat.S_IFMT(mode), "device")
-
-
-def _depth_of_seven_scenes(entries: list[Path], files: list[Path]) -> set[Path]:
-    """Depth maps, in a folder with `NAME.color.png` whose `NAME` has a depth map or a `.pose.txt`."""
-    names = {entry.name.lower() for entry in entries}
-    colour = {file.name.lower()[: -len(".color.png")] for file in files if _is_colour(file)}
-    depth = {file: found[1].lower() for file in files if (found := _SEVEN_SCENES_DEPTH.fullmatch(file.name))}
-    if any(f"{name}.pose.txt" in names for name in colour) or colour & set(depth.values()):
-        return set(depth)
-    return set()
-
-
-def _is_colour(file: Path) -> bool:
-    return file.name.lower().endswith(SEVEN_SCENES_COLOUR)
 
 
 def _doubts(files: list[Path]) -> list[str]:
