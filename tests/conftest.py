@@ -100,6 +100,12 @@ def examples_dir() -> Path:
 
 
 @pytest.fixture(scope="session")
+def cases_dir() -> Path:
+    """Small pictures, videos and folders as users have them."""
+    return _shared("data", "cases")
+
+
+@pytest.fixture(scope="session")
 def small_config() -> ModelConfig:
     """A model of about 0.2 M parameters that has every part; images of 28 x 42 give it 2 x 3 patches."""
     return ModelConfig(

@@ -198,7 +198,7 @@ def test_bad_input_is_one_line_and_exit_code_2(
     for file in sorted(room.glob("*.color.png"))[:2]:
         (truncated / file.name).write_bytes(file.read_bytes())
     (truncated / file.name).write_bytes(file.read_bytes()[:300])
-    assert_fails(capsys, reconstruct(truncated), file.name)
+    assert_fails(capsys, reconstruct(truncated, checkpoint, "--strict"), file.name)
     assert_fails(capsys, ["convert", str(empty), "--output", str(output)], str(empty))
     assert_fails(capsys, ["view", str(empty)], str(empty))
     assert_fails(capsys, ["render-room", "--output", str(room)], str(room), "--overwrite")

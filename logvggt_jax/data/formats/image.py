@@ -1,20 +1,24 @@
 """Pictures from files, with the damage that decoders let pass reported.
 
 OpenCV decodes truncated JPEG and PNG files without complaint and fills the missing part with grey; files are
-therefore walked to their end marker first.
+therefore walked to their end marker first. A JPEG that this walk does not find regular may still be whole: Pillow
+decides (`jpeg.py`), which takes half as long again.
 """
 
 import re
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from logvggt_jax.data.errors import BrokenPicture, missing_file
+from logvggt_jax.data.formats.jpeg import JPEG_START, decode_jpeg
+from logvggt_jax.errors import InputError, one_line
 
-_JPEG_START = b"\xff\xd8"
-_PNG_START = b"\x89PNG\r\n\x1a\n"
+PNG_START = b"\x89PNG\r\n\x1a\n"
 # Within entropy-coded data a real marker is FF followed by neither 00, a restart marker nor a fill byte.
 _JPEG_MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 _JPEG_END, _JPEG_SCAN = 0xD9, 0xDA
@@ -32,9 +36,14 @@ def read_rgb(path: str | Path) -> np.ndarray:
     if picture.ndim == 2:
         return np.repeat(picture[:, :, None], 3, axis=2)
     if picture.shape[2] == 4:
-        alpha = picture[:, :, 3:].astype(np.float32) / 255.0
-        picture = (picture[:, :, :3] * alpha + 255.0 * (1.0 - alpha) + 0.5).astype(np.uint8)
+        picture = over_white(picture)
     return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+
+
+def over_white(picture: np.ndarray) -> np.ndarray:
+    """Colours [H, W, 3] uint8 of a picture [H, W, 4] uint8 with alpha on a white ground."""
+    alpha = picture[:, :, 3:].astype(np.float32) / 255.0
+    return (picture[:, :, :3] * alpha + 255.0 * (1.0 - alpha) + 0.5).astype(np.uint8)
 
 
 def read_depth(path: str | Path) -> np.ndarray:
@@ -52,17 +61,27 @@ def read_depth(path: str | Path) -> np.ndarray:
     return picture
 
 
+@contextmanager
+def decoding_errors(path: Path) -> Iterator[None]:
+    """Turns what Pillow raises over a damaged file into BrokenPicture; the system's errors pass through."""
+    try:
+        yield
+    except (InputError, MemoryError):
+        raise
+    except Exception as error:  # the plugins raise whatever their parsing stumbles over
+        if isinstance(error, OSError) and error.errno is not None:
+            raise
+        raise BrokenPicture(f"{path}: truncated or damaged picture ({one_line(error)}): fetch it again") from error
+
+
 def _decode(path: Path) -> np.ndarray:
     if not path.is_file():
         raise missing_file(path)
     data = path.read_bytes()
-    if data.startswith(_JPEG_START):
-        complete = _jpeg_is_complete(data)
-    elif data.startswith(_PNG_START):
-        complete = _png_is_complete(data)
-    else:
-        complete = bool(data)
-    if not complete:
+    if data.startswith(JPEG_START) and not _jpeg_is_regular(data):
+        with decoding_errors(path):
+            return np.array(decode_jpeg(data).convert("RGB"))[..., ::-1]
+    if not data or (data.startswith(PNG_START) and not png_is_whole(data)):
         raise BrokenPicture(f"{path}: truncated or damaged picture of {len(data)} bytes: fetch it again")
     try:
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -73,9 +92,9 @@ def _decode(path: Path) -> np.ndarray:
     return picture
 
 
-def _jpeg_is_complete(data: bytes) -> bool:
-    """Whether the segments up to the end-of-image marker are all there (ITU T.81, annex B)."""
-    position = len(_JPEG_START)
+def _jpeg_is_regular(data: bytes) -> bool:
+    """Whether the segments up to the end-of-image marker are all there and nothing else (ITU T.81, annex B)."""
+    position = len(JPEG_START)
     while position + 2 <= len(data):
         if data[position] != 0xFF:
             return False
@@ -96,9 +115,9 @@ def _jpeg_is_complete(data: bytes) -> bool:
     return False
 
 
-def _png_is_complete(data: bytes) -> bool:
+def png_is_whole(data: bytes) -> bool:
     """Whether all chunks up to IEND are there with correct checksums (PNG specification, section 5)."""
-    position = len(_PNG_START)
+    position = len(PNG_START)
     while position + 12 <= len(data):
         length = int.from_bytes(data[position : position + 4], "big")
         end = position + 12 + length

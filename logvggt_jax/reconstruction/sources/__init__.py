@@ -6,7 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from logvggt_jax.errors import InputError, MissingInput, disk_errors
-from logvggt_jax.reconstruction.sources.image_folder import IMAGE_SUFFIXES, FolderSource
+from logvggt_jax.reconstruction.sources.image_folder import FolderSource
+from logvggt_jax.reconstruction.sources.listing import names_pictures
+from logvggt_jax.reconstruction.sources.pictures import IMAGE_SUFFIXES
 from logvggt_jax.reconstruction.sources.source import SkippedFrame, Source, SourceFrame, SourceOptions
 from logvggt_jax.reconstruction.sources.video import VideoSource, is_live
 
@@ -17,7 +19,8 @@ def open_source(path: str | Path, **options: Any) -> Source:
     """A folder of images or a video as a `Source`.
 
     Args:
-      path: folder or video file, number of a camera (`0`), or address of a network stream (`rtsp://…`).
+      path: folder, glob (`photos/*.jpg`) or list of image files (a text file with a path a line); video file, number of
+        a camera (`0`), or address of a network stream (`rtsp://…`).
       options: those of `SourceOptions`: which frames are taken.
 
     Raises:
@@ -29,15 +32,17 @@ def open_source(path: str | Path, **options: Any) -> Source:
         return VideoSource(path, chosen)
     try:
         path = Path(path).expanduser()
+        if names_pictures(path):
+            return FolderSource(path, chosen)
         with disk_errors(path):
             path.stat()
-    except MissingInput:
-        raise MissingInput(f"{path} does not exist: expected a folder of images or a video file") from None
+    except MissingInput as error:
+        if path.exists():
+            raise
+        raise MissingInput(f"{path} does not exist: expected a folder of images or a video file") from error
     except (RuntimeError, ValueError) as error:
         # No such user, or a null character.
         raise error if isinstance(error, InputError) else InputError(f"{path!r} is no path: {error}") from error
-    if path.is_dir():
-        return FolderSource(path, chosen)
     if path.suffix.lower() in IMAGE_SUFFIXES:
-        raise InputError(f"{path} is a single image: give the folder that holds the sequence, or a video")
+        raise InputError(f"{path} is a single image: give the folder that holds the sequence, a glob, or a video")
     return VideoSource(path, chosen)

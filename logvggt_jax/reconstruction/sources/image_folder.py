@@ -1,113 +1,262 @@
-"""Images of a folder as the frames of a sequence."""
+"""Pictures of a folder, a glob or a list of files as the frames of a sequence."""
 
 from __future__ import annotations
 
-import re
+import dataclasses
+import hashlib
+import json
+import threading
+import unicodedata
+from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
-from logvggt_jax.data.formats.image import read_rgb
-from logvggt_jax.errors import InputError, MissingInput, disk_errors
-from logvggt_jax.reconstruction.sources.source import Source, SourceFrame, SourceOptions, fingerprint
+from logvggt_jax.data.errors import BrokenPicture
+from logvggt_jax.errors import InputError, MissingInput, MissingPackage, disk_errors
+from logvggt_jax.reconstruction.sources.headers import PictureHeader, read_header
+from logvggt_jax.reconstruction.sources.listing import is_glob, list_pictures, some, stem
+from logvggt_jax.reconstruction.sources.ordering import natural_order, time_stamps
+from logvggt_jax.reconstruction.sources.pictures import read_picture, refuse_depth
+from logvggt_jax.reconstruction.sources.source import SkippedFrame, Source, SourceFrame, SourceOptions, fingerprint
 
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
-SEVEN_SCENES_COLOUR = (".color.png", ".color.jpg")
+_LONGEST_NAME = 240  # bytes; a file of the result adds its suffix, and file systems allow 255
+_FIRST_BROKEN = 2
+
+
+@dataclasses.dataclass(frozen=True)
+class _Picture:
+    """A frame before it is read."""
+
+    name: str
+    timestamp: float
+    file: Path
+    header: PictureHeader
 
 
 class FolderSource(Source):
-    """Images of a folder in natural order (`img2` before `img10`).
+    """Pictures of a folder, a glob or a list of files, turned upright by their EXIF orientation.
 
-    A 7-Scenes sequence gives its `*.color.png` or `*.color.jpg` files only; any other folder all its JPEG and
-    PNG files. `len` is the number of frames; a frame's file is read when iteration reaches it.
+    Folders and globs are taken in natural order (`img2` before `img10`, see `natural_order`), lists as they are. The
+    time stamp of a frame is its name, where all names are moments that increase (see `time_stamps`), else its
+    position. All headers are read here, the pixels of a picture when its loader is called.
+
+    Pictures of another size than the others are an error, are left out (`skip`: the most frequent size stays), or
+    all are cut to the smallest height and the smallest width from their centre (`crop`; nothing is scaled).
 
     Args:
-      path: the folder.
-      options: which images are taken.
+      path: the folder, a glob (`photos/*.jpg`), or a text file with the path of an image a line.
+      options: which images are taken; `start` and `end` count from the first, and as `fps` need names that are times.
 
     Raises:
-      FileNotFoundError: no image in the folder.
-      ValueError: while iterating, an image cannot be read, or differs in size from the first.
+      MissingInput: no image, or one that has gone.
+      MissingPackage: all images are HEIC, or one is and `strict` is set, and pillow-heif is not installed.
+      InputError: names or pictures that cannot be used; two sizes; too many broken pictures, or one with `strict`.
+        While frames are loaded: too many broken ones.
     """
 
     def __init__(self, path: Path, options: SourceOptions) -> None:
-        super().__init__(path, options)
-        with disk_errors(path):
-            files = [file for file in path.iterdir() if file.is_file() and not file.name.startswith(".")]
-        images = [file for file in files if file.suffix.lower() in IMAGE_SUFFIXES]
-        if not images:
-            raise MissingInput(
-                f"no image in {path}: expected {', '.join('*' + s for s in IMAGE_SUFFIXES)} files, found "
-                f"{len(files)} other files; give the folder that holds the images themselves"
-            )
-        colour = [file for file in images if file.name.lower().endswith(SEVEN_SCENES_COLOUR)]
-        ordered = sorted(colour or images, key=_natural_order)
-        names = [_stem(file.name) for file in ordered]
-        if len(set(names)) < len(names):
-            # 1.jpg beside 1.png: results are named after frames, so that names must differ.
-            names = [file.name for file in ordered]
-        listing = [
-            (float(position), name, file) for position, (name, file) in enumerate(zip(names, ordered, strict=True))
-        ]
-        self._frames = listing[:: options.stride][: options.max_frames]
+        listing = list_pictures(path, options.pattern)
+        super().__init__(listing.root if is_glob(path) and not path.exists() else path, options)
+        self.notes += listing.left_out + listing.doubts
+        self._doubts = listing.doubts
+        self._lock = threading.Lock()
+        files = listing.files
+        if not listing.in_order:
+            relative = [str(file.relative_to(listing.root).with_name(stem(file.name))) for file in files]
+            files = [files[position] for position in natural_order(relative)]
+        times = time_stamps([stem(file.name) for file in files])
+        chosen = self._chosen(times, len(files))
+        names = _names([files[position] for position in chosen], listing.root)
+        stamps = [float(position) for position in range(len(files))] if times is None else times
+        self._asked_for = len(chosen)
+        pictures = self._with_headers(
+            [(name, stamps[position], files[position]) for name, position in zip(names, chosen, strict=True)]
+        )
+        self._pictures, self._size = self._of_one_size(pictures)
 
     def __len__(self) -> int:
-        return len(self._frames)
+        return len(self._pictures)
 
     @property
     def expected_frames(self) -> int:
-        """Number of frames, for progress bars."""
+        """Number of frames, without those that are known to be broken."""
         return len(self)
 
     @property
-    def image_size(self) -> tuple[int, int] | None:
-        """(H, W) of the images."""
-        return None
+    def image_size(self) -> tuple[int, int]:
+        """(H, W) of the upright images, after cropping."""
+        return self._size
 
     def fingerprint(self, count: int) -> str:
-        """Digest of options and files."""
-        return fingerprint(self.options, [file for _, _, file in self._frames[:count]])
+        """See `Source.fingerprint`. What files further on may change, as sizes and time stamps, is part of it."""
+        pictures = self._pictures[:count]
+        with disk_errors(self.path):
+            of_files = fingerprint(self.options, [picture.file for picture in pictures])
+        text = json.dumps([of_files, self._size, [(picture.name, picture.timestamp) for picture in pictures]])
+        return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
     def loaders(self, first: int = 0) -> Iterator[Callable[[], SourceFrame | None]]:
-        """See `Source.loaders`."""
-        opening = self._load(self._frames[0])
-        if first == 0:
-            yield partial(_itself, opening)
-        shape = opening.image.shape
-        del opening
-        for entry in self._frames[max(first, 1) :]:
-            yield partial(self._load, entry, shape)
+        """See `Source.loaders`; pictures before the first are not read."""
+        return (partial(self._load, picture) for picture in self._pictures[first:])
 
-    def _load(self, entry: tuple[float, str, Path], shape: tuple[int, ...] | None = None) -> SourceFrame:
-        """The frame of an entry; its image has the `shape` of the first."""
-        timestamp, name, file = entry
-        with disk_errors(file):
-            image = read_rgb(file)
-        if shape is not None and image.shape != shape:
+    def _load(self, picture: _Picture) -> SourceFrame | None:
+        header = picture.header
+        try:
+            image = read_picture(picture.file, orientation=header.orientation)
+            if image.shape[:2] != header.size:
+                raise BrokenPicture(
+                    f"{picture.file} was {_pixels(header.size)} when the folder was opened and is now "
+                    f"{_pixels(image.shape[:2])}: is it being written?"
+                )
+        except BrokenPicture as error:
+            with self._lock:
+                self._leave_out(picture.name, error)
+                self._check_share()
+            return None
+        except MissingInput as error:
+            raise MissingInput(f"{picture.file} was there when the source was opened and has gone since") from error
+        (height, width), (above, left) = self._size, _margins(header.size, self._size)
+        image = image[above : above + height, left : left + width]
+        return SourceFrame(picture.name, picture.timestamp, image, header.focal_length)
+
+    def _leave_out(self, name: str, error: InputError) -> None:
+        """Lists a broken picture, once however often it is loaded."""
+        if self.options.strict:
+            raise error
+        if all(skipped.name != name for skipped in self.skipped):
+            self.skipped.append(SkippedFrame(name, str(error)))
+
+    def _check_share(self) -> None:
+        if len(self.skipped) > max(_FIRST_BROKEN, self.options.most_broken * self._asked_for):
             raise InputError(
-                f"{file} is {_size(image.shape)} pixels but {self._frames[0][2].name} is {_size(shape)}: all frames "
-                "of a sequence need one size; resize them or put them into folders of their own"
+                f"{len(self.skipped)} of {self._asked_for} images of {self.path} cannot be read, more than the "
+                f"{self.options.most_broken:.0%} that may be left out: {_reasons(self.skipped)}"
             )
-        return SourceFrame(name, timestamp, image)
+
+    def _chosen(self, times: list[float] | None, count: int) -> list[int]:
+        """Positions of the frames that the options take."""
+        options = self.options
+        chosen = list(range(count))
+        if times is None:
+            for name in ("fps", "start", "end"):
+                if getattr(options, name) is not None:
+                    raise InputError(
+                        f"{name} needs time stamps, which names of images in {self.path} are not: use stride"
+                    )
+        else:
+            begin, end = options.start or 0.0, float("inf") if options.end is None else options.end
+            chosen = [position for position in chosen if begin <= times[position] - times[0] < end]
+            if options.fps is not None:
+                # Digits of a name are rounded; a frame that is due a hair later is due.
+                due = [int((times[position] - times[0]) * options.fps + 1e-3) for position in chosen]
+                chosen = chosen[:1] + [chosen[i] for i in range(1, len(chosen)) if due[i] > due[i - 1]]
+            if not chosen:
+                raise InputError(
+                    f"no image of {self.path} lies between start and end ({begin:g} s to {end:g} s after the first; "
+                    f"the last is at {times[-1] - times[0]:g} s)"
+                )
+        return chosen[:: options.stride][: options.max_frames]
+
+    def _with_headers(self, frames: list[tuple[str, float, Path]]) -> list[_Picture]:
+        """The pictures whose headers can be read; notes on the others."""
+        pictures, no_decoder = list[_Picture](), list[tuple[Path, MissingPackage]]()
+        for name, timestamp, file in frames:
+            try:
+                pictures.append(_Picture(name, timestamp, file, read_header(file)))
+            except BrokenPicture as error:
+                self._leave_out(name, error)
+            except MissingPackage as error:
+                if self.options.strict:
+                    raise
+                no_decoder.append((file, error))
+        if deep := [picture for picture in pictures if picture.header.deep_grey][:1]:
+            try:
+                refuse_depth(deep[0].file)
+            except BrokenPicture as error:
+                self._leave_out(deep[0].name, error)
+                pictures.remove(deep[0])
+        for suffix, count in Counter(file.suffix for file, _ in no_decoder).items():
+            inside = "" if suffix.lower().startswith(".h") else " that are HEIC inside"
+            self.notes.append(f"{count} {suffix}{inside} ignored: install logvggt-jax[heic], or convert to JPEG")
+        self._check_share()
+        if self.skipped:
+            self.notes.append(f"left out: {len(self.skipped)} broken ({_reasons(self.skipped)})")
+        if several := [picture for picture in pictures if picture.header.pages > 1]:
+            listed = some(f"{picture.file.name}: {picture.header.pages}" for picture in several)
+            self.notes.append(
+                f"files that hold several pictures, of which the first is taken: {len(several)} ({listed})"
+            )
+        if not pictures:
+            if no_decoder:
+                raise no_decoder[0][1]
+            raise InputError(f"no image of {self.path} can be read: {_reasons(self.skipped)}")
+        return pictures
+
+    def _of_one_size(self, pictures: list[_Picture]) -> tuple[list[_Picture], tuple[int, int]]:
+        """The pictures that are taken and the (H, W) that they are handed out in."""
+        counts = Counter(picture.header.size for picture in pictures)
+        (common, most), *others = counts.most_common()
+        if not others:
+            return pictures, common
+        smallest = (min(height for height, _ in counts), min(width for _, width in counts))
+        if self.options.size_mismatch == "skip":
+            left = [picture for picture in pictures if picture.header.size != common]
+            self.notes.append(
+                f"left out: {len(left)} of another size than {_pixels(common)} ({some(p.file.name for p in left)})"
+            )
+            return [picture for picture in pictures if picture.header.size == common], common
+        if self.options.size_mismatch == "crop":
+            self.notes.append(f"images of {len(counts)} sizes are cut to {_pixels(smallest)} from their centre")
+            return pictures, smallest
+        example = {picture.header.size: picture.file.name for picture in reversed(pictures)}
+        listed = "; ".join(f"{n} of {_pixels(size)} ({example[size]})" for size, n in counts.most_common(5))
+        listed += "; …" if len(counts) > 5 else ""
+        sideways = ", some upright and some sideways" if any((w, h) in counts for h, w in counts if h != w) else ""
+        raise InputError(
+            f"{self.path} holds images of {len(counts)} sizes{sideways}: {listed}. All "
+            f"frames of a sequence need one size: --size-mismatch skip keeps the {most} of {_pixels(common)}, "
+            f"--size-mismatch crop cuts all to {_pixels(smallest)} from their centre"
+            + "".join(f"; {doubt}" for doubt in self._doubts)
+        )
 
 
-def _itself(frame: SourceFrame) -> SourceFrame:
-    return frame
+def _names(files: list[Path], root: Path) -> list[str]:
+    """What the frames are called, and so the files of a result; unique and short enough for that."""
+    for choice in (
+        lambda file: stem(file.name),
+        # 1.jpg beside 1.png, or left/1.jpg beside right/1.jpg.
+        lambda file: file.name,
+        lambda file: "_".join(file.relative_to(root).parts),
+    ):
+        names = [choice(file) for file in files]
+        if len(set(names)) == len(names):
+            break
+    else:
+        twice = next(before for before, after in pairwise(sorted(names)) if before == after)
+        raise InputError(f"two images would be called {twice!r}, as results are named after them: rename one")
+    for name, file in zip(names, files, strict=True):
+        length = len(name.encode(errors="surrogateescape"))
+        if length > _LONGEST_NAME:
+            raise InputError(
+                f"{file}: its name is {length} bytes long; results are named after images: at most {_LONGEST_NAME}"
+            )
+        if any(unicodedata.category(character) in ("Cc", "Cs") for character in name):
+            raise InputError(
+                f"{str(file)!r}: its name has control characters, or is not UTF-8, and results are named after images: "
+                "rename it"
+            )
+    return names
 
 
-def _natural_order(file: Path) -> tuple[list[tuple[int, int, str]], str]:
-    parts = re.split(r"(\d+)", file.name.lower())
-    # Upper and lower case of one name still need an order of their own.
-    return [(1, int(p), "") if p.isdecimal() else (0, 0, p) for p in parts], file.name
+def _margins(size: tuple[int, int], wanted: tuple[int, int]) -> tuple[int, int]:
+    return (size[0] - wanted[0]) // 2, (size[1] - wanted[1]) // 2
 
 
-def _stem(name: str) -> str:
-    lower = name.lower()
-    for suffix in (*SEVEN_SCENES_COLOUR, *IMAGE_SUFFIXES):
-        if lower.endswith(suffix):
-            return name[: -len(suffix)]
-    return name
+def _reasons(skipped: list[SkippedFrame]) -> str:
+    return "; ".join(each.reason for each in skipped[:3]) + ("; …" if len(skipped) > 3 else "")
 
 
-def _size(shape: tuple[int, ...]) -> str:
-    return f"{shape[1]} x {shape[0]}"
+def _pixels(size: tuple[int, ...]) -> str:
+    return f"{size[1]} x {size[0]}"

@@ -22,13 +22,16 @@ class SourceFrame(NamedTuple):
 
     Attributes:
       name: file name without suffix, or `frame-000123` with the position in the video.
-      timestamp: seconds from the video's start; for folders, which know no time, the position in the sorted folder.
+      timestamp: seconds from the video's start; for images the time that their names tell, or else the position in
+        the sorted folder.
       image: [H, W, 3] uint8 RGB.
+      focal_length: pixels of the image, as the camera noted it; None where it is not known.
     """
 
     name: str
     timestamp: float
     image: np.ndarray
+    focal_length: float | None = None
 
 
 class SkippedFrame(NamedTuple):
@@ -48,7 +51,8 @@ class SourceOptions:
       fps: take at most so many frames a second, by their time stamps; None for all.
       start, end: seconds of the video; None for its beginning and end.
       pattern: glob that names of image files have to match; None for all.
-      size_mismatch: what happens to images of another size than the first: `error`, `crop` or `skip`.
+      size_mismatch: what happens to images of several sizes: `error`, `crop` (all are cut from their centre to the
+        smallest height and the smallest width) or `skip` (the most frequent size stays).
       strict: a frame that cannot be read is an error. Otherwise it is left out and listed.
       most_broken: the share of the frames that may be left out so, beyond a first two.
     """
@@ -83,7 +87,7 @@ class Source(abc.ABC):
       path: folder or file.
       options: which frames are taken.
       notes: what the user should know before the work begins, one line each: what is left out, and why.
-      skipped: frames that could not be read, filled while frames are loaded.
+      skipped: frames that could not be read, filled when the source is opened and while frames are loaded.
     """
 
     def __init__(self, path: Path, options: SourceOptions) -> None:

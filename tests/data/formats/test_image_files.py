@@ -1,10 +1,12 @@
 """Whole pictures are read as they are; truncated, damaged and mistyped ones are named."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from logvggt_jax.data.formats.image import read_depth, read_rgb
 
@@ -77,6 +79,65 @@ def test_a_jpeg_with_a_whole_thumbnail_but_half_a_picture_is_truncated(tmp_path:
     path.write_bytes(whole[:2] + segment + whole[2 : len(whole) // 2])
     with pytest.raises(ValueError, match=r"c\.jpg"):
         read_rgb(path)
+
+
+def jpeg(path: Path, mode: str = "RGB", **options: object) -> bytes:
+    Image.fromarray(cv2.GaussianBlur(PICTURE, (0, 0), 3)).convert(mode).save(path, "JPEG", quality=95, **options)
+    return path.read_bytes()
+
+
+def after_the_tables(data: bytes) -> int:
+    return data.index(b"\xff\xc4")
+
+
+@pytest.mark.parametrize("progressive", [False, True])
+@pytest.mark.parametrize(
+    "odd",
+    [
+        lambda data: data[:-2],
+        lambda data: data[:-1],
+        lambda data: data + b"\0" * 5000,
+        lambda data: data + b"camera maker's own \xff\xd8\xff\xe0 data",
+        lambda data: data[: after_the_tables(data)] + b"stray" + data[after_the_tables(data) :],
+    ],
+    ids=["no end", "half an end", "padded", "trailing data", "stray bytes"],
+)
+def test_a_jpeg_that_is_odd_but_whole_is_read_in_silence(
+    tmp_path: Path, odd: Callable[[bytes], bytes], progressive: bool, capfd: pytest.CaptureFixture[str]
+):
+    path = tmp_path / "a.jpg"
+    data = jpeg(path, progressive=progressive)
+    expected = read_rgb(path)
+    path.write_bytes(odd(data))
+    np.testing.assert_array_equal(read_rgb(path), expected)
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("keep", [0.2, 0.5, 0.8, 0.99])
+@pytest.mark.parametrize("tail", [b"", b"\0" * 4000, b"\xff"], ids=["cut", "zeros", "half a marker"])
+@pytest.mark.parametrize("progressive", [False, True])
+def test_a_jpeg_without_its_end_is_refused_where_pixels_are_missing(
+    tmp_path: Path, keep: float, tail: bytes, progressive: bool
+):
+    path = tmp_path / "cut.jpg"
+    data = jpeg(path, progressive=progressive)
+    start = data.index(b"\xff\xda")
+    path.write_bytes(data[: start + int(keep * (len(data) - start))] + tail)
+    with pytest.raises(ValueError, match=r"cut\.jpg.*fetch it again"):
+        read_rgb(path)
+
+
+def test_a_jpeg_for_print_becomes_rgb(tmp_path: Path):
+    path = tmp_path / "cmyk.jpg"
+    jpeg(path, "CMYK")
+    assert np.abs(read_rgb(path).astype(int) - cv2.GaussianBlur(PICTURE, (0, 0), 3)).mean() < 3
+
+
+def test_data_sets_keep_pixels_as_stored(tmp_path: Path):
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    jpeg(tmp_path / "a.jpg", exif=exif)
+    assert read_rgb(tmp_path / "a.jpg").shape == PICTURE.shape
 
 
 def test_a_flipped_byte_in_a_png_is_named(tmp_path: Path):

@@ -1,0 +1,90 @@
+"""JPEG pictures: the whole ones are read, however odd their file is, and the truncated ones are told.
+
+libjpeg fills what is missing with grey and complains on standard error only. Pillow feeds it piece by piece and raises
+where it asks for more than there is; that covers all but two kinds, which are decided here.
+"""
+
+import io
+import re
+
+from PIL import Image, JpegImagePlugin
+
+JPEG_START = b"\xff\xd8"
+_END = b"\xff\xd9"
+_SCAN = b"\xff\xda"
+# Bits in place of what a file lacks, with a restart marker of each kind. Where pixels are missing they become other
+# pixels than the zeros that libjpeg assumes; where none is missing nobody looks at them.
+_OTHER_BITS = b"".join(b"\x5a\xa5\x33\xcc" * 4 + bytes((0xFF, 0xD0 + number % 8)) for number in range(16))
+_MOST_ZEROS = 16
+
+
+class _Pixels(JpegImagePlugin.JpegImageFile):
+    """A picture whose camera data are left alone: Pillow warns on opening it if they are odd."""
+
+    def getexif(self) -> Image.Exif:
+        return Image.Exif()
+
+
+def decode_jpeg(data: bytes) -> Image.Image:
+    """The pixels as stored, without orientation, in mode L, RGB or CMYK.
+
+    Read are also pictures without an end marker, with stray bytes between the segments or after the end.
+
+    Raises:
+      OSError: pixels are missing, even where an end marker was appended afterwards.
+      Exception: no JPEG, or of a kind that libjpeg does not read; Pillow raises many types.
+    """
+    # Zeros to the full size are what an interrupted download or a crash leaves; libjpeg would take them for pixels.
+    zeros = len(data) - len(data.rstrip(b"\0"))
+    if zeros > _MOST_ZEROS:
+        data = data[:-zeros]
+    try:
+        picture = _decode(data)
+    except OSError:
+        content = data.rstrip(_END[:1])
+        picture = _decode(content + _END)
+        if _lacks_scans(content, picture) or picture.tobytes() != _decode(content + _OTHER_BITS + _END).tobytes():
+            raise
+        return picture
+    if _ends_flat(picture):
+        end = data.rfind(_END)
+        if picture.tobytes() != _decode(data[:end] + _OTHER_BITS + data[end:]).tobytes():
+            raise OSError("the lower part of the picture is missing")
+    return picture
+
+
+def first_scan(data: bytes) -> int:
+    """Position of the first scan's marker; thumbnails in the header lie before it. Errors as `decode_jpeg`."""
+    stream = io.BytesIO(data)
+    _Pixels(stream)
+    # Pillow stops behind the scan's header.
+    return data.rfind(_SCAN, 0, stream.tell())
+
+
+def _decode(data: bytes) -> Image.Image:
+    picture = _Pixels(io.BytesIO(data))
+    picture.load()
+    return picture
+
+
+def _lacks_scans(data: bytes, picture: Image.Image) -> bool:
+    """Whether a progressive picture ends before the scans that bring the last bit of all its coefficients."""
+    if "progressive" not in picture.info:
+        return False
+    complete = set()
+    # Scan headers are as in ITU T.81, B.2.3.
+    for scan in re.finditer(_SCAN, data[first_scan(data) :]):
+        count, *header = scan.string[scan.end() + 2 : scan.end() + 14]
+        names, (begin, end, bits) = header[: 2 * count : 2], header[2 * count : 2 * count + 3]
+        if bits & 0x0F == 0:
+            complete |= {(name, coefficient) for name in names for coefficient in range(begin, end + 1)}
+    return len(complete) < 64 * len(picture.getbands())
+
+
+def _ends_flat(picture: Image.Image) -> bool:
+    """Whether the last coded unit is of one colour, as those that libjpeg makes up are.
+
+    Of its up to 16 x 16 pixels those that are smoothed with other units' are left out.
+    """
+    corner = [length - max(1, (length - 1) % 16 - 1) for length in picture.size]
+    return len(picture.crop((*corner, *picture.size)).getcolors() or ()) == 1

@@ -1,0 +1,192 @@
+"""Pictures of all formats as upright 8-bit colours; what a file is says its content, not its name."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from types import MappingProxyType
+from typing import IO
+
+import numpy as np
+from PIL import (
+    AvifImagePlugin,
+    BmpImagePlugin,
+    Image,
+    ImageFile,
+    JpegImagePlugin,
+    PngImagePlugin,
+    TiffImagePlugin,
+    WebPImagePlugin,
+)
+
+from logvggt_jax.data.errors import BrokenPicture
+from logvggt_jax.data.formats.image import decoding_errors, over_white, png_is_whole
+from logvggt_jax.data.formats.jpeg import decode_jpeg
+from logvggt_jax.errors import InputError, MissingPackage, disk_errors
+
+IMAGE_SUFFIXES = (
+    *(".jpg", ".jpeg", ".jpe", ".jfif"),
+    *(".png", ".webp", ".tif", ".tiff", ".bmp"),
+    *(".heic", ".heif", ".hif", ".avif"),
+)
+MOST_PIXELS = 2 * (Image.MAX_IMAGE_PIXELS or 89_478_485)
+SIGNATURE_BYTES = 32
+
+# Plugins by name, rather than Image.open: that looks at suffixes and warns of sizes which MOST_PIXELS allows.
+_READERS: MappingProxyType[str, type[ImageFile.ImageFile]] = MappingProxyType(
+    {
+        "JPEG": JpegImagePlugin.JpegImageFile,
+        "PNG": PngImagePlugin.PngImageFile,
+        "WebP": WebPImagePlugin.WebPImageFile,
+        "TIFF": TiffImagePlugin.TiffImageFile,
+        "BMP": BmpImagePlugin.BmpImageFile,
+        "AVIF": AvifImagePlugin.AvifImageFile,
+    }
+)
+_SIGNATURES = (
+    *((b"\xff\xd8", "JPEG"), (b"\x89PNG\r\n\x1a\n", "PNG"), (b"BM", "BMP")),
+    *((start, "TIFF") for start in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")),
+    *((b"GIF8", "GIF picture"), (b"\0\0\0\x0cjP  ", "JPEG 2000 picture"), (b"\0\0\0\x0cJXL ", "JPEG XL picture")),
+    *((b"8BPS", "Photoshop file"), (b"v/1\x01", "OpenEXR file"), (b"%PDF", "PDF file"), (b"PK\x03\x04", "ZIP archive")),
+    *((b"\x1aE\xdf\xa3", "video"), (b"<", "web page or XML file"), (b"version https://git-lfs", "Git LFS pointer")),
+)
+_HEIC_BRANDS = {b"heic", b"heix", b"hevc", b"hevx", b"heim", b"heis", b"mif1", b"msf1"}
+# As ImageOps.exif_transpose: what turns the stored pixels upright, by EXIF orientation.
+_UPRIGHT = MappingProxyType(
+    {
+        2: Image.Transpose.FLIP_LEFT_RIGHT,
+        3: Image.Transpose.ROTATE_180,
+        4: Image.Transpose.FLIP_TOP_BOTTOM,
+        5: Image.Transpose.TRANSPOSE,
+        6: Image.Transpose.ROTATE_270,
+        7: Image.Transpose.TRANSVERSE,
+        8: Image.Transpose.ROTATE_90,
+    }
+)
+
+
+def read_picture(path: Path, *, orientation: int = 1) -> np.ndarray:
+    """The pixels [H, W, 3] uint8 RGB, turned upright by the EXIF orientation that the header gave.
+
+    Grey is repeated, alpha composited over white, 16 bits a channel become the upper 8, CMYK is converted.
+
+    Raises:
+      BrokenPicture: truncated, damaged or no picture.
+      InputError: pixels that are no colours, as those of depth maps in floating point.
+      MissingPackage: HEIC without pillow-heif.
+    """
+    with disk_errors(path):
+        data = path.read_bytes()
+    picture = _decode(path, data)
+    if orientation in _UPRIGHT:
+        with decoding_errors(path):
+            picture = picture.transpose(_UPRIGHT[orientation])
+    return _colours(path, picture)
+
+
+def refuse_depth(path: Path) -> None:
+    """Raises InputError for a grey picture with 16 bits that looks like a depth map.
+
+    Depth maps have values for distances in millimetres or similar: none near white, or pixels without a value (0)
+    and between them and the nearest distance nothing. Grey levels that come from 8 bits are no distances.
+    """
+    with disk_errors(path):
+        values = np.asarray(_decode(path, path.read_bytes()))
+    if not values.any() or any((values % step == 0).all() for step in (256, 257)):
+        return
+    none, near_none = np.mean(values == 0), np.mean((values > 0) & (values < 256))
+    dark = values[values < 65535].max(initial=0) < 1 << 14
+    if dark or (none > 0.01 and near_none < 0.001 * none):
+        raise InputError(
+            f"{path}: a grey picture with 16 bits whose values (up to {values.max()}) look like a depth map; give "
+            "colour pictures, choose them with --pattern, or, if these are pictures, convert them to 8 bits"
+        )
+
+
+def open_picture(path: Path, stream: IO[bytes]) -> tuple[str, ImageFile.ImageFile]:
+    """The format's name and the picture whose header has been read. Errors as `read_picture`."""
+    stream.seek(0)
+    start = stream.read(SIGNATURE_BYTES)
+    kind = kind_of(start)
+    stream.seek(0)
+    if not start:
+        raise BrokenPicture(f"{path}: empty file (0 bytes): fetch it again")
+    if kind == "HEIC":
+        reader = _heic_reader(path)
+    elif kind in _READERS:
+        reader = _READERS[kind]
+    else:
+        found = f"a {kind}" if kind else f"no picture (it begins with {start[:8]!r})"
+        raise BrokenPicture(f"{path} is {found}: expected JPEG, PNG, WebP, TIFF, BMP, AVIF or HEIC")
+    with decoding_errors(path):
+        try:
+            return kind, reader(stream)
+        except SyntaxError as error:
+            if kind == "TIFF" and _is_floating_point(stream):
+                raise not_colours(path, "floating point") from error
+            raise
+
+
+def kind_of(start: bytes) -> str:
+    """What a file is by its first `SIGNATURE_BYTES` bytes; empty where they are of no known kind."""
+    if start[:4] == b"RIFF":
+        return "WebP" if start[8:12] == b"WEBP" else "video"
+    if start[4:8] == b"ftyp":
+        # The major brand, a version, then the compatible ones.
+        brands = {start[8:12], *(start[at : at + 4] for at in range(16, min(len(start), int.from_bytes(start[:4])), 4))}
+        if brands & {b"avif", b"avis"}:
+            return "AVIF"
+        return "HEIC" if brands & _HEIC_BRANDS else "video"
+    return next((kind for signature, kind in _SIGNATURES if start.startswith(signature)), "")
+
+
+def not_colours(path: Path, values: str) -> InputError:
+    """The error for a picture whose pixels are of this type."""
+    return InputError(
+        f"{path}: its pixels are {values}, as those of a depth map: give colour pictures, choose them with --pattern"
+    )
+
+
+def _decode(path: Path, data: bytes) -> Image.Image:
+    """The picture with its pixels as stored."""
+    if kind_of(data[:SIGNATURE_BYTES]) == "JPEG":
+        with decoding_errors(path):
+            return decode_jpeg(data)
+    kind, picture = open_picture(path, io.BytesIO(data))
+    with decoding_errors(path):
+        if kind == "PNG" and not png_is_whole(data):
+            # Pillow looks at no checksum of the pixels.
+            raise BrokenPicture(f"{path}: truncated or damaged picture (wrong checksum): fetch it again")
+        picture.load()
+        return picture
+
+
+def _colours(path: Path, picture: Image.Image) -> np.ndarray:
+    if picture.mode.startswith("I;16"):
+        grey = (np.asarray(picture) >> 8).astype(np.uint8)
+        return np.repeat(grey[:, :, None], 3, axis=2)
+    if picture.mode in ("I", "F"):
+        raise not_colours(path, "floating point" if picture.mode == "F" else "32-bit numbers")
+    with decoding_errors(path):
+        if picture.mode == "RGB" and "transparency" not in picture.info:
+            return np.array(picture)
+        if picture.has_transparency_data:
+            return over_white(np.asarray(picture.convert("RGBA")))
+        return np.array(picture.convert("RGB"))
+
+
+def _heic_reader(path: Path) -> type[ImageFile.ImageFile]:
+    try:
+        from pillow_heif.as_plugin import HeifImageFile
+    except ImportError as error:
+        raise MissingPackage(f"{path} is HEIC: install logvggt-jax[heic], or convert it to JPEG") from error
+    return HeifImageFile
+
+
+def _is_floating_point(stream: IO[bytes]) -> bool:
+    """Whether a TIFF says so of its samples."""
+    stream.seek(0)
+    directory = TiffImagePlugin.ImageFileDirectory_v2(stream.read(8))
+    stream.seek(directory.next)
+    directory.load(stream)
+    return 3 in directory.get(TiffImagePlugin.SAMPLEFORMAT, ())
