@@ -103,17 +103,20 @@ class RunCheckpoints:
         """A model without checkpoints is this run's if it was killed before its first one was complete."""
         if any(entry.name.isdecimal() for entry in self.folder.glob("*")) or not is_model_folder(self.model_folder):
             return
-        ours, theirs = self._provenance(), read_provenance(self.model_folder)
-        if ours != theirs:
+        source = read_provenance(self.model_folder).source or "source not recorded"
+        if not source.endswith(self._here()):
             raise OutputExists(
-                f"{self.model_folder}: a model that this run did not write ({theirs.source or 'source not recorded'}) "
-                "would be replaced; start in another --workdir or move it away"
+                f"{self.model_folder}: a model that this run did not write ({source}) would be replaced; start in "
+                "another --workdir or move it away"
             )
+
+    def _here(self) -> str:
+        return f" in {self.folder.parent}"
 
     def _provenance(self) -> Provenance:
         longer_edge = max(max(size) for stage in self.config.stages for size in stage.sizes)
         start = self.config.initial_weights or "random parameters"
-        return Provenance("windows", longer_edge, source=f"trained from {start} in {self.folder.parent}")
+        return Provenance("windows", longer_edge, source=f"trained from {start}{self._here()}")
 
     def restore(self, like: TrainState, *, step: int | None = None) -> tuple[TrainState, Position]:
         """The state at `step` (None: the latest), with the shapes and placement of `like`.
