@@ -15,7 +15,13 @@ from logvggt_jax.model.parameters import stack_layers, unstack_layers
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.processes import any_process
 from logvggt_jax.training.state import TrainState
-from logvggt_jax.weights.checkpoints import check_destination, read_provenance, read_with_orbax, save_model
+from logvggt_jax.weights.checkpoints import (
+    check_destination,
+    read_provenance,
+    read_with_orbax,
+    save_model,
+    writing_with_orbax,
+)
 from logvggt_jax.weights.digests import digests, json_digest, verify_digests
 from logvggt_jax.weights.folder import is_model_folder
 from logvggt_jax.weights.provenance import Provenance
@@ -88,16 +94,17 @@ class RunCheckpoints:
             "libraries": {name: importlib.metadata.version(name) for name in LIBRARIES},
         }
         meta["digest"] = json_digest([meta, position.data])
-        self._manager.save(
-            step,
-            args=ocp.args.Composite(
-                params=ocp.args.StandardSave(params),
-                state=ocp.args.StandardSave(rest),
-                data=ocp.args.JsonSave(position.data),
-                meta=ocp.args.JsonSave(meta),
-            ),
-            force=True,
-        )
+        with writing_with_orbax(self.folder / str(step)):
+            self._manager.save(
+                step,
+                args=ocp.args.Composite(
+                    params=ocp.args.StandardSave(params),
+                    state=ocp.args.StandardSave(rest),
+                    data=ocp.args.JsonSave(position.data),
+                    meta=ocp.args.JsonSave(meta),
+                ),
+                force=True,
+            )
 
     def _check_own(self) -> None:
         """A model without checkpoints is this run's if it was killed before its first one was complete."""

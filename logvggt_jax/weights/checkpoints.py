@@ -11,6 +11,7 @@ import contextlib
 import dataclasses
 import importlib.metadata
 import os
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -66,7 +67,7 @@ def save_model(
             name: importlib.metadata.version(name) for name in ("logvggt-jax", "jax", "flax", "orbax-checkpoint")
         },
     }
-    with atomic_folder(path, replace=replace) as fresh, disk_errors(path):
+    with atomic_folder(path, replace=replace) as fresh, writing_with_orbax(path):
         with _checkpointer() as checkpointer:
             checkpointer.save(fresh / "params", jax.device_get(params))
             checkpointer.wait_until_finished()
@@ -270,6 +271,22 @@ def read_with_orbax(read: Callable[[], Any], where: str, mend: str) -> Any:
     except Exception as error:
         reason = f"{type(error).__name__}: {one_line(error):.200}"
         raise InputError(f"{where} cannot be read ({reason}); {mend}") from error
+
+
+@contextlib.contextmanager
+def writing_with_orbax(path: Path) -> Iterator[None]:
+    """Turns the operating system's errors in the block, which writes `path`, into DiskError, as `disk_errors` does;
+    those too that Orbax passes on as the text of another exception."""
+    try:
+        with disk_errors(path):
+            yield
+    except InputError:
+        raise
+    except Exception as error:
+        code = re.search(r"os_error_code='(\d+)'", str(error))
+        if code is None:
+            raise
+        raise DiskError(f"{path}: {os.strerror(int(code[1]))}") from error
 
 
 @contextlib.contextmanager

@@ -92,10 +92,13 @@ def _layouts(pickled: bytes, path: Path) -> tuple[dict[str, TensorLayout | Unrea
         raise InputError(
             f"{path}: data.pkl is damaged ({type(error).__name__}: {error}); copy or download it again"
         ) from error
-    if kind := getattr(tree, "kind", None):
+    kind = getattr(tree, "kind", None)
+    if kind and not isinstance(tree, TensorLayout | UnreadTensor):
         raise InputError(f"{path}: the pickle holds code or objects other than tensors: refused {kind}; {_MEND}")
     if not isinstance(tree, dict):
-        raise InputError(f"{path}: holds a {type(tree).__name__}, expected a state dict of tensors; {_STATE_DICT}")
+        raise InputError(
+            f"{path}: holds a {kind or type(tree).__name__}, expected a state dict of tensors; {_STATE_DICT}"
+        )
     state_dict, origin = find_state_dict(tree, lambda value: isinstance(value, TensorLayout | UnreadTensor), str(path))
     others = {
         name: value

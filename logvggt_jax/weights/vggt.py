@@ -224,16 +224,20 @@ def params_from_vggt(
     report = ConversionReport()
     known = {rule.name for rule in rules}
     heads = _BUFFERS + (("track_head.",) if config.point_head is not None else ("track_head.", "point_head."))
-    for name in state_dict:
-        if name not in known and not name.startswith(heads):
-            raise InputError(f"unknown key {name!r} in the state dict{_differences(state_dict, config)}")
+    unknown = [name for name in state_dict if name not in known and not name.startswith(heads)]
+    if unknown:
+        others = f" and {len(unknown) - 1} others" if len(unknown) > 1 else ""
+        raise InputError(
+            f"unknown key {unknown[0]!r}{others} in the state dict, expected those of VGGT's aggregator, camera_head, "
+            f"depth_head, point_head and track_head{_differences(state_dict, config)}"
+        )
     report.skipped = [name for name in state_dict if name not in known]
     present = [rule for rule in rules if rule.name in state_dict]
     missing = [rule.name for rule in rules if rule.name not in state_dict and rule.name != _MASK_TOKEN]
     if missing:
         raise InputError(
             f"{len(missing)} of {len(rules)} keys are missing from the state dict, first {', '.join(missing[:3])}"
-            f"{_differences(state_dict, config)}"
+            f"{_differences(state_dict, config)}; {_seen(state_dict)}"
         )
     params: dict[str, Any] = {}
     for rule in present:

@@ -127,6 +127,16 @@ def test_a_failed_save_leaves_the_older_model_and_nothing_else(folder, small_con
     _assert_same(load_model(folder)[1], small_variables)
 
 
+def test_a_full_disk_is_one_line_with_the_path(tmp_path, small_config, small_variables, monkeypatch):
+    def fail(*args, **kwargs):  # as Orbax does it
+        raise ValueError("RESOURCE_EXHAUSTED: Error writing: No space left on device [os_error_code='28']")
+
+    monkeypatch.setattr(ocp.StandardCheckpointer, "save", fail)
+    with pytest.raises(DiskError, match=r"/model: No space left on device$"):
+        save_model(tmp_path / "model", small_config, small_variables["params"])
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_folder_that_is_no_model_is_never_overwritten(tmp_path, small_config, small_variables):
     (tmp_path / "thesis.tex").write_text("years of work")
     with pytest.raises(FileExistsError, match="not a model folder"):
