@@ -24,6 +24,10 @@ def resolve(path_or_repo: str | Path) -> Path:
     found = hub_address(path_or_repo)
     if found is not None:
         return download(*found)
+    if isinstance(path_or_repo, str) and path_or_repo.startswith(PREFIX):
+        raise MissingInput(
+            f"{path_or_repo}: no address on the hub; expected {PREFIX}owner/name, or {PREFIX}owner/name/file"
+        )
     path = Path(path_or_repo).expanduser()
     if not path.exists():
         raise MissingInput(

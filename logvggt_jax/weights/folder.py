@@ -4,8 +4,9 @@ import json
 from pathlib import Path
 from typing import Any
 
-from logvggt_jax.errors import InputError, MissingInput, disk_errors
+from logvggt_jax.errors import InputError, MissingInput
 from logvggt_jax.weights.digests import json_digest
+from logvggt_jax.weights.json_file import read_json
 
 FORMAT = "logvggt-jax model"
 VERSION = 1
@@ -44,11 +45,7 @@ def read_description(path: Path) -> dict[str, Any]:
     file = path / "config.json"
     if not file.is_file():
         raise MissingInput(f"{file}: no such file{_why_no_model(path)}")
-    try:
-        with disk_errors(file):
-            description = json.loads(file.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"{file}: not valid JSON ({error}); {MEND}") from error
+    description = read_json(file, MEND)
     if not isinstance(description, dict) or description.get("format") != FORMAT:
         raise InputError(f"{file}: not the description of a model of this package (format {FORMAT!r})")
     if description.get("version") != VERSION:

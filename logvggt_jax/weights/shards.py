@@ -1,10 +1,10 @@
 """Checkpoints in several files, with an index that says which tensor lies in which."""
 
-import json
 import re
 from pathlib import Path
 
-from logvggt_jax.errors import InputError, MissingInput, disk_errors
+from logvggt_jax.errors import InputError, MissingInput
+from logvggt_jax.weights.json_file import read_json
 
 INDEX_SUFFIX = ".index.json"
 _SHARD = re.compile(r".*-(\d{5})-of-(\d{5})\.\w+")
@@ -21,13 +21,7 @@ def read_index(path: Path) -> dict[str, str]:
 
     Raises InputError for a JSON text that is no such index, or that names a file of another folder.
     """
-    try:
-        with disk_errors(path):
-            index = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{path}: not valid JSON ({error}), so no index of shards; copy it again") from error
+    index = read_json(path, "so it is no index of shards; copy it again")
     weight_map = index.get("weight_map") if isinstance(index, dict) else None
     if not isinstance(weight_map, dict) or not weight_map:
         raise InputError(

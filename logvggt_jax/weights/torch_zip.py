@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from logvggt_jax.errors import InputError, disk_errors
+from logvggt_jax.errors import InputError, disk_errors, one_line
 from logvggt_jax.weights.lazy import LazyTensors, refused_type
 from logvggt_jax.weights.state_dicts import described, find_state_dict
 from logvggt_jax.weights.unpickling import RefusedError, TensorLayout, UnreadTensor, unpickle
@@ -32,7 +32,9 @@ def open_torch_zip(path: Path) -> Iterator[LazyTensors]:
     try:
         with disk_errors(path):
             opened = zipfile.ZipFile(path)
-    except zipfile.BadZipFile as error:
+    except InputError:
+        raise
+    except Exception as error:  # of damaged names and versions of the format, any
         raise InputError(f"{path}: the zip archive is truncated or damaged; copy or download the file again") from error
     with opened as archive:
         root = _root(archive, path)
@@ -76,8 +78,10 @@ def _read(archive: zipfile.ZipFile, member: str, path: Path) -> bytes:
             raise InputError(f"{path}: {member} is compressed, torch.save never does that; {_MEND}")
         # Reading to the end checks the member's CRC.
         return archive.read(info)
-    except (KeyError, zipfile.BadZipFile, EOFError, OSError) as error:
-        reason = f"{member} is missing" if isinstance(error, KeyError) else str(error)
+    except InputError:
+        raise
+    except Exception as error:  # a damaged header may ask for a password, among others
+        reason = f"{member} is missing" if isinstance(error, KeyError) else one_line(error)
         raise InputError(f"{path}: {reason}; the file is damaged, copy or download it again") from error
 
 
@@ -90,7 +94,7 @@ def _layouts(pickled: bytes, path: Path) -> tuple[dict[str, TensorLayout | Unrea
     except Exception as error:
         # A malformed pickle raises whatever its broken instructions run into.
         raise InputError(
-            f"{path}: data.pkl is damaged ({type(error).__name__}: {error}); copy or download it again"
+            f"{path}: data.pkl is damaged ({type(error).__name__}: {one_line(error):.200}); copy or download it again"
         ) from error
     kind = getattr(tree, "kind", None)
     if kind and not isinstance(tree, TensorLayout | UnreadTensor):

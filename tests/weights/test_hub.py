@@ -193,6 +193,8 @@ def test_a_path_that_exists_is_never_a_repository(hub, tmp_path, monkeypatch):
     for text in ("./owner/vgtt", "../owner/vgtt", "/owner/vgtt", "~/owner-of-nothing", "other/vggt.ckpt", "a/b/c"):
         with pytest.raises(FileNotFoundError, match="no such file or folder"):
             resolve(text)
+    with pytest.raises(FileNotFoundError, match=r"hf:vggt: no address on the hub; expected hf:owner/name"):
+        resolve("hf:vggt")
     with pytest.raises(FileNotFoundError, match=r"stranger/vggt: no such file or folder"):
         resolve(Path("stranger/vggt"))  # whoever has a path says so
     with pytest.raises(FileNotFoundError, match=r"did you mean owner/vggt\?"):

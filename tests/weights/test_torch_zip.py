@@ -246,3 +246,24 @@ def test_types_that_are_not_read_name_the_tensor_when_it_is_asked_for(tmp_path, 
     )
     with open_torch_zip(path) as tensors, pytest.raises(InputError, match=r"tensor w is float8_e4m3fn.*bfloat16"):
         tensors["w"]
+
+
+def test_damage_anywhere_is_an_error_with_the_file_or_has_no_effect(tmp_path, write_torch_file):
+    tensors = {"a.weight": np.arange(12, dtype=np.float32).reshape(3, 4), "a.bias": np.ones(4, np.float16)}
+    settings = write_torch_file.instance("argparse", "Namespace", {"lr": 0.5})
+    path = write_torch_file(tmp_path / "model.pt", {"model": tensors, "args": settings})
+    good, rng, refused = path.read_bytes(), np.random.default_rng(0), 0
+    for i in range(1500):
+        bad = bytearray(good)
+        if i % 3:
+            bad[rng.integers(len(bad))] ^= 1 << rng.integers(8)
+        else:
+            start = rng.integers(len(bad))
+            bad[start : start + rng.integers(1, 40)] = rng.bytes(rng.integers(40))
+        path.write_bytes(bad)
+        try:
+            _read_all(path)
+        except InputError as error:
+            assert str(error).startswith(f"{path}: ") and "\n" not in str(error)
+            refused += 1
+    assert refused > 1000

@@ -102,6 +102,8 @@ def test_the_content_says_what_a_file_is(tmp_path, write_torch_file, name, torch
         (b"", "empty"),
         (b"weights of a friend", "begins with b'weights of a fri'"),
         (b'{"error": "not found"}', "JSON text.*weight_map"),
+        (b'{"weight_map": ' + b"[" * 100_000, "not valid JSON"),
+        (b'{"weight_map": ' + b"9" * 5000, "not valid JSON"),
         (b"PK\x03\x04 and then nothing", "zip archive is truncated"),
     ],
 )
