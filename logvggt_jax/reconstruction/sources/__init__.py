@@ -30,6 +30,7 @@ def open_source(path: str | Path, **options: Any) -> Source:
     chosen = SourceOptions(**options)
     if is_live(path):
         return VideoSource(path, chosen)
+    given = path
     try:
         path = Path(path).expanduser()
         if names_pictures(path):
@@ -37,12 +38,12 @@ def open_source(path: str | Path, **options: Any) -> Source:
         with disk_errors(path):
             path.stat()
     except MissingInput as error:
-        if path.exists():
+        if Path(path).exists():
             raise
         raise MissingInput(f"{path} does not exist: expected a folder of images or a video file") from error
     except (RuntimeError, ValueError) as error:
         # No such user, or a null character.
-        raise error if isinstance(error, InputError) else InputError(f"{path!r} is no path: {error}") from error
+        raise error if isinstance(error, InputError) else InputError(f"{given!r} is no path: {error}") from error
     if path.suffix.lower() in IMAGE_SUFFIXES:
         raise InputError(f"{path} is a single image: give the folder that holds the sequence, a glob, or a video")
     return VideoSource(path, chosen)
