@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-from logvggt_jax.errors import InputError, OutputExists, disk_errors
+from logvggt_jax.errors import DiskError, InputError, OutputExists, disk_errors
 
 
 @contextmanager
@@ -94,6 +94,30 @@ def check_output(output: str | Path, *, overwrite: bool, marker: str) -> Path:
             "output or delete it yourself"
         )
     return output
+
+
+def check_writable(output: Path) -> None:
+    """Raises DiskError unless something can be made at `output`, an absolute path, as far as permissions tell."""
+    parent = existing_parent(output)
+    if not parent.is_dir():
+        raise DiskError(f"{output}: {parent} is no folder; choose another output")
+    if not os.access(parent, os.W_OK | os.X_OK):
+        raise DiskError(f"{output}: no permission to write in {parent}; choose another output")
+
+
+def check_space(output: Path, needed: int, mend: str = "make room or choose another output") -> str:
+    """How many bytes are needed at `output` and how many are free, in words; DiskError where they do not suffice."""
+    parent = existing_parent(output)
+    free = shutil.disk_usage(parent).free
+    words = f"about {needed / 1e6:,.1f} MB, {free / 1e6:,.1f} MB are free in {parent}"
+    if free < needed:
+        raise DiskError(f"{output}: needs {words}; {mend}")
+    return words
+
+
+def existing_parent(path: Path) -> Path:
+    """The innermost folder above `path` that is there."""
+    return next(parent for parent in path.parents if parent.exists())
 
 
 def user_cache_folder(kind: str) -> Path:

@@ -32,6 +32,7 @@ def write_cameras(
     model_size: tuple[int, int],
     complete: bool = True,
     skipped: Sequence[tuple[str, str]] = (),
+    noted_focal_length: float | None = None,
 ) -> None:
     """Writes all cameras as one JSON file.
 
@@ -46,6 +47,7 @@ def write_cameras(
       model_size: (H, W) of the depth maps.
       complete: whether the sequence was read to its end.
       skipped: frames that could not be read, with the reason.
+      noted_focal_length: pixels of the original images, as the camera noted it; None where it is not known.
     """
     frames: list[dict[str, Any]] = [
         {
@@ -66,6 +68,7 @@ def write_cameras(
         "image_size": list(image_size),
         "depth_size": list(model_size),
         "complete": complete,
+        "noted_focal_length": noted_focal_length,
         "skipped": [{"name": name, "reason": reason} for name, reason in skipped],
         "frames": frames,
     }
@@ -118,8 +121,10 @@ def _checked(document: Any) -> dict[str, Any]:
         size = document.get(key)
         valid = isinstance(size, list) and len(size) == 2 and all(type(n) is int and 0 < n < 2**31 for n in size)
         _require(valid, f"{key} must be height and width in pixels, got {shown(size)}")
-    # Earlier versions wrote neither.
+    # Earlier versions wrote none of these.
     complete, skipped = document.setdefault("complete", True), document.setdefault("skipped", [])
+    noted = document.setdefault("noted_focal_length", None)
+    _require(noted is None or bool(_numbers(noted, (), "noted_focal_length") > 0), "noted_focal_length must be above 0")
     _require(type(complete) is bool, f"complete must be true or false, got {shown(complete)}")
     _require(
         isinstance(skipped, list)

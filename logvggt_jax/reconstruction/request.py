@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +10,8 @@ import jax
 
 from logvggt_jax.config import ModelConfig
 from logvggt_jax.data.feeding.transforms import check_longer_edge, resized_size
-from logvggt_jax.errors import DiskError, InputError
-from logvggt_jax.files import check_output
+from logvggt_jax.errors import InputError
+from logvggt_jax.files import check_output, check_space, check_writable
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.operations import matmul_flops_per_second
 from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE
@@ -42,9 +40,7 @@ def check_request(source: Source, output: str | Path, *, longer_edge: int | None
         raise InputError(f"output {output} contains the source {source.path}: choose another output")
     if overwrite or not is_unfinished(target):
         check_output(target, overwrite=overwrite, marker=CAMERAS_FILE)
-    parent = existing_parent(target)
-    if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
-        raise DiskError(f"{parent}: no folder can be made there; choose another output or mend its permissions")
+    check_writable(target)
     return target
 
 
@@ -56,18 +52,6 @@ def disk_bytes(num_frames: int | None, size: tuple[int, int], point_filter: Poin
     pixels = frames * height * width // point_filter.pixel_stride**2
     points = min(pixels, point_filter.max_points or pixels) * VERTEX.itemsize
     return frame, frames * frame + points
-
-
-def check_free_space(output: Path, needed: int) -> int:
-    """Free bytes where `output` will lie; InputError where they are fewer than `needed`."""
-    parent = existing_parent(output)
-    free = shutil.disk_usage(parent).free
-    if free < needed:
-        raise InputError(
-            f"{parent}: {free / 1e9:.1f} GB are free, about {needed / 1e9:.1f} GB are needed; make room, choose "
-            "another output, or take fewer frames (--stride, --max-frames) or a smaller --longer-edge"
-        )
-    return free
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,12 +89,12 @@ def describe(
         return [f"{count} frames of a size that is known with the first one; method {method}"]
     size = resized_size(source.image_size, longer_edge)
     frame, whole = disk_bytes(frames, size, point_filter)
-    free = check_free_space(output, whole)
-    needed = f"{whole / 1e9:.2f} GB" if frames is not None else f"{frame / 1e6:.1f} MB a frame"
+    space = check_space(output, whole, "make room, choose another output, or take fewer (--stride) or smaller frames")
+    a_frame = "" if frames is not None else f"; {frame / 1e6:.2f} MB a frame"
     original = "x".join(map(str, source.image_size[::-1]))
     lines = [
         f"{count} frames of {original} pixels, {size[1]}x{size[0]} for the model; method {method}",
-        f"disk: about {needed}, {free / 1e9:.1f} GB are free at {existing_parent(output)}",
+        f"disk: {space}{a_frame}",
     ]
     if config is not None:
         needs = device_needs(method, LogVGGT(config), settings, size, frames)
@@ -139,8 +123,3 @@ def device_needs(
         working = whole - memory.alias_size_in_bytes - parameters
     rate = _REACHED * matmul_flops_per_second(model.config.dtype)
     return DeviceNeeds(parameters, working, program.flops / program.frames / rate)
-
-
-def existing_parent(path: Path) -> Path:
-    """The innermost folder above `path` that is there."""
-    return next(parent for parent in path.parents if parent.exists())

@@ -35,6 +35,7 @@ class Reconstruction:
       depth_size: (h, w) of depth, confidence and image.
       complete: False if the run was ended before the end of its source.
       skipped: names of frames that could not be read and are left out.
+      noted_focal_length: pixels of the original images, as the camera noted it in EXIF; None where it did not.
       seconds: from the first frame to the last depth map, compilation included; None for a folder opened later.
     """
 
@@ -48,6 +49,7 @@ class Reconstruction:
     depth_size: tuple[int, int]
     complete: bool = True
     skipped: tuple[str, ...] = ()
+    noted_focal_length: float | None = None
     seconds: float | None = None
 
     @classmethod
@@ -90,6 +92,7 @@ class Reconstruction:
             image_size=tuple(document["image_size"]),
             depth_size=tuple(document["depth_size"]),
             complete=document["complete"],
+            noted_focal_length=document["noted_focal_length"],
             skipped=tuple(frame["name"] for frame in document["skipped"]),
         )
 
@@ -140,6 +143,11 @@ class Reconstruction:
         notes = [] if self.complete else ["ended early: the same command goes on from here"]
         if self.skipped:
             notes.append(f"{len(self.skipped)} frames left out: {', '.join(map(printable, self.skipped[:5]))}")
+        if self.noted_focal_length:
+            focal = float(np.median(self.intrinsics[:, 0, 0]))
+            notes.append(
+                f"focal length: {focal:.0f} pixels predicted, {self.noted_focal_length:.0f} by the camera's EXIF"
+            )
         folder = printable(str(self.folder))
         return "\n".join(
             [f"{self.num_frames} frames{took}", *notes, *(f"  {folder}/{name}: {what}" for name, what in lines)]

@@ -35,6 +35,7 @@ class _Picture(NamedTuple):
     timestamp: float
     image: np.ndarray
     transform: ResizeTransform
+    focal_length: float | None
 
 
 class Run:
@@ -71,6 +72,7 @@ class Run:
         self._names: list[str] = []
         self._timestamps: list[float] = []
         self._transform: ResizeTransform | None = None
+        self._focal_length: float | None = None
         # Frames whose depth is not final yet.
         self._images: dict[int, np.ndarray] = {}
         # Written since the last save.
@@ -96,7 +98,7 @@ class Run:
                 self._images[len(self._names)] = picture.image
                 self._names.append(picture.name)
                 self._timestamps.append(picture.timestamp)
-                self._transform = picture.transform
+                self._transform, self._focal_length = picture.transform, picture.focal_length or self._focal_length
                 self._hand_on(self._predictor.push(picture.image))
             advance()
             if stop.reason:
@@ -142,6 +144,7 @@ class Run:
             model_size=transform.size,
             complete=complete,
             skipped=self._source.skipped,
+            noted_focal_length=self._focal_length,
         )
 
     def _pictures(self) -> Iterator[_Picture | None]:
@@ -163,7 +166,7 @@ class Run:
         if frame is None:
             return None
         image, transform = resize(frame.image, longer_edge=self._longer_edge)
-        return _Picture(frame.name, frame.timestamp, image, transform)
+        return _Picture(frame.name, frame.timestamp, image, transform, frame.focal_length)
 
     def _hand_on(self, results: list[FrameResult]) -> None:
         for result in results:
@@ -191,6 +194,7 @@ class Run:
             "names": self._names,
             "timestamps": self._timestamps,
             "skipped": self._source.skipped,
+            "focal_length": self._focal_length,
             "size": None if self._transform is None else self._transform.original_size,
             "model_size": None if self._transform is None else self._transform.size,
         }
@@ -207,6 +211,7 @@ class Run:
                 f"{self._source.path} has changed since {self._work.path} was left unfinished: frames that were read "
                 "are other ones, or are taken otherwise; pass --overwrite to start anew"
             )
+        self._focal_length = facts["focal_length"]
         self._names, self._timestamps = facts["names"], facts["timestamps"]
         self._source.skipped[:] = [SkippedFrame(*each) for each in facts["skipped"]]
         if facts["size"]:

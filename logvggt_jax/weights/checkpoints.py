@@ -12,7 +12,6 @@ import dataclasses
 import importlib.metadata
 import os
 import re
-import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,7 @@ from rich.progress import Progress
 
 from logvggt_jax.config import ModelConfig, from_mapping
 from logvggt_jax.errors import DiskError, InputError, MissingInput, OutputExists, disk_errors, one_line
-from logvggt_jax.files import atomic_folder, check_output
+from logvggt_jax.files import atomic_folder, check_output, check_space, check_writable
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.weights.address import hub_address, resolve, similar
 from logvggt_jax.weights.digests import check_finite, digests, named_leaves, verify_digests
@@ -178,7 +177,7 @@ def convert(
     """
     destination = check_output(destination, overwrite=overwrite, marker="config.json")
     check_destination(destination)
-    _check_writable(destination)
+    check_writable(destination)
     path, progress_console = resolve(source), Console(stderr=True)
     if path.is_dir() and is_model_folder(path):
         raise InputError(f"{path}: is a model folder already, there is nothing to convert")
@@ -186,7 +185,11 @@ def convert(
         config = config_from_vggt(state_dict, point_head=point_head)
         needed = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(parameter_shapes(config)))
         progress_console.print(
-            _sizes(config), _check_space(destination, needed), soft_wrap=True, highlight=False, markup=False
+            _sizes(config),
+            f"the folder takes {check_space(destination, needed)}",
+            soft_wrap=True,
+            highlight=False,
+            markup=False,
         )
         with Progress(console=progress_console, transient=True) as progress:
             task = progress.add_task("Reading tensors", total=len(vggt_rules(config)))
@@ -213,28 +216,6 @@ def _sizes(config: ModelConfig) -> str:
         f"encoder of {config.encoder.depth} blocks and width {config.encoder.embed_dim}, aggregator of "
         f"{config.aggregator.depth} + {config.aggregator.depth} blocks, camera head of {config.camera_head.depth};"
     )
-
-
-def _check_writable(destination: Path) -> None:
-    parent = _existing_parent(destination)
-    if not parent.is_dir():
-        raise DiskError(f"{destination}: {parent} is no folder; choose another output")
-    if not os.access(parent, os.W_OK | os.X_OK):
-        raise DiskError(f"{destination}: no permission to write in {parent}; choose another output")
-
-
-def _check_space(destination: Path, needed: int) -> str:
-    """How much a model folder needs and how much is free, in words; DiskError where that does not suffice."""
-    parent = _existing_parent(destination)
-    free = shutil.disk_usage(parent).free
-    words = f"the folder takes about {needed / 1e6:,.1f} MB, {free / 1e6:,.1f} MB are free in {parent}"
-    if free < needed:
-        raise DiskError(f"{destination}: {words}; make room or choose another output")
-    return words
-
-
-def _existing_parent(destination: Path) -> Path:
-    return next(parent for parent in destination.parents if parent.exists())
 
 
 def _vggt_provenance(source: str | Path) -> Provenance:

@@ -14,9 +14,9 @@ from PIL import Image
 from recorder import LONGER_EDGE, Recorder, reconstruct_recorded
 
 from logvggt_jax import LogVGGT, ModelConfig
-from logvggt_jax.errors import DiskError, InputError
+from logvggt_jax.errors import DiskError
 from logvggt_jax.reconstruction import PointFilter, open_source
-from logvggt_jax.reconstruction.request import check_free_space, check_request, device_needs, disk_bytes
+from logvggt_jax.reconstruction.request import check_request, describe, device_needs, disk_bytes
 from logvggt_jax.streaming import METHODS, ChunkPlan
 
 
@@ -41,11 +41,14 @@ def test_a_result_fits_into_what_was_estimated(walk: Path, tmp_path: Path) -> No
     assert disk_bytes(None, (392, 518), PointFilter())[0] == 392 * 518 * 5
 
 
-def test_a_disk_that_is_too_small_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=3_000_000_000))
-    assert check_free_space(tmp_path / "new" / "out", 2_900_000_000) == 3_000_000_000
-    with pytest.raises(InputError, match=r"3\.0 GB are free, about 4\.5 GB are needed.*--stride"):
-        check_free_space(tmp_path / "new" / "out", 4_500_000_000)
+def test_a_disk_that_is_too_small_is_refused(walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source, output = open_source(walk), tmp_path / "new" / "out"
+    arguments = (source, output, None, "windows", None, LONGER_EDGE, PointFilter())
+    lines = describe(*arguments)
+    assert lines[0].startswith("12 frames of 168x112 pixels, 42x28 for the model") and "MB are free in" in lines[1]
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=100_000))
+    with pytest.raises(DiskError, match=r"out: needs about 0\.\d MB, 0\.1 MB are free.*--stride"):
+        describe(*arguments)
 
 
 def test_an_output_that_cannot_be_made_is_refused(walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -53,10 +56,10 @@ def test_an_output_that_cannot_be_made_is_refused(walk: Path, tmp_path: Path, mo
     source = open_source(walk)
     options = {"longer_edge": LONGER_EDGE, "overwrite": False}
     assert check_request(source, tmp_path / "new" / "out", **options) == tmp_path / "new" / "out"
-    with pytest.raises(DiskError, match=r"file: no folder can be made there"):
+    with pytest.raises(DiskError, match=r"file is no folder"):
         check_request(source, tmp_path / "file" / "out", **options)
     monkeypatch.setattr(os, "access", lambda *_: False)
-    with pytest.raises(DiskError, match="permissions"):
+    with pytest.raises(DiskError, match="no permission"):
         check_request(source, tmp_path / "new" / "out", **options)
 
 
