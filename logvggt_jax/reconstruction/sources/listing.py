@@ -130,7 +130,7 @@ def _of_list(path: Path, pattern: str | None) -> Listing:
         text = line.strip()
         if not text or text.startswith("#"):
             continue
-        file = path.parent / Path(text).expanduser()
+        file = path.absolute().parent / text
         with disk_errors(f"{path}, line {number}"):
             if "\0" in text or not file.exists():
                 raise MissingInput(
