@@ -23,7 +23,7 @@ $(VENV)/.installed: pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed, for example: make PYTHON=python3.12")'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet --editable ".[data,eval,heic,hub,viewer,dev]"
+	$(BIN)/python -m pip install --quiet --editable ".[data,eval,heic,hub,video,viewer,dev]"
 	@touch $@
 
 demo: install
@@ -32,7 +32,7 @@ demo: install
 	$(CPU) $(BIN)/logvggt render-room --output $(DEMO)/room --frames 48 --size 56x70 --split test
 	$(CPU) $(BIN)/logvggt reconstruct $(DEMO)/room --checkpoint $(DEMO)/training/model \
 	  --output $(DEMO)/reconstruction --longer-edge 70
-	$(CPU) $(BIN)/python eval.py --config=configs/eval/rooms.py --config.rooms.num_rooms=8 \
+	$(CPU) $(BIN)/python eval.py --config=configs/eval/rooms.py --config.options.num_rooms=8 \
 	  --checkpoint=$(DEMO)/training/model --output=$(DEMO)/evaluation
 	@echo
 	@echo "Results in $(DEMO)/:"

@@ -4,7 +4,7 @@
 
     python eval.py --config=configs/eval/paper.py --checkpoint=vggt/model --data_root=data --output=runs/eval-paper
 
-Any field of the configuration can be changed on the command line: --config.rooms.num_rooms=8. The rows of the model
+Any field of the configuration can be changed on the command line: --config.options.num_rooms=8. The rows of the model
 are chosen by name, the first one is drawn: --config.methods="('windows', 'offline')".
 """
 
@@ -18,7 +18,7 @@ from absl import app, flags, logging
 from ml_collections import config_flags
 
 from logvggt_jax.compile import check_devices, enable_compilation_cache
-from logvggt_jax.errors import InputError, one_line
+from logvggt_jax.errors import InputError, one_line, printable
 from logvggt_jax.evaluation.report.report import print_report
 from logvggt_jax.evaluation.run import run_evaluation
 from logvggt_jax.terminal import forgiving_streams
@@ -26,7 +26,10 @@ from logvggt_jax.terminal import forgiving_streams
 _CONFIG = config_flags.DEFINE_config_file("config", None, "what to evaluate: a file of configs/eval", lock_config=True)
 _CHECKPOINT = flags.DEFINE_string("checkpoint", None, "model folder, as training and `logvggt convert` write it")
 _OUTPUT = flags.DEFINE_string(
-    "output", None, "folder of the results; an interrupted run goes on, others are replaced once this one is complete"
+    "output",
+    None,
+    "folder of the results, new or an evaluation's; an interrupted run goes on, others are replaced once this one is "
+    "complete",
 )
 _DATA_ROOT = flags.DEFINE_string(
     "data_root", None, "folder of the data set, where it is read from disk; for several, the folder of their folders"
@@ -56,7 +59,7 @@ def main(arguments: Sequence[str]) -> None:
             raise
         sys.exit(f"eval.py: {one_line(error)}")
     print_report(results)
-    print(f"\nTables, JSON and figures are in {_OUTPUT.value}/; report.html has all of it on one page")
+    print(f"\nTables, JSON and figures are in {printable(_OUTPUT.value)}/; report.html has all of it on one page")
 
 
 def parse_flags(arguments: list[str]) -> list[str]:

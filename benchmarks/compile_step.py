@@ -24,6 +24,7 @@ import jax
 import jax.numpy as jnp
 
 from logvggt_jax import LogVGGT, ModelConfig
+from logvggt_jax.model.logvggt import variable_shapes
 
 IMAGE_SIZE = (392, 518)
 GIB = 2**30
@@ -36,7 +37,7 @@ def abstract_step(model: LogVGGT, sharding: jax.sharding.Sharding | None = None)
     def frames(count: int) -> jax.ShapeDtypeStruct:
         return jax.ShapeDtypeStruct((1, count, *IMAGE_SIZE, 3), jnp.uint8)
 
-    variables = jax.eval_shape(model.init, jax.random.key(0), frames(1))
+    variables = variable_shapes(model.config)
     state = jax.eval_shape(model.start, variables, frames(windows.size - windows.stride))
     mask = jax.ShapeDtypeStruct((1, windows.stride), bool)
     place = lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding)  # noqa: E731

@@ -157,7 +157,7 @@ def main() -> None:
         print(f"{options.frames} files of 640 x 480 pixels, {size:.0f} kB each, to {SIZE[0]} x {SIZE[1]}")
         started, used = time.perf_counter(), time.process_time()
         METHODS["clock"] = Method(
-            lambda *_: predictor, WindowSettings, "windows", "a clock in the device's place", window_program
+            "clock", lambda *_: predictor, WindowSettings, "windows", "a clock in the device's place", window_program
         )
         result = reconstruct(
             folder,

@@ -162,10 +162,12 @@ def _render_room(options: argparse.Namespace) -> None:
 
 
 def _view(options: argparse.Namespace) -> None:
-    from logvggt_jax.reconstruction.viewer import open_viewer, serve_forever
+    from logvggt_jax.reconstruction.viewer import access_note, open_viewer, serve_forever
 
-    server = open_viewer(options.folder, port=options.port)
+    server = open_viewer(options.folder, host=options.host, port=options.port)
     print(f"open http://{server.get_host()}:{server.get_port()} in a browser; Ctrl-C ends the viewer", flush=True)
+    if note := access_note(options.host, server.get_port()):
+        print(f"logvggt: {note}", file=sys.stderr)
     serve_forever(server)
 
 
@@ -386,11 +388,14 @@ def _parser() -> argparse.ArgumentParser:
     sub = command(
         "view",
         _view,
-        "look at a reconstruction in the browser (this machine only)",
+        "look at a reconstruction in the browser",
         "logvggt view runs/walk",
+        details=" Only this machine's browser reaches the page. From another machine, open a tunnel: "
+        "ssh -N -L 8080:localhost:8080 USER@THIS_MACHINE.",
     )
     sub.add_argument("folder", type=Path, help="output of `logvggt reconstruct`")
     sub.add_argument("--port", type=int, default=8080, help="of the web page; the next free one if in use")
+    sub.add_argument("--host", default="127.0.0.1", help="serve at this address, to the network that it belongs to")
 
     sub = command(
         "info",

@@ -7,10 +7,8 @@ from pathlib import Path
 
 import jax
 
-from logvggt_jax.errors import InputError
+from logvggt_jax.errors import InputError, install_line, one_line
 from logvggt_jax.files import user_cache_folder
-
-_INSTALL = 'pip install "logvggt-jax[cuda]"'
 
 
 def nvidia_gpu_present() -> bool:
@@ -28,14 +26,14 @@ def check_devices() -> None:
     try:
         platform = jax.default_backend()
     except (RuntimeError, AssertionError) as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
         raise InputError(
-            f"JAX_PLATFORMS={asked}: these devices do not start ({reason:.200}); install JAX for them ({_INSTALL} for "
-            "NVIDIA GPUs) or unset JAX_PLATFORMS"
+            f"JAX_PLATFORMS={asked}: these devices do not start ({one_line(error):.200}); install JAX for them "
+            f"({install_line('cuda')} for NVIDIA GPUs) or unset JAX_PLATFORMS"
         ) from error
     if platform == "cpu" and "cpu" not in asked and nvidia_gpu_present():
         warnings.warn(
-            f"JAX computes on the CPU, but this machine has an NVIDIA GPU: {_INSTALL}, or set JAX_PLATFORMS=cpu",
+            f"JAX computes on the CPU, but this machine has an NVIDIA GPU: {install_line('cuda')}, or set "
+            "JAX_PLATFORMS=cpu",
             stacklevel=2,
         )
 

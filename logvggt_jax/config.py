@@ -75,12 +75,13 @@ def to_mapping(config: Any) -> dict[str, Any]:
     return mapping
 
 
-def require_counts(config: Any, *names: str) -> None:
-    """Raises InputError unless these fields are whole numbers of at least 1; None passes, where a type allows it."""
+def require_counts(config: Any, *names: str, least: int = 1) -> None:
+    """Raises InputError unless these fields are whole numbers of at least `least`; None passes, where a type allows."""
+    kind = "a positive integer" if least == 1 else f"an integer of at least {least}"
     for name in names:
         value = getattr(config, name)
-        if value is not None and (not _is_number(value, numbers.Integral) or value < 1):
-            raise InputError(f"{type(config).__name__}.{name} must be a positive integer, got {value!r}")
+        if value is not None and (not _is_number(value, numbers.Integral) or value < least):
+            raise InputError(f"{type(config).__name__}.{name} must be {kind}, got {value!r}")
 
 
 def require_within(config: Any, interval: str, *names: str) -> None:

@@ -1,8 +1,14 @@
 """Errors of what a user gave, which entry points shorten to one line; any other exception keeps its traceback."""
 
+import unicodedata
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+# Control characters, lone surrogates (bytes of a name that are not UTF-8), separators of lines, and what reorders text;
+# joiners are letters' own.
+_UNSEEN = ("Cc", "Cf", "Cs", "Zl", "Zp")
+_JOINERS = "\u200c\u200d"
 
 
 class InputError(ValueError):
@@ -44,6 +50,29 @@ def disk_errors(path: str | Path) -> Iterator[None]:
         raise kind(f"{path}: {error.strerror or error}") from error
 
 
+def printable(text: str) -> str:
+    """A user's text with control characters shown as escapes, so that it stays on its line and moves no cursor.
+
+    Names of files, sequences and titles come from anywhere; a terminal would obey what they hold, and a stream in
+    UTF-8 refuses a name that is not.
+    """
+    if text.isprintable():
+        return text
+    return "".join(_escaped(c) if unicodedata.category(c) in _UNSEEN and c not in _JOINERS else c for c in text)
+
+
 def one_line(error: BaseException) -> str:
-    """An error's message on one line."""
-    return " ".join(str(error).split()) or type(error).__name__
+    """An error's message on one line, `printable`."""
+    return printable(" ".join(str(error).split())) or type(error).__name__
+
+
+def _escaped(character: str) -> str:
+    # A byte that is not UTF-8 stands in a name as a surrogate, and is shown as the byte.
+    if "\udc80" <= character <= "\udcff":
+        return f"\\x{ord(character) - 0xDC00:02x}"
+    return character.encode("unicode_escape", "surrogatepass").decode()
+
+
+def install_line(extra: str) -> str:
+    """The command that brings an extra of this package, for messages."""
+    return f'pip install "logvggt-jax[{extra}]"'

@@ -3,11 +3,27 @@
 import os
 import secrets
 import shutil
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
-from logvggt_jax.errors import OutputExists, disk_errors
+from logvggt_jax.errors import InputError, OutputExists, disk_errors
+
+
+@contextmanager
+def open_regular(path: str | Path) -> Iterator[BinaryIO]:
+    """A regular file, open for reading bytes. What else has its name, a pipe above all, is refused and not waited for.
+
+    Raises MissingInput where nothing is there, InputError where no file is, and DiskError where the operating system
+    refuses to read it, also in the block.
+    """
+    with disk_errors(path):
+        if not stat.S_ISREG(Path(path).stat().st_mode):
+            raise InputError(f"{path} is no file but a folder, a pipe or a device")
+        with Path(path).open("rb") as stream:
+            yield stream
 
 
 @contextmanager
@@ -19,12 +35,12 @@ def atomic_file(path: str | Path) -> Iterator[Path]:
     """
     path = Path(path)
     temporary = path.with_name(f".{path.stem}.{_unique()}{path.suffix}")
-    try:
-        with disk_errors(path):
+    with disk_errors(path):
+        try:
             yield temporary
             temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+        finally:
+            temporary.unlink(missing_ok=True)
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -62,12 +78,17 @@ def check_output(output: str | Path, *, overwrite: bool, marker: str) -> Path:
     With `overwrite` an existing folder may be replaced, provided it is empty or holds `marker`, a file that every
     finished folder of this kind has, so that a slip of the keyboard deletes no other folder.
     """
-    output = Path(output).expanduser().resolve()
-    if not output.exists():
-        return output
-    if not overwrite:
-        raise _exists(output)
-    if not output.is_dir() or (any(output.iterdir()) and not (output / marker).is_file()):
+    try:
+        output = Path(output).expanduser().resolve()
+    except RuntimeError as error:  # a link that leads to itself, the home of nobody
+        raise InputError(f"{output}: {error}") from error
+    with disk_errors(output):
+        if not output.exists():
+            return output
+        if not overwrite:
+            raise _exists(output)
+        replaceable = output.is_dir() and (not any(output.iterdir()) or (output / marker).is_file())
+    if not replaceable:
         raise OutputExists(
             f"{output} is not overwritten: it holds no {marker}, so it is no earlier result; choose another "
             "output or delete it yourself"

@@ -53,6 +53,18 @@ def test_imports_go_one_way() -> None:
     assert not wrong, "\n".join(wrong)
 
 
+def test_rooms_are_a_data_set_like_any_other() -> None:
+    """Only the registry, the public names and what writes a room to the disk import them; others open them by name."""
+    knowing = {"logvggt_jax.data.registry", "logvggt_jax.data.__init__", "logvggt_jax.reconstruction.room_sequence"}
+    others = {name: path for name, path in sources().items() if not name.startswith("logvggt_jax.data.rooms.")}
+    found = {
+        name
+        for name, path in others.items()
+        if any(module.startswith("logvggt_jax.data.rooms") for module in imported_modules(path))
+    }
+    assert found == knowing
+
+
 def test_there_are_no_import_circles_and_no_drawer_for_everything() -> None:
     modules = sources()
     assert not [name for name in modules if name.split(".")[-1] in {"utils", "util", "helpers", "misc", "common"}]

@@ -1,12 +1,13 @@
 """Files and folders appear whole or not at all, whatever happens while they are written."""
 
 import errno
+import os
 from pathlib import Path
 
 import pytest
 
-from logvggt_jax.errors import DiskError, MissingInput, OutputExists
-from logvggt_jax.files import atomic_file, atomic_folder, check_output, write_text
+from logvggt_jax.errors import DiskError, InputError, MissingInput, OutputExists, one_line, printable
+from logvggt_jax.files import atomic_file, atomic_folder, check_output, open_regular, write_text
 
 
 def names(folder: Path) -> list[str]:
@@ -44,6 +45,43 @@ def test_what_the_disk_refuses_is_one_line_that_names_the_file(tmp_path: Path) -
     ):
         pass
     assert names(tmp_path) == ["file"]
+
+
+def test_a_name_that_the_disk_refuses_is_one_line_too(tmp_path: Path) -> None:
+    """The temporary name cannot be removed either where there can be none."""
+    with pytest.raises(DiskError, match=r"file/f\.txt: Not a directory$"):
+        (tmp_path / "file").touch()
+        write_text(tmp_path / "file" / "f.txt", "")
+    with pytest.raises(DiskError, match=r"nnn\.txt: File name too long$"):
+        write_text(tmp_path / (300 * "n" + ".txt"), "")
+
+
+def test_only_regular_files_are_opened(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    (tmp_path / "file").write_text("content")
+    for name in ("pipe", "."):
+        with (
+            pytest.raises(InputError, match="is no file but a folder, a pipe or a device"),
+            open_regular(tmp_path / name),
+        ):
+            pass
+    with pytest.raises(MissingInput, match="nothing: No such file"), open_regular(tmp_path / "nothing"):
+        pass
+    with pytest.raises(DiskError, match="loop: Too many levels of symbolic links"), open_regular(tmp_path / "loop"):
+        pass
+    with open_regular(tmp_path / "file") as stream:
+        assert stream.read() == b"content"
+    with pytest.raises(InputError, match="loop"):
+        check_output(tmp_path / "loop" / "out", overwrite=True, marker="done")
+
+
+def test_control_characters_are_shown_and_not_obeyed() -> None:
+    assert printable("naïve 写真 a.jpg") == "naïve 写真 a.jpg"
+    assert printable("a\x1b[31m\x9b\x07\u202egnp.\u2028") == r"a\x1b[31m\x9b\x07\u202egnp.\u2028"
+    assert printable(os.fsdecode(b"caf\xe9")) == r"caf\xe9"
+    assert one_line(InputError("a\x1b[2J\nis   missing")) == r"a\x1b[2J is missing"
+    assert one_line(InputError("")) == "InputError"
 
 
 def test_a_folder_appears_whole_or_not_at_all(tmp_path: Path) -> None:

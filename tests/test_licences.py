@@ -1,6 +1,7 @@
 """What a plain `pip install` brings may be distributed with an Apache-2.0 package: none of it is under the GPL.
 
-The LGPL is allowed, since its libraries may be used by programs under other licences. evo (GPL) is in the extra `eval`.
+The LGPL is allowed, since its libraries may be used by programs under other licences. evo (GPL) is in the extra `eval`,
+PyAV, whose wheels bundle FFmpeg with parts under the GPL, in the extra `video`.
 """
 
 import re
@@ -58,9 +59,13 @@ def test_nothing_that_a_plain_install_brings_is_gpl() -> None:
     assert [name for name, metadata in found.items() if not licences(metadata)] == [], "no licence stated"
 
 
-def test_evo_stays_in_its_extra() -> None:
-    extras = PROJECT["optional-dependencies"]
-    assert [name for name, needed in extras.items() if any(text.startswith("evo") for text in needed)] == ["eval"]
+@pytest.mark.parametrize(("package", "extra"), [("evo", "eval"), ("av", "video")])
+def test_what_brings_gpl_stays_in_its_extra(package: str, extra: str) -> None:
+    extras = {
+        name: {Requirement(text).name for text in texts} for name, texts in PROJECT["optional-dependencies"].items()
+    }
+    assert [name for name, needed in extras.items() if package in needed] == [extra]
+    assert package not in {Requirement(text).name for text in PROJECT["dependencies"]}
 
 
 @pytest.mark.parametrize(

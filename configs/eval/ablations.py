@@ -19,12 +19,12 @@ def get_config() -> ConfigDict:
     config.dataset = "rooms"
     config.split = "test"
     # Rooms of the kind that configs/tiny.py trains on, twice round at stride 1.
-    config.rooms = ConfigDict({"num_rooms": 8, "style": "compass", "num_frames": 400})
+    config.options = ConfigDict({"num_rooms": 8, "style": "compass", "num_frames": 400})
     config.baselines = True
     # Rows of the model: LoG-VGGT's windows, VGGT offline up to max_frames, and VGGT on overlapping chunks, as long as
     # the model was trained at.
     config.methods = ("windows", "offline", "chunks")
-    config.references = ConfigDict({"max_frames": 200, "chunk_size": 12, "chunk_overlap": 6})
+    config.settings = ConfigDict({"offline": {"max_frames": 200}, "chunks": {"size": 12, "overlap": 6}})
     # Names of logvggt_jax/evaluation/methods/variants.py.
     config.variants = (
         "full",

@@ -25,7 +25,7 @@ def get_config() -> ConfigDict:
 
     # Rows of the model: LoG-VGGT's windows, VGGT offline up to max_frames, VGGT on overlapping chunks chained together.
     config.methods = ("windows", "offline", "chunks")
-    config.references = ConfigDict({"max_frames": 200, "chunk_size": 60, "chunk_overlap": 30})
+    config.settings = ConfigDict({"offline": {"max_frames": 200}, "chunks": {"size": 60, "overlap": 30}})
     # Names of logvggt_jax/evaluation/methods/variants.py, evaluated beside the network.
     config.variants = ()
 
@@ -39,5 +39,6 @@ def get_config() -> ConfigDict:
     protocol.max_points = 1_000_000
     protocol.icp_threshold = 0.1
     protocol.seed = 0
-    protocol.rooms = ConfigDict({"num_rooms": 24, "style": "compass", "num_frames": 96})
+    # Of data sets' readers, by name.
+    protocol.options = ConfigDict({"rooms": {"num_rooms": 24, "style": "compass", "num_frames": 96}})
     return config

@@ -21,7 +21,7 @@ def get_config() -> ConfigDict:
     # Rows of the model: LoG-VGGT's windows, VGGT offline up to max_frames, and VGGT on overlapping chunks, as long as
     # the model was trained at.
     config.methods = ("windows", "offline", "chunks")
-    config.references = ConfigDict({"max_frames": 200, "chunk_size": 12, "chunk_overlap": 6})
+    config.settings = ConfigDict({"offline": {"max_frames": 200}, "chunks": {"size": 12, "overlap": 6}})
 
     config.evaluation = evaluation = ConfigDict()
     # The tiny model's size, to which frames are scaled and cropped; VGGT-1B's would be (392, 518).

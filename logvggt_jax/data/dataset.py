@@ -3,6 +3,7 @@
 import abc
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
@@ -44,6 +45,13 @@ class Dataset(Protocol):
         """Frames `indices` of `sequence`, in the order asked for."""
         ...
 
+    def sfm_extrinsics(self, sequence: str, indices: Sequence[int]) -> np.ndarray | None:
+        """World-to-camera [T, 4, 4] float32 of a second set of true poses, from structure from motion.
+
+        NaN for single frames that it lacks; None where there is no such set.
+        """
+        ...
+
 
 @dataclass(frozen=True)
 class About:
@@ -63,8 +71,10 @@ TRAINING, EVALUATION = "training", "evaluation"
 LICENCE_NOT_READ = "not read for this list: see the set's site"
 
 
-class Reader(abc.ABC):
+class Reader(Dataset):
     """A `Dataset` that says what it is, made from its folder (where it needs one), a split, and options of its own.
+
+    The methods with a body are what other parts ask of every set; here as most sets answer.
 
     Attributes:
       name: as in `DATASETS`.
@@ -83,11 +93,32 @@ class Reader(abc.ABC):
     splits: ClassVar[tuple[str, ...]]
     about: ClassVar[About]
     needs_root: ClassVar[bool] = True
+    sequences: Sequence[str] = ()
 
     @property
     @abc.abstractmethod
     def identity(self) -> Mapping[str, Any]:
         """As of `Dataset`."""
+
+    @classmethod
+    def size_options(cls, image_size: tuple[int, int]) -> Mapping[str, Any]:
+        """The options with which pictures are made at `image_size` (H, W); none where they have the size they have."""
+        return {}
+
+    def for_training(self, *, cache_dir: str | Path | None, progress: bool) -> Dataset:
+        """The set in the form in which training reads it over and over.
+
+        What has to be made for that is kept in the folder `cache_dir`, in memory if None; `progress` shows it.
+        """
+        return self
+
+    def training_split(self) -> "Reader | None":
+        """The training split with pictures alike, where it is always at hand; None for a copy on disk."""
+        return None
+
+    def sfm_extrinsics(self, sequence: str, indices: Sequence[int]) -> np.ndarray | None:
+        """As of `Dataset`."""
+        return None
 
 
 def check_split(split: str, reader: Reader) -> None:

@@ -36,9 +36,10 @@ def missing_files(reasons: Mapping[Path, str]) -> MissingFiles:
     return error
 
 
-def missing_file(path: str | Path) -> MissingFiles:
-    """The error for a picture or depth file that was listed and is no longer there."""
-    return MissingFiles(f"{path}: no such file; fetch it again or remove the frame's other files")
+def missing_file(path: str | Path, reason: str = "; fetch it again or remove the frame's other files") -> MissingFiles:
+    """The error for a file that was listed or is needed and is not there; `reason` ends its message."""
+    what = "no regular file, but a folder, pipe or device" if Path(path).exists() else "no such file"
+    return MissingFiles(f"{path}: {what}{reason}")
 
 
 class BrokenPicture(CopyError, kind="broken picture"):

@@ -1,16 +1,19 @@
 """Data sets by name."""
 
 import inspect
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
-from logvggt_jax.data.dataset import Dataset, Reader
+from logvggt_jax.data.dataset import Reader
 from logvggt_jax.data.readers.arkitscenes import ARKitScenes
 from logvggt_jax.data.readers.blendedmvs import BlendedMVS
 from logvggt_jax.data.readers.bonn import Bonn
 from logvggt_jax.data.readers.co3dv2 import Co3Dv2
+from logvggt_jax.data.readers.colmap import Colmap
 from logvggt_jax.data.readers.hypersim import HyperSim
 from logvggt_jax.data.readers.kitti import KITTI
+from logvggt_jax.data.readers.kitti_odometry import KITTIOdometry
 from logvggt_jax.data.readers.mvs_synth import MVSSynth
 from logvggt_jax.data.readers.nrgbd import NRGBD
 from logvggt_jax.data.readers.pointodyssey import PointOdyssey
@@ -20,6 +23,7 @@ from logvggt_jax.data.readers.seven_scenes import SevenScenes
 from logvggt_jax.data.readers.sintel import Sintel
 from logvggt_jax.data.readers.spring import Spring
 from logvggt_jax.data.readers.tum import TUM
+from logvggt_jax.data.readers.tum_recording import TUMRecording
 from logvggt_jax.data.readers.virtual_kitti import VirtualKITTI
 from logvggt_jax.data.readers.wildrgbd import WildRGBD
 from logvggt_jax.data.rooms.rooms import Rooms
@@ -44,15 +48,18 @@ _READERS: tuple[type[Reader], ...] = (
     KITTI,
     TUM,
     Rooms,
+    KITTIOdometry,
+    TUMRecording,
+    Colmap,
 )
 READERS: dict[str, type[Reader]] = {reader.name: reader for reader in _READERS}
-"""Readers by name; the paper's training sets first, then those that it only evaluates on."""
+"""Readers by name: the paper's training sets, those that it only evaluates on, rooms, those that it does not use."""
 
 DATASETS: tuple[str, ...] = tuple(READERS)
 """All names that `open_dataset` knows."""
 
 
-def open_dataset(name: str, root: str | Path | None, split: str = "all", **options: Any) -> Dataset:
+def open_dataset(name: str, root: str | Path | None, split: str = "all", **options: Any) -> Reader:
     """Opens data set `name` (one of `DATASETS`) in folder `root`.
 
     Args:
@@ -65,14 +72,9 @@ def open_dataset(name: str, root: str | Path | None, split: str = "all", **optio
       InputError: unknown name or option, a split that the set does not have, or a wrong `root`.
       MissingFiles: the folder or a file in it is missing; named.
     """
-    if name not in READERS:
-        raise InputError(f"unknown data set {name!r}: choose one of {', '.join(DATASETS)}")
+    check_options(name, options)
     reader = READERS[name]
     make: Any = reader
-    known = [option for option in inspect.signature(make).parameters if option not in ("root", "split")]
-    for option in options:
-        if option not in known:
-            raise InputError(f"{name}: unknown option {option!r}; known are {', '.join(known) or 'none'}")
     if not reader.needs_root:
         if root is not None:
             raise InputError(f"{name} are made when they are read and have no folder, got root={root}: pass root=None")
@@ -80,3 +82,13 @@ def open_dataset(name: str, root: str | Path | None, split: str = "all", **optio
     if root is None:
         raise InputError(f"{name} needs root, the folder that holds {reader.expects}")
     return make(root=root, split=split, **options)
+
+
+def check_options(name: str, options: Collection[str]) -> None:
+    """Raises InputError for an unknown data set, or names of options that its reader does not have."""
+    if name not in READERS:
+        raise InputError(f"unknown data set {name!r}: choose one of {', '.join(DATASETS)}")
+    known = [option for option in inspect.signature(READERS[name]).parameters if option not in ("root", "split")]
+    for option in options:
+        if option not in known:
+            raise InputError(f"{name}: unknown option {option!r}; known are {', '.join(known) or 'none'}")

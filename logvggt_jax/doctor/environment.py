@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import importlib.metadata
 import platform
+import re
 from collections.abc import Iterator
 
 from logvggt_jax.compile import nvidia_gpu_present
 from logvggt_jax.doctor.finding import Finding
+from logvggt_jax.errors import install_line, one_line
 
 _LIBRARIES = ("logvggt-jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
-# Of each of these one build may be installed; JAX loads whichever it finds first.
-_ONE_BUILD = ("nvidia-nccl-cu", "nvidia-cudnn-cu", "nvidia-cublas-cu", "jax-cuda")
-_INSTALL = 'pip install "logvggt-jax[cuda]"'
+# Of each of these one build may be installed, for one version of CUDA; JAX loads whichever it finds first.
+_BUILD = re.compile(r"(nvidia-(?:nccl|cudnn|cublas)-cu|jax-cuda)\d+(-plugin|-pjrt)?")
 
 
 def examine() -> Iterator[Finding]:
@@ -23,11 +24,14 @@ def examine() -> Iterator[Finding]:
     }
     for name in _LIBRARIES:
         yield Finding("environment", name, installed.get(name), ok=None if name in installed else False)
-    for prefix in _ONE_BUILD:
-        builds = sorted(name for name in installed if name.startswith(prefix) and name.endswith(("12", "13")))
+    families: dict[str, list[str]] = {}
+    for name in sorted(installed):
+        if match := _BUILD.fullmatch(name):
+            families.setdefault(f"{match[1]}*{match[2] or ''}", []).append(name)
+    for family, builds in families.items():
         if len(builds) > 1:
-            note = f"pip uninstall all but one, then {_INSTALL}"
-            yield Finding("environment", f"builds of {prefix}*", ", ".join(builds), ok=False, note=note)
+            note = f"pip uninstall all but one, then {install_line('cuda')}"
+            yield Finding("environment", f"builds of {family}", ", ".join(builds), ok=False, note=note)
     yield from _devices()
 
 
@@ -38,8 +42,7 @@ def _devices() -> Iterator[Finding]:
         devices = jax.devices()
     except RuntimeError as error:
         # What the backend says: a driver too old, a library that is missing, a platform that is not there.
-        reason = " ".join(str(error).split())
-        yield Finding("environment", "devices", None, ok=False, note=f"{reason:.300}")
+        yield Finding("environment", "devices", None, ok=False, note=f"{one_line(error):.300}")
         return
     kinds = ", ".join(sorted({device.device_kind for device in devices}))
     yield Finding("environment", "devices", f"{len(devices)} x {kinds}", note=f"platform {jax.default_backend()}")
@@ -57,8 +60,8 @@ def _why_no_gpu() -> str:
     except RuntimeError as error:
         # A back end that was installed and failed says why, a driver too old for example.
         if "failed to initialize" in str(error):
-            return f"{' '.join(str(error).split()):.300}"
-    return f"JAX computes on the CPU of a machine with an NVIDIA GPU: {_INSTALL}"
+            return f"{one_line(error):.300}"
+    return f"JAX computes on the CPU of a machine with an NVIDIA GPU: {install_line('cuda')}"
 
 
 def _cudnn() -> Finding:
@@ -69,6 +72,5 @@ def _cudnn() -> Finding:
     try:
         jax.block_until_ready(jax.nn.dot_product_attention(tokens, tokens, tokens, implementation="cudnn"))
     except Exception as error:  # of whatever kind the library raises
-        reason = " ".join(str(error).split())
-        return Finding("environment", "cuDNN attention", "refused", ok=False, note=f"{reason:.300}")
+        return Finding("environment", "cuDNN attention", "refused", ok=False, note=f"{one_line(error):.300}")
     return Finding("environment", "cuDNN attention", "works", ok=True)

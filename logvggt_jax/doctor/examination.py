@@ -71,11 +71,15 @@ def _in_own_process(part: str, limit: float, *, tiny: bool, quick: bool) -> Iter
         assert process.stdout is not None  # a pipe was asked for
         late = threading.Timer(limit, process.kill)
         late.start()
-        for line in process.stdout:
-            with contextlib.suppress(ValueError, TypeError):  # what a library printed
-                yield Finding(**json.loads(line))
-        code, over = process.wait(), time.monotonic() - started >= limit
-        late.cancel()
+        try:
+            for line in process.stdout:
+                with contextlib.suppress(ValueError, TypeError):  # what a library printed
+                    yield Finding(**json.loads(line))
+            code, over = process.wait(), time.monotonic() - started >= limit
+        finally:
+            # Also where whoever reads the findings has had enough, or Ctrl-C came.
+            late.cancel()
+            process.kill()
         errors.seek(0)
         last = next((line.strip() for line in reversed(errors.readlines()) if line.strip()), "no message")
     if code != 0:

@@ -13,8 +13,7 @@ import numpy as np
 
 from logvggt_jax.doctor.finding import Finding
 from logvggt_jax.doctor.subject import Subject, random_variables
-from logvggt_jax.evaluation.costs.parts import abstract_variables
-from logvggt_jax.model.logvggt import LogVGGT
+from logvggt_jax.model.logvggt import LogVGGT, variable_shapes
 from logvggt_jax.model.parameters import in_compute_type, stack_layers
 from logvggt_jax.operations import count_flops, matmul_flops_per_second
 
@@ -66,7 +65,8 @@ def examine(subject: Subject) -> Iterator[Finding]:
     )
     yield Finding("inference", "rate", stride / seconds, "frames/s")
     plain = LogVGGT(dataclasses.replace(model.config, attention="xla"))
-    operations = count_flops(plain.step, abstract_variables(plain), *jax.eval_shape(lambda s, f: (s, f), state, frames))
+    inputs = jax.eval_shape(lambda s, f: (s, f), state, frames)
+    operations = count_flops(plain.step, variable_shapes(plain.config), *inputs)
     peak = matmul_flops_per_second("bfloat16", size=256 if subject.tiny else None)
     yield Finding("inference", "operations of a step", operations / 1e12, "TFLOP")
     yield Finding("inference", "fastest large product", peak / 1e12, "TFLOP/s")

@@ -7,7 +7,6 @@ import math
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from logvggt_jax.config import (
@@ -18,7 +17,7 @@ from logvggt_jax.config import (
     ModelConfig,
     RefinementConfig,
 )
-from logvggt_jax.model.logvggt import LogVGGT
+from logvggt_jax.model.logvggt import LogVGGT, variable_shapes
 
 # Values that parameters are cut from: a generator for each of a thousand shapes would compile for minutes.
 _BLOCK = 1 << 22
@@ -58,7 +57,6 @@ def random_variables(model: LogVGGT, *, scale: float = 0.02) -> dict[str, Any]:
 
     They are cut from one block of normal numbers of this standard deviation; gains of norms are moved up by one.
     """
-    shapes = jax.eval_shape(model.init, jax.random.key(0), jax.ShapeDtypeStruct((1, 1, 14, 14, 3), jnp.uint8))
     block = scale * np.random.default_rng(0).standard_normal(_BLOCK, np.float32)
     offset = 0
 
@@ -71,4 +69,4 @@ def random_variables(model: LogVGGT, *, scale: float = 0.02) -> dict[str, Any]:
         offset = (start + size) % _BLOCK
         return values + np.float32(1.0) if path[-1].key == "scale" else values
 
-    return jax.tree_util.tree_map_with_path(cut, shapes)
+    return jax.tree_util.tree_map_with_path(cut, variable_shapes(model.config))

@@ -23,10 +23,30 @@ from logvggt_jax.training.state import TrainState, initial_state
 from logvggt_jax.training.step import make_loss_terms, make_train_step
 
 # As configs/h20.py has them; what they are changes no time.
-_LOSS = LossConfig("log_vggt", 1.0, 1.0, 1.0, 1.0, 0.5, 0.6, 0.2)
+_LOSS = LossConfig(
+    name="log_vggt",
+    camera_weight=1.0,
+    depth_weight=1.0,
+    translation_weight=1.0,
+    rotation_weight=1.0,
+    field_of_view_weight=0.5,
+    gamma=0.6,
+    alpha=0.2,
+)
+_OPTIMIZER = OptimizerConfig(
+    learning_rate=5e-5,
+    final_learning_rate=0.0,
+    schedule="cosine",
+    warmup_fraction=0.05,
+    restart_each_stage=False,
+    b1=0.9,
+    b2=0.95,
+    weight_decay=0.05,
+    decay_all=False,
+    clip_norm=1.0,
+)
 # No other number of clips is begun that would end later than this.
 _SECONDS = 110.0
-_OPTIMIZER = OptimizerConfig(5e-5, 0.0, "cosine", 0.05, False, 0.9, 0.95, 0.05, False, 1.0)
 
 
 def examine(subject: Subject) -> Iterator[Finding]:

@@ -6,7 +6,6 @@ from typing import NamedTuple
 import numpy as np
 
 from logvggt_jax.data.dataset import Dataset
-from logvggt_jax.data.readers.seven_scenes import SevenScenes
 from logvggt_jax.errors import InputError
 from logvggt_jax.evaluation.progress import track
 from logvggt_jax.evaluation.protocols.images import ImageRule
@@ -58,5 +57,4 @@ def load_clip(
             clip.depth[t] = frame.depth[0]
     if clip is None:
         raise ValueError(f"{sequence}: a clip needs at least one frame")
-    second = dataset.sfm_extrinsics(sequence, indices) if isinstance(dataset, SevenScenes) else None
-    return clip._replace(sfm_extrinsics=second)
+    return clip._replace(sfm_extrinsics=dataset.sfm_extrinsics(sequence, indices))

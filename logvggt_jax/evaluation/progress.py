@@ -17,7 +17,13 @@ _SHORT = 64  # steps that are over before they could be read
 @contextlib.contextmanager
 def progress_display(console: Console | None) -> Iterator[Progress]:
     """A display on `console` (None: the standard one) that `track` adds its bars to while it is open."""
-    columns = (TextColumn("{task.description:<44}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    # Names of sequences and methods are no markup.
+    columns = (
+        TextColumn("{task.description:<44}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+    )
     with Progress(*columns, TimeRemainingColumn(), console=console) as display:
         token = _DISPLAY.set(display)
         try:

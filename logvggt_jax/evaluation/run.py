@@ -1,18 +1,20 @@
 """A whole evaluation, from a configuration's values to the tables on disk."""
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from logvggt_jax.evaluation.costs.throughput import measured_timings
 from logvggt_jax.evaluation.datasets import open_run
-from logvggt_jax.evaluation.methods.method import Checkpoint
-from logvggt_jax.evaluation.methods.rows import model_rows
+from logvggt_jax.evaluation.methods.method import Checkpoint, model_row
 from logvggt_jax.evaluation.methods.variants import variant_methods
+from logvggt_jax.evaluation.records import RECORDS_FILE
 from logvggt_jax.evaluation.report.report import write_report
 from logvggt_jax.evaluation.runner import evaluate
 from logvggt_jax.evaluation.settings import PaperRun, read_run
+from logvggt_jax.files import check_output
 
 
 def run_evaluation(
@@ -29,8 +31,8 @@ def run_evaluation(
     Args:
       configuration: as a file of configs/eval gives it.
       checkpoint: model folder.
-      output: folder of the results. What an interrupted run of the same code has measured is taken over; other
-        results are replaced once these are complete.
+      output: folder of the results: a new or empty one, or an evaluation's. What an interrupted run of the same code
+        has measured is taken over; other results are replaced once these are complete.
       data_root: folder of the data set, where it is read from disk; for the paper's benchmarks that of their folders.
       fresh: measure everything anew.
       command: what a reader has to run to get the same numbers.
@@ -39,22 +41,23 @@ def run_evaluation(
       The content of results.json, see `evaluate`.
 
     Raises:
+      OutputExists: `output` holds something else than an evaluation.
       InputError: a setting, the data or the checkpoint cannot be used.
     """
-    run, output = read_run(configuration), Path(output)
+    run = read_run(configuration)
+    output = check_output(output, overwrite=True, marker=RECORDS_FILE)
     benchmarks, baselines = open_run(run, data_root)
     loaded = Checkpoint.load(checkpoint)
-    rows = model_rows(loaded, run.methods, run.references)
-
-    def timings() -> dict[str, Any]:
-        assert isinstance(run, PaperRun) and run.timings is not None
-        others = [row for row, name in zip(rows, run.methods, strict=True) if name != "windows"]
-        edge = run.protocol.longer_edge
-        return measured_timings(loaded, others, run.timings, output, longer_edge=edge, fresh=fresh)
-
+    rows = {method: model_row(method, loaded, run.settings_of(method)) for method in run.methods}
+    timings = None
+    if isinstance(run, PaperRun) and run.timings is not None and run.timings.lengths:
+        others = [row for method, row in rows.items() if method != "windows"]
+        timings = functools.partial(
+            measured_timings, loaded, others, run.timings, output, longer_edge=run.protocol.longer_edge, fresh=fresh
+        )
     results = evaluate(
         benchmarks,
-        [*rows, *variant_methods(loaded, run.variants), *baselines(loaded.model)],
+        [*rows.values(), *variant_methods(loaded, run.variants), *baselines(loaded.model)],
         output,
         title=run.title,
         command=command,
@@ -63,7 +66,7 @@ def run_evaluation(
         max_sequences=run.max_sequences,
         figures=run.figures,
         fresh=fresh,
-        timings=timings if isinstance(run, PaperRun) and run.timings and run.timings.lengths else None,
+        timings=timings,
     )
     write_report(results, output)
     return results

@@ -13,13 +13,13 @@ from rich.console import Console
 
 from logvggt_jax.compile import out_of_device_memory
 from logvggt_jax.data.dataset import Dataset
-from logvggt_jax.errors import InputError
+from logvggt_jax.errors import InputError, disk_errors, printable
 from logvggt_jax.evaluation.clips import load_clip
 from logvggt_jax.evaluation.environment import code_version, environment
 from logvggt_jax.evaluation.methods.method import ClipPrediction, Method
 from logvggt_jax.evaluation.progress import progress_display
 from logvggt_jax.evaluation.protocols.protocol import Protocol
-from logvggt_jax.evaluation.records import PREDICTION, ClipRecords, plain, record_key
+from logvggt_jax.evaluation.records import FIGURES_FOLDER, PREDICTION, RECORDS_FILE, ClipRecords, plain, record_key
 from logvggt_jax.evaluation.scores import (
     ClipScore,
     ClipTruth,
@@ -75,6 +75,8 @@ def evaluate(
     the measures, and the method with its parameters. A later run takes over what it finds under its keys. Results of
     other runs in the folder stay until this one is complete, and then make place for it.
 
+    A clip that is to be drawn and whose pictures are not there is predicted and measured again for the first method.
+
     Clips that are too short or cannot be read, methods that cannot predict a clip (out of memory among other things),
     and metrics that a clip does not admit, are listed with their reason; means are over the others and carry their
     number beside the number planned. Any other exception is a fault of this package and is not caught.
@@ -112,19 +114,23 @@ def evaluate(
         for method in methods
         if is_measured(method, clip.benchmark.protocol)
     }
-    records = ClipRecords(output / "clips.jsonl", list(keys.values()), environment(), fresh=fresh)
+    records = ClipRecords(output / RECORDS_FILE, list(keys.values()), environment(), fresh=fresh)
     with progress_display(console) as progress:
         task = progress.add_task("evaluating", total=len(plan))
         drawn: dict[str, int] = {}
         for clip in plan:
             protocol = clip.benchmark.protocol
-            progress.update(task, description=f"{protocol.name}: {clip.sequence}")
+            progress.update(task, description=printable(f"{protocol.name}: {clip.sequence}"))
             draws = drawn.get(protocol.name, 0) < figures
             drawn[protocol.name] = drawn.get(protocol.name, 0) + draws
-            asked = [method for method in methods if (clip, method.name) in keys]
-            pending = [method for method in asked if keys[clip, method.name] not in records]
+            pending = [
+                method
+                for method in methods
+                if (clip, method.name) in keys
+                and not _is_done(records, keys[clip, method.name], output if draws and method is methods[0] else None)
+            ]
             if pending:
-                reason = _run_clip(clip, pending, methods[0], records, keys, output / "figures" if draws else None)
+                reason = _run_clip(clip, pending, methods[0], records, keys, output / FIGURES_FOLDER if draws else None)
                 if reason:
                     skipped.append({**_where(clip), "reason": reason})
             progress.advance(task)
@@ -152,15 +158,16 @@ def evaluate(
 
 
 def _replace_results(results: Mapping[str, Any], records: ClipRecords, output: Path) -> None:
-    """Writes results.json, and removes what belongs to other results."""
-    records.keep_asked()
+    """Writes results.json, and then removes what belongs to other results."""
     write_text(output / "results.json", json.dumps(results, indent=1) + "\n")
+    records.keep_asked()
     old = [output / "report.md", output / "report.html"]
     for pattern in ("*_frames_*.png", "ate_against_views_*.png"):
-        old += (output / "figures").glob(pattern)
+        old += (output / FIGURES_FOLDER).glob(pattern)
     for path in old:
         if str(path.relative_to(output)) not in results["figures"]:
-            path.unlink(missing_ok=True)
+            with disk_errors(path):
+                path.unlink(missing_ok=True)
 
 
 def plan_clips(
@@ -206,10 +213,13 @@ def _run_clip(
         return str(error)
     truth = prepare_truth(data, protocol.points if any(method.points for method in pending) else None)
     for method in pending:
-        pictures: list[str] = []
+        pictures: list[str] | None = None
         prediction, score = _predicted(method, truth, protocol)
+        if prediction is None and keys[clip, method.name] in records:
+            continue  # it was only to be drawn, and what was measured before stays
         if figures is not None and method is drawn and prediction is not None:
-            pictures = _draw(figures, clip, method, prediction, truth)
+            records.claim()
+            pictures = _draw(figures, clip, keys[clip, method.name], method, prediction, truth)
         record = {
             **_where(clip),
             "method": method.name,
@@ -221,6 +231,17 @@ def _run_clip(
         }
         records.add(keys[clip, method.name], record)
     return ""
+
+
+def _is_done(records: ClipRecords, key: str, drawn_in: Path | None) -> bool:
+    """Whether a clip is measured and, where it is to be drawn in an output folder, its pictures are there.
+
+    A record's `figures` are null where nothing was drawn, and empty where there was nothing to draw.
+    """
+    if key not in records:
+        return False
+    figures = records[key]["figures"]
+    return drawn_in is None or (figures is not None and all((drawn_in / path).is_file() for path in figures))
 
 
 def _predicted(method: Method, truth: ClipTruth, protocol: Protocol) -> tuple[ClipPrediction | None, ClipScore]:
@@ -285,7 +306,7 @@ def _collected(
             for record in done:
                 where = {key: record[key] for key in ("benchmark", "sequence", "frames", "method")}
                 failures += [{**where, "metric": group, "reason": why} for group, why in record["failures"].items()]
-                figures += record["figures"]
+                figures += record["figures"] or []
     return {"benchmarks": described, "summary": summary, "failures": failures, "figures": figures}
 
 
@@ -311,12 +332,18 @@ def _key(clip: Clip, method: Method) -> str:
     return record_key(code_version(), names, data, protocol.measures(), claims, method.identity)
 
 
-def _draw(folder: Path, clip: Clip, method: Method, prediction: ClipPrediction, truth: ClipTruth) -> list[str]:
-    """Draws what the benchmark measures; returns the pictures' paths from the output folder."""
+def _draw(
+    folder: Path, clip: Clip, key: str, method: Method, prediction: ClipPrediction, truth: ClipTruth
+) -> list[str]:
+    """Draws what the benchmark measures; returns the pictures' paths from the output folder.
+
+    Part of their names is the record's key: those of other results stay as they are until these are complete.
+    """
     from logvggt_jax.evaluation.report import figures as plots
 
     protocol, data = clip.benchmark.protocol, truth.clip
     stem = f"{protocol.name}_{clip.sequence.replace('/', '_')}_from_{clip.indices[0]}_{len(clip.indices)}_frames"
+    stem = f"{stem}_{key[:8]}"
     drawn: list[Path] = []
     if method.depth and prediction.depth is not None and data.depth is not None:
         drawn.append(folder / f"{stem}_depth.png")

@@ -36,6 +36,19 @@ SFM = "sfm/"
 
 
 @dataclasses.dataclass(frozen=True)
+class TruePoses:
+    """One set of true poses of a clip."""
+
+    extrinsics: np.ndarray  # [T, 4, 4], world-to-camera
+
+    @functools.cached_property
+    def identity_rotation_error(self) -> float:
+        """Mean rotation error in degrees over all pairs of frames of a camera that never moves."""
+        rotation, _ = relative_pose_errors(np.tile(np.eye(4), (len(self.extrinsics), 1, 1)), self.extrinsics)
+        return float(rotation.mean())
+
+
+@dataclasses.dataclass(frozen=True)
 class ClipTruth:
     """Ground truth of one clip, prepared once for all methods."""
 
@@ -45,6 +58,12 @@ class ClipTruth:
     indices: np.ndarray | None = None
     points: np.ndarray | None = None  # [N, 3] in the data set's world
     normals: np.ndarray | None = None  # [N, 3]
+
+    @functools.cached_property
+    def poses(self) -> dict[str, TruePoses]:
+        """Sets of true poses, by what stands before the names of errors against them."""
+        sets = {"": self.clip.extrinsics, SFM: self.clip.sfm_extrinsics}
+        return {prefix: TruePoses(extrinsics) for prefix, extrinsics in sets.items() if extrinsics is not None}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,13 +104,12 @@ def clip_score(method: Method, prediction: ClipPrediction, truth: ClipTruth, pro
     depth, points = protocol.depth, protocol.points
     if depth is not None and method.depth:
         groups.append(("depth", lambda: _depth(prediction, truth.clip, depth)))
-    for prefix, true in (("", truth.clip.extrinsics), (SFM, truth.clip.sfm_extrinsics)):
-        if true is None or not method.pose:
-            continue
+    for prefix, true in truth.poses.items() if method.pose else ():
         if protocol.poses:
             groups.append((f"{prefix}pose", functools.partial(_pose, prediction, true)))
         if protocol.trajectory:
-            groups.append((f"{prefix}trajectory", functools.partial(_trajectory, prediction, true, method.static)))
+            trajectory = functools.partial(_trajectory, prediction, true.extrinsics, method.static)
+            groups.append((f"{prefix}trajectory", trajectory))
     if points is not None and method.points:
         groups.append(("points", lambda: _points(prediction, truth, points.icp_threshold)))
     metrics: dict[str, float] = {}
@@ -214,10 +232,9 @@ def _depth(prediction: ClipPrediction, clip: ClipData, measure: DepthMeasure) ->
     return result
 
 
-def _pose(prediction: ClipPrediction, true: np.ndarray) -> dict[str, float]:
-    """Means over all pairs of frames, against true world-to-camera extrinsics [T, 4, 4]."""
-    rotation, translation = relative_pose_errors(prediction.extrinsics, true)
-    identity_rotation, _ = relative_pose_errors(np.tile(np.eye(4), (len(true), 1, 1)), true)
+def _pose(prediction: ClipPrediction, true: TruePoses) -> dict[str, float]:
+    """Means over all pairs of frames."""
+    rotation, translation = relative_pose_errors(prediction.extrinsics, true.extrinsics)
     wide = pose_accuracy(rotation, translation, 30)
     return {
         "rra@5": pose_accuracy(rotation, translation, 5)["rra"],
@@ -225,7 +242,7 @@ def _pose(prediction: ClipPrediction, true: np.ndarray) -> dict[str, float]:
         "rta@30": wide["rta"],
         "auc@30": wide["auc"],
         "rotation_error": float(rotation.mean()),
-        "identity_rotation_error": float(identity_rotation.mean()),
+        "identity_rotation_error": true.identity_rotation_error,
         "pairs": float(len(rotation)),
     }
 

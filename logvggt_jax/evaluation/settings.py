@@ -7,9 +7,9 @@ from typing import Any
 from logvggt_jax.config import from_mapping, require_counts
 from logvggt_jax.errors import InputError
 from logvggt_jax.evaluation.costs.throughput import TimingConfig
-from logvggt_jax.evaluation.methods.rows import ReferenceConfig
 from logvggt_jax.evaluation.protocols import ProtocolSettings
 from logvggt_jax.evaluation.protocols.clips import ClipSettings
+from logvggt_jax.streaming import METHODS
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -20,9 +20,24 @@ class Run:
     baselines: bool  # whether answers that need no learning are evaluated beside the model
     # Rows of the model, names of `logvggt_jax.streaming.METHODS`; the first one is drawn.
     methods: tuple[str, ...] = ("windows", "offline", "chunks")
-    references: ReferenceConfig = ReferenceConfig()  # limits of the methods `offline` and `chunks`
+    # Fields of a method's own settings class, by the method's name; what is left out has that class's defaults.
+    settings: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
     # Names of `logvggt_jax.evaluation.methods.variants.VARIANTS` that are evaluated beside the methods.
     variants: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for field, names in {"methods": self.methods, "settings": self.settings}.items():
+            for name in names:
+                if name not in METHODS:
+                    raise InputError(f"{type(self).__name__}.{field}: unknown {name!r}; known are {', '.join(METHODS)}")
+        for name in self.settings:
+            self.settings_of(name)
+
+    def settings_of(self, method: str) -> Any:
+        """Settings of a method, of its own settings class; None where the run says nothing of it."""
+        if method not in self.settings:
+            return None
+        return from_mapping(METHODS[method].settings, self.settings[method], f"settings.{method}")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -32,7 +47,7 @@ class ClipRun(Run):
     dataset: str  # one of `logvggt_jax.data.DATASETS`
     split: str  # `train`, `val`, `test` or `all`
     evaluation: ClipSettings  # clips and metrics
-    rooms: Mapping[str, Any] | None = None  # options of procedural rooms, for `dataset` = `rooms` alone
+    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # further arguments of the set's reader
 
     @property
     def max_sequences(self) -> int | None:
@@ -57,6 +72,7 @@ class PaperRun(Run):
     timings: TimingConfig | None = None  # sequences that are timed for the paper's tables of cost; None leaves them out
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not self.benchmarks:
             raise InputError("PaperRun.benchmarks must name at least one, for example ('*',) or ('seven_scenes-*',)")
         require_counts(self, "max_sequences")

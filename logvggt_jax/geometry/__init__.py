@@ -16,7 +16,13 @@ from logvggt_jax.geometry.cameras import (
     unproject_pixels,
 )
 from logvggt_jax.geometry.pose_encoding import decode_poses, encode_poses
-from logvggt_jax.geometry.rotations import matrix_to_quaternion, nearest_rotation, quaternion_to_matrix, rotation_angle
+from logvggt_jax.geometry.rotations import (
+    is_rotation,
+    matrix_to_quaternion,
+    nearest_rotation,
+    quaternion_to_matrix,
+    rotation_angle,
+)
 from logvggt_jax.geometry.similarity import Similarity, robust_similarity, umeyama
 
 __all__ = [
@@ -27,6 +33,7 @@ __all__ = [
     "decode_poses",
     "encode_poses",
     "invert",
+    "is_rotation",
     "matrix_to_quaternion",
     "nearest_rotation",
     "project",

@@ -81,3 +81,12 @@ def nearest_rotation(matrix: Any) -> Any:
     determinant = xp.sign(xp.linalg.det(u) * xp.linalg.det(vt))
     signs = xp.stack([xp.ones_like(determinant), xp.ones_like(determinant), determinant], axis=-1)
     return ((u * signs[..., None, :])[..., :, :, None] * vt[..., None, :, :]).sum(-2)
+
+
+def is_rotation(matrix: Any, tolerance: float = 1e-3) -> Any:
+    """Whether matrices [..., 3, 3] are rotations, to `tolerance` in every entry of R^T R; bool [...]."""
+    xp = namespace(matrix)
+    gram = (matrix[..., :, :, None] * matrix[..., :, None, :]).sum(-3)
+    orthogonal = (xp.abs(gram - xp.eye(3)) <= tolerance).all((-2, -1))
+    turned = xp.linalg.cross(matrix[..., 0, :], matrix[..., 1, :])
+    return orthogonal & ((turned * matrix[..., 2, :]).sum(-1) > 0)

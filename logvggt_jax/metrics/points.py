@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from logvggt_jax.errors import MissingPackage
+from logvggt_jax.errors import MissingPackage, install_line
 from logvggt_jax.metrics.errors import NotMeasurable
 
 
@@ -111,7 +111,7 @@ def _nearest(points: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.nda
     try:
         from scipy.spatial import cKDTree
     except ImportError as error:
-        raise MissingPackage(f'nearest neighbours need SciPy ({error}): pip install "logvggt-jax[eval]"') from error
+        raise MissingPackage(f"nearest neighbours need SciPy ({error}): {install_line('eval')}") from error
     return cKDTree(others).query(points)
 
 
@@ -153,7 +153,7 @@ def _open3d() -> Any:
             ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
             return importlib.import_module("open3d")
     except ImportError as error:
-        mend = 'pip install "logvggt-jax[eval]"'
+        mend = install_line("eval")
         if ".so" in str(error):
             mend = "install that library (Debian, Ubuntu: apt install libx11-6 libgl1 libegl1 libudev1 libidn2-0)"
         raise MissingPackage(f"ICP and normals need Open3D ({error}): {mend}") from error

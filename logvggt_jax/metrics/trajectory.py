@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from logvggt_jax.errors import MissingPackage
+from logvggt_jax.errors import MissingPackage, install_line
 from logvggt_jax.geometry import nearest_rotation, umeyama
 from logvggt_jax.metrics.errors import NotMeasurable
 from logvggt_jax.metrics.pose import checked_poses
@@ -86,4 +86,4 @@ def _evo(module: str) -> Any:
     try:
         return importlib.import_module(f"evo.core.{module}")
     except ImportError as error:
-        raise MissingPackage(f'trajectory errors need evo ({error}): pip install "logvggt-jax[eval]"') from error
+        raise MissingPackage(f"trajectory errors need evo ({error}): {install_line('eval')}") from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax
@@ -17,7 +18,7 @@ from logvggt_jax.model.refinement import Refinement
 from logvggt_jax.model.windows import Windows, WindowState
 from logvggt_jax.types import Predictions, WindowOutput
 
-__all__ = ["LogVGGT", "Variables"]
+__all__ = ["LogVGGT", "Variables", "variable_shapes"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -162,3 +163,13 @@ class LogVGGT:
           Pose encodings [B, N, R, 9] of all rounds, world-to-camera in the first camera's frame.
         """
         return self.refinement.refine(variables, camera_tokens, register_tokens, camera_mask, register_mask)
+
+
+@functools.lru_cache(maxsize=8)
+def variable_shapes(config: ModelConfig) -> Variables:
+    """{"params": …} of a model as `jax.ShapeDtypeStruct`s; traced once for each configuration, nothing is allocated."""
+    # They do not depend on the form of attention, and tracing cuDNN's asks for a GPU.
+    model, patch = LogVGGT(dataclasses.replace(config, attention="xla")), config.encoder.patch_size
+    images = jax.ShapeDtypeStruct((1, 1, patch, patch, 3), jnp.uint8)
+    variables: Variables = jax.eval_shape(model.init, jax.random.key(0), images)
+    return variables

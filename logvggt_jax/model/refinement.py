@@ -24,13 +24,6 @@ def num_triggers(num_frames: int, period: int | None) -> int:
     return 1 if period is None else -(-num_frames // period)
 
 
-def trigger_range(trigger: int, num_frames: int, period: int | None) -> tuple[int, int]:
-    """Frames [start, stop) that a trigger (from 0) refines; they see the registers of frames [0, stop)."""
-    if period is None:
-        return 0, num_frames
-    return trigger * period, min((trigger + 1) * period, num_frames)
-
-
 class Span(NamedTuple):
     """The frames [start, stop) that a trigger takes, of sequences of unequal length.
 

@@ -53,16 +53,6 @@ def num_windows(num_frames: int, size: int, stride: int) -> int:
     return 1 if num_frames <= size else -(-(num_frames - size) // stride) + 1
 
 
-def kept_window(frame: int, num_frames: int, size: int, stride: int) -> int:
-    """The window whose copy of `frame` counts: the last one that holds it."""
-    return min(frame // stride, num_windows(num_frames, size, stride) - 1)
-
-
-def first_window(frame: int, size: int, stride: int) -> int:
-    """The first window that holds `frame`."""
-    return max(0, -(-(frame - size + 1) // stride))
-
-
 @dataclasses.dataclass(frozen=True)
 class Windows:
     """Encoder, aggregator and dense heads over K frames at a time; pure functions of parameters and arrays.

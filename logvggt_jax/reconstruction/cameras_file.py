@@ -5,15 +5,19 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from reprlib import repr as shown  # short, however large or deep the value is
 from typing import Any
 
 import numpy as np
 
-from logvggt_jax.errors import InputError, MissingInput, disk_errors
-from logvggt_jax.files import write_text
+from logvggt_jax.errors import InputError, MissingInput
+from logvggt_jax.files import open_regular, write_text
+from logvggt_jax.geometry import is_rotation
 
 CAMERAS_FILE = "cameras.json"
 CAMERAS_FORMAT = "logvggt-cameras-1"
+# The squares of larger entries are infinite in float32, in which points are made.
+_LARGEST = 1e18
 
 
 def write_cameras(
@@ -79,22 +83,89 @@ def is_complete(path: Path) -> bool:
 def read_cameras(path: str | Path) -> dict[str, Any]:
     """Inverse of `write_cameras`: the document, with the frames' matrices as float64 arrays.
 
+    What is returned can be relied on: sizes are positive; names differ, are names of files and lead out of no folder;
+    numbers are finite, also in float32; rotations are rotations; focal lengths are not zero.
+
     Raises:
       FileNotFoundError: no such file.
-      ValueError: not a file that `write_cameras` has written.
+      ValueError: not a file that `write_cameras` has written, or damaged; says what and where.
     """
     path = Path(path)
-    if not path.is_file():
-        raise MissingInput(f"{path} does not exist: expected the output of `logvggt reconstruct`")
     try:
-        with disk_errors(path):
-            document = json.loads(path.read_text())
-        known = document["format"] == CAMERAS_FORMAT
-        for frame in document["frames"]:
-            for key in ("extrinsics", "intrinsics", "depth_intrinsics"):
-                frame[key] = np.array(frame[key], np.float64)
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path} is not a cameras file of this program: {error!r}") from None
-    if not known:
-        raise InputError(f"{path} has format {document['format']!r}, expected {CAMERAS_FORMAT!r}")
+        with open_regular(path) as stream:
+            document = json.loads(stream.read().decode())
+    except MissingInput:
+        raise MissingInput(f"{path} does not exist: expected the output of `logvggt reconstruct`") from None
+    except InputError:
+        raise
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path} is not a cameras file of this program: {error}") from None
+    try:
+        return _checked(document)
+    except _Fault as fault:
+        raise InputError(f"{path} is not a cameras file of this program, or damaged: {fault}") from None
+
+
+class _Fault(Exception):
+    """What is wrong with a document, without the file's name."""
+
+
+def _checked(document: Any) -> dict[str, Any]:
+    _require(isinstance(document, dict), "it holds no object")
+    kind = document.get("format")
+    _require(kind == CAMERAS_FORMAT, f"it has format {shown(kind)}, expected {CAMERAS_FORMAT!r}")
+    for key in ("image_size", "depth_size"):
+        size = document.get(key)
+        valid = isinstance(size, list) and len(size) == 2 and all(type(n) is int and 0 < n < 2**31 for n in size)
+        _require(valid, f"{key} must be height and width in pixels, got {shown(size)}")
+    # Earlier versions wrote neither.
+    complete, skipped = document.setdefault("complete", True), document.setdefault("skipped", [])
+    _require(type(complete) is bool, f"complete must be true or false, got {shown(complete)}")
+    _require(
+        isinstance(skipped, list)
+        and all(isinstance(each, dict) and isinstance(each.get("name"), str) for each in skipped),
+        f"skipped must be a list of frames with their names, got {shown(skipped)}",
+    )
+    frames = document.get("frames")
+    _require(isinstance(frames, list) and bool(frames), f"frames must be a list of cameras, got {shown(frames)}")
+    names: set[str] = set()
+    for index, frame in enumerate(frames):
+        _require(isinstance(frame, dict), f"frame {index} is no object but {shown(frame)}")
+        name = frame.get("name")
+        _require(_is_file_name(name), f"frame {index} has the name {shown(name)}, which cannot be that of a file")
+        _require(name not in names, f"two frames have the name {name!r:.80}")
+        names.add(name)
+        where = f"of frame {index}, {name!r:.80},"
+        frame["timestamp"] = float(_numbers(frame.get("timestamp"), (), f"the timestamp {where}"))
+        for key, shape in (("extrinsics", (3, 4)), ("intrinsics", (3, 3)), ("depth_intrinsics", (3, 3))):
+            frame[key] = _numbers(frame.get(key), shape, f"the {key} {where}")
+        _require(is_rotation(frame["extrinsics"][:, :3]), f"the extrinsics {where} hold no rotation")
+        for key in ("intrinsics", "depth_intrinsics"):
+            matrix = frame[key]
+            pinhole = (matrix[2] == [0, 0, 1]).all() and matrix[1, 0] == 0 and (matrix.diagonal() != 0).all()
+            _require(pinhole, f"the {key} {where} are not those of a pinhole camera")
     return document
+
+
+def _require(condition: bool, complaint: str) -> None:
+    if not condition:
+        raise _Fault(complaint)
+
+
+def _is_file_name(name: object) -> bool:
+    return isinstance(name, str) and name not in ("", ".", "..") and "/" not in name and "\0" not in name
+
+
+def _numbers(value: object, shape: tuple[int, ...], what: str) -> np.ndarray:
+    """A JSON value as float64 numbers of a shape."""
+    try:
+        array = np.array(value)
+    except ValueError:  # lists of unequal lengths
+        array = np.array(None)
+    # Whole numbers beyond 64 bits make an array of objects, as do null and text among numbers.
+    valid = array.dtype.kind in "iuf" and array.shape == shape
+    _require(valid, f"{what} must be {f'numbers {list(shape)}' if shape else 'a number'}, got {shown(value)}")
+    array = array.astype(np.float64)
+    largest = _LARGEST if shape else np.inf  # of times there are some in nanoseconds
+    _require(bool((np.abs(array) < largest).all()), f"{what} must be finite, and below {largest:g}")
+    return array

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 import cv2
 import numpy as np
 from PIL import Image
 
-from logvggt_jax.errors import InputError, MissingInput, disk_errors, one_line
-from logvggt_jax.files import atomic_file
+from logvggt_jax.errors import InputError, MissingInput, one_line
+from logvggt_jax.files import atomic_file, open_regular
+from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE
 
 _JPEG = (
     *(cv2.IMWRITE_JPEG_QUALITY, 95),
@@ -33,14 +36,34 @@ def write_depth(path: str | Path, depth: np.ndarray, confidence: np.ndarray) -> 
     return depth.astype(np.float32), confidence.astype(np.float32)
 
 
-def read_depth(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
-    """Depth and confidence, [H, W] float32, of a file that `write_depth` has written."""
-    with disk_errors(path), Path(path).open("rb") as stream:
+def read_depth(path: str | Path, size: tuple[int, int] | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Depth and confidence, [H, W] float32, of a file that `write_depth` has written.
+
+    Pixels to which the model gave no number hold none here either.
+
+    Args:
+      path: the .npz file.
+      size: (H, W) that the maps must have; None for any.
+
+    Raises:
+      MissingInput: no such file.
+      InputError: another file, damaged, or of another size.
+    """
+    with _result_file(path) as stream:
         try:
             with np.load(stream, allow_pickle=False) as arrays:
-                return arrays["depth"].astype(np.float32), arrays["confidence"].astype(np.float32)
-        except (zipfile.BadZipFile, EOFError, KeyError, ValueError, TypeError) as error:
+                # What has no array's header comes as bytes.
+                maps = np.asarray(arrays["depth"]), np.asarray(arrays["confidence"])
+        except OSError:
+            raise
+        except Exception as error:  # numpy and zipfile meet damaged files with two dozen kinds
             raise InputError(f"{path}: no depth file of this program, or damaged: {one_line(error)}") from error
+    for name, values in zip(("depth", "confidence"), maps, strict=True):
+        if values.dtype.kind != "f" or values.ndim != 2 or (size is not None and values.shape != size):
+            expected = "[H, W]" if size is None else f"{list(size)}, as {CAMERAS_FILE} says"
+            found = f"{list(values.shape)} of {values.dtype}"
+            raise InputError(f"{path}: {name} must be floats {expected}, got {found}; reconstruct again")
+    return maps[0].astype(np.float32), maps[1].astype(np.float32)
 
 
 def depth_picture(depth: np.ndarray, *, near: float, far: float) -> np.ndarray:
@@ -65,20 +88,38 @@ def write_picture(path: str | Path, image: np.ndarray) -> None:
         temporary.write_bytes(encoded.tobytes())
 
 
-def read_picture(path: str | Path) -> np.ndarray:
-    """An image file as [H, W, 3] uint8 RGB.
+def read_picture(path: str | Path, size: tuple[int, int] | None = None) -> np.ndarray:
+    """An image that `write_picture` has written as JPEG, [H, W, 3] uint8 RGB.
+
+    Args:
+      path: the file.
+      size: (H, W) that it must have; None for any.
 
     Raises:
       MissingInput: no such file.
-      InputError: it is no picture, or damaged.
+      InputError: it is no picture, damaged, or of another size.
     """
+    with _result_file(path) as stream:
+        try:
+            with Image.open(stream, formats=("JPEG",)) as picture:
+                height, width = picture.height, picture.width
+                if size is None or size == (height, width):
+                    return np.asarray(picture.convert("RGB"))
+        except Exception as error:  # Pillow meets damaged pictures with as many kinds as it has decoders
+            raise InputError(f"{path}: cannot be read as a picture ({one_line(error)}); reconstruct again") from error
+    raise InputError(
+        f"{path} has {height} x {width} pixels, expected {size[0]} x {size[1]}, as {CAMERAS_FILE} says; "
+        "reconstruct again"
+    )
+
+
+@contextmanager
+def _result_file(path: str | Path) -> Iterator[BinaryIO]:
     try:
-        with Path(path).open("rb") as stream, Image.open(stream) as picture:
-            return np.asarray(picture.convert("RGB"))
-    except FileNotFoundError as error:
-        raise MissingInput(f"{path} does not exist: expected the output of `logvggt reconstruct`") from error
-    except (OSError, SyntaxError) as error:  # what Pillow raises for damaged pictures
-        raise InputError(f"{path}: cannot be read as a picture ({one_line(error)}); reconstruct again") from error
+        with open_regular(path) as stream:
+            yield stream
+    except MissingInput:
+        raise MissingInput(f"{path} does not exist: expected the output of `logvggt reconstruct`") from None
 
 
 def _half(values: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import os
 import re
 import threading
 from collections.abc import Callable, Iterable, Mapping
@@ -17,8 +18,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from logvggt_jax.errors import InputError, MissingInput, disk_errors
-from logvggt_jax.files import atomic_file
+from logvggt_jax.errors import InputError, MissingInput
+from logvggt_jax.files import atomic_file, open_regular
 from logvggt_jax.geometry import unproject_pixels
 
 VERTEX = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")])
@@ -31,8 +32,10 @@ _HEADER = (
 
 # Confidences are counted as float16, as which they are stored: a bin a value, up to infinity.
 _NUM_BINS = int(np.float16(np.inf).view(np.uint16))
-# Of a sequence, and of a frame; 13 bytes each.
-_MOST_SAMPLES, _FEWEST_SAMPLES = 8_000_000, 64
+# Of a sequence, and of a frame; 17 bytes each.
+_MOST_SAMPLES, _FEWEST_SAMPLES = 6_000_000, 64
+# Pixels looked at for each that is wanted: more cost more than reading the frame again, where that should be needed.
+_LOOK_AHEAD = 4
 # Where a video does not say how long it is.
 _UNKNOWN_FRAMES = 10_000
 
@@ -93,11 +96,21 @@ class FramePoints(NamedTuple):
 
 
 class _Sample(NamedTuple):
-    """The first candidates that a frame's random order meets, with their bins, and how many it has in all."""
+    """The first candidates that a frame's random order meets, their places in it, their bins; and the number of all."""
 
     points: FramePoints
+    places: np.ndarray
     bins: np.ndarray
     candidates: int
+
+    def shortened(self, size: int) -> _Sample:
+        """What would have been sampled had `size` points been wanted."""
+        kept = min(size, int(np.searchsorted(self.places, _LOOK_AHEAD * size)))
+        if kept == len(self.places):
+            return self
+        # Copies, so that what is left out is let go.
+        points = FramePoints(*(values[:kept].copy() for values in self.points))
+        return _Sample(points, self.places[:kept].copy(), self.bins[:kept].copy(), self.candidates)
 
 
 class PointSelection:
@@ -109,15 +122,16 @@ class PointSelection:
 
     Args:
       point_filter: which pixels become points.
-      expected_frames: length of the sequence if it is known; sets the size of samples.
+      expected_frames: length of the sequence if it is known; sets the size of samples at first. They shrink when
+        more frames are seen, so that all together stay within bounds whatever a file's header has promised.
     """
 
     def __init__(self, point_filter: PointFilter, expected_frames: int | None) -> None:
         self._filter = point_filter
         # Twice what a mean frame will hand out, since frames differ.
         wanted = 2 * (point_filter.max_points or 0) / (1 - point_filter.confidence_percentile / 100)
-        kept = min(wanted, _MOST_SAMPLES) / max(expected_frames or _UNKNOWN_FRAMES, 1)
-        self._sample_size = max(int(kept), _FEWEST_SAMPLES)
+        self._kept = min(wanted, _MOST_SAMPLES)
+        self._frames = max(expected_frames or _UNKNOWN_FRAMES, 1)
         self._histogram = np.zeros(_NUM_BINS, np.int64)
         self._samples: dict[int, _Sample] = {}
         self._lock = threading.Lock()
@@ -133,13 +147,22 @@ class PointSelection:
         """
         candidates = self._filter.candidates(depth, confidence).reshape(-1)
         counts = np.bincount(_bins(confidence, np.flatnonzero(candidates)), minlength=_NUM_BINS)
-        # Walking further than this costs more than reading the frame again, where that should be needed.
-        order = _random_order(frame, depth.size)[: 4 * self._sample_size]
-        indices = order[candidates[order]][: self._sample_size]
-        sample = _Sample(_points(depth, image, indices), _bins(confidence, indices), int(counts.sum()))
+        size = self._sample_size
+        order = _random_order(frame, depth.size)[: _LOOK_AHEAD * size]
+        places = np.flatnonzero(candidates[order])[:size].astype(np.int32)
+        indices = order[places]
+        sample = _Sample(_points(depth, image, indices), places, _bins(confidence, indices), int(counts.sum()))
         with self._lock:
             self._histogram += counts
-            self._samples[frame] = sample
+            self._samples[frame] = sample.shortened(self._sample_size)
+            if len(self._samples) > self._frames:
+                # By a quarter at a time: what is kept depends on how many frames were seen, not on their order.
+                self._frames = max(len(self._samples), self._frames * 5 // 4)
+                self._samples = {key: each.shortened(self._sample_size) for key, each in self._samples.items()}
+
+    @property
+    def _sample_size(self) -> int:
+        return max(int(self._kept / self._frames), _FEWEST_SAMPLES)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """All that was seen, for `restore`."""
@@ -274,25 +297,47 @@ def count_points(path: str | Path) -> int:
 
 
 def read_points(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
-    """Points [M, 3] float32 and colours [M, 3] uint8 of such a file; errors as `count_points`."""
+    """Points [M, 3] float32, all finite, and colours [M, 3] uint8 of such a file; errors as `count_points`."""
     vertices = _stored_points(Path(path))
     points = np.stack([vertices[name] for name in "xyz"], axis=-1)
+    finite = np.isfinite(points).all(axis=1)
+    if not finite.all():
+        raise InputError(
+            f"{path} is damaged: {np.count_nonzero(~finite):,} of its {len(points):,} points are not finite; "
+            "reconstruct again"
+        )
     return points, np.stack([vertices[name] for name in ("red", "green", "blue")], axis=-1)
 
 
 def _stored_points(path: Path) -> np.ndarray:
     """The vertices [M] of a file, mapped and not read."""
-    if not path.is_file():
-        raise MissingInput(f"{path} does not exist: expected the output of `logvggt reconstruct`")
-    with disk_errors(path), path.open("rb") as stream:
-        start = stream.read(2 * len(_HEADER))
-    match = re.search(rb"element vertex ( *\d+)\n", start)
-    count = int(match[1]) if match else 0
-    header = _HEADER.format(count=match[1].decode() if match else "").encode()
-    size = len(header) + count * VERTEX.itemsize
-    if not start.startswith(header) or path.stat().st_size != size:
-        raise InputError(f"{path} is not a point cloud of this program, or is cut off; reconstruct again")
-    return np.memmap(path, VERTEX, "r", len(header), (count,)) if count else np.empty(0, VERTEX)
+    try:
+        with open_regular(path) as stream:
+            start, found = stream.read(2 * len(_HEADER)), os.fstat(stream.fileno()).st_size
+            # More digits could not be a size.
+            match = re.search(rb"element vertex ( *\d{1,18})\n", start)
+            header = _HEADER.format(count=match[1].decode() if match else "").encode()
+            if match is None or not start.startswith(header):
+                raise InputError(f"{path} is {_other_file(start)}: expected the output of `logvggt reconstruct`")
+            count = int(match[1])
+            size = len(header) + count * VERTEX.itemsize
+            if found != size:
+                raise InputError(
+                    f"{path} is {'cut off' if found < size else 'longer than its header says'}: {count:,} points need "
+                    f"{size:,} bytes, it has {found:,}; copy it again or reconstruct again"
+                )
+            return np.memmap(stream, VERTEX, "r", len(header), (count,)) if count else np.empty(0, VERTEX)
+    except MissingInput:
+        raise MissingInput(f"{path} does not exist: expected the output of `logvggt reconstruct`") from None
+
+
+def _other_file(start: bytes) -> str:
+    """What a file is whose first bytes are not those of a cloud of ours."""
+    if not start:
+        return "empty"
+    if not start.startswith(b"ply"):
+        return "no PLY file"
+    return "cut off in its header" if b"end_header" not in start else "a PLY file of another program, or damaged"
 
 
 def _points(depth: np.ndarray, image: np.ndarray, indices: np.ndarray) -> FramePoints:
@@ -302,7 +347,7 @@ def _points(depth: np.ndarray, image: np.ndarray, indices: np.ndarray) -> FrameP
 def _bins(confidence: np.ndarray, indices: np.ndarray) -> np.ndarray:
     """Bins [n] of the confidences of some pixels."""
     values = np.clip(confidence.reshape(-1)[indices], 0.0, np.finfo(np.float16).max)
-    return values.astype(np.float16).view(np.uint16)
+    return np.abs(values).astype(np.float16).view(np.uint16)  # -0.0 would be a bin of its own
 
 
 @functools.lru_cache(4)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from logvggt_jax.errors import InputError
+from logvggt_jax.errors import InputError, disk_errors, printable
 from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE, read_cameras
 from logvggt_jax.reconstruction.depth_files import read_depth, read_picture
 from logvggt_jax.reconstruction.point_cloud import count_points, read_points
@@ -55,17 +55,19 @@ class Reconstruction:
         """The reconstruction in a folder that `reconstruct` has written.
 
         Raises:
-          InputError: the folder is not one, or a file of it is missing or cut off. What else is wrong with a file is
-            said when it is read.
+          InputError: the folder is not one, its cameras cannot be used, or a file is missing or cut off. What else is
+            wrong with a file is said when it is read.
         """
         folder = Path(folder).expanduser()
         result = cls.with_cameras_of(folder)
         files = [depth_file(folder, name) for name in result.names]
-        if (folder / IMAGE_FOLDER).exists():  # results of earlier versions have none
-            files += [image_file(folder, name) for name in result.names]
+        with disk_errors(folder / IMAGE_FOLDER):
+            if (folder / IMAGE_FOLDER).exists():  # results of earlier versions have none
+                files += [image_file(folder, name) for name in result.names]
         for file in files:
-            if not file.is_file():
-                raise InputError(f"{file} is missing: the reconstruction is damaged or incomplete; make it again")
+            with disk_errors(file):
+                if not file.is_file():
+                    raise InputError(f"{file} is missing: the reconstruction is damaged or incomplete; make it again")
         count_points(folder / POINTS_FILE)
         return result
 
@@ -87,8 +89,8 @@ class Reconstruction:
             depth_intrinsics=stacked("depth_intrinsics"),
             image_size=tuple(document["image_size"]),
             depth_size=tuple(document["depth_size"]),
-            complete=document.get("complete", True),
-            skipped=tuple(frame["name"] for frame in document.get("skipped", ())),
+            complete=document["complete"],
+            skipped=tuple(frame["name"] for frame in document["skipped"]),
         )
 
     @property
@@ -111,18 +113,18 @@ class Reconstruction:
 
     def depth_and_confidence(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         """Both of one frame, in one reading."""
-        return read_depth(depth_file(self.folder, self.names[index]))
+        return read_depth(depth_file(self.folder, self.names[index]), self.depth_size)
 
     def image(self, index: int) -> np.ndarray:
         """A frame as the model saw it, [h, w, 3] uint8 RGB, to the few grey levels that JPEG costs."""
-        return read_picture(image_file(self.folder, self.names[index]))
+        return read_picture(image_file(self.folder, self.names[index]), self.depth_size)
 
     def points(self) -> tuple[np.ndarray, np.ndarray]:
         """The cloud: points [M, 3] float32 in the world, and colours [M, 3] uint8."""
         return read_points(self.folder / POINTS_FILE)
 
     def summary(self) -> str:
-        """One line a result, with its place."""
+        """One line a result, with its place; for people, so that a name's control characters are shown as escapes."""
         height, width = self.depth_size
         lines = [
             (CAMERAS_FILE, f"intrinsics and world-to-camera extrinsics of {self.num_frames} frames"),
@@ -137,9 +139,10 @@ class Reconstruction:
             took = f" in {self.seconds:.1f} s ({self.num_frames / self.seconds:.2f} frames/s)"
         notes = [] if self.complete else ["ended early: the same command goes on from here"]
         if self.skipped:
-            notes.append(f"{len(self.skipped)} frames left out: {', '.join(self.skipped[:5])}")
+            notes.append(f"{len(self.skipped)} frames left out: {', '.join(map(printable, self.skipped[:5]))}")
+        folder = printable(str(self.folder))
         return "\n".join(
-            [f"{self.num_frames} frames{took}", *notes, *(f"  {self.folder / name}: {what}" for name, what in lines)]
+            [f"{self.num_frames} frames{took}", *notes, *(f"  {folder}/{name}: {what}" for name, what in lines)]
         )
 
 

@@ -66,6 +66,7 @@ class Method(NamedTuple):
     """A line of the registry.
 
     Attributes:
+      title: what tables call it.
       open: model, variables and settings to a predictor of one sequence.
       settings: the frozen dataclass of what can be set, all fields with defaults.
       trained_for: what its weights have to be trained for: `windows` (LoG-VGGT) or `vggt` (plain VGGT).
@@ -74,6 +75,7 @@ class Method(NamedTuple):
         method spends its time.
     """
 
+    title: str
     open: Callable[[LogVGGT, Variables, Any], Predictor]
     settings: type
     trained_for: str
@@ -83,24 +85,27 @@ class Method(NamedTuple):
 
 METHODS: dict[str, Method] = {
     "windows": Method(
-        StreamSession.from_settings,
+        "LoG-VGGT",
+        StreamSession,
         WindowSettings,
         "windows",
-        "LoG-VGGT: overlapping windows that hand tokens on, poses refined globally",
+        "overlapping windows that hand tokens on, poses refined globally",
         window_program,
     ),
     "offline": Method(
+        "VGGT offline",
         OfflineSession,
         OfflineSettings,
         "vggt",
-        "plain VGGT: all frames in one window of full global attention",
+        "all frames in one window of full global attention",
         offline_program,
     ),
     "chunks": Method(
+        "VGGT on chunks",
         ChunkSession,
         ChunkPlan,
         "vggt",
-        "plain VGGT on overlapping chunks, chained by robust similarities",
+        "overlapping chunks without memory, chained by robust similarities",
         chunk_program,
     ),
 }

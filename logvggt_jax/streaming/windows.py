@@ -7,13 +7,13 @@ import functools
 from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from logvggt_jax.config import RefinementConfig
+from logvggt_jax.config import RefinementConfig, require_counts
 from logvggt_jax.model.gccr import RegisterKeys
 from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.model.parameters import in_compute_type
@@ -126,9 +126,8 @@ class WindowSettings:
     first_capacity: int = 256
 
     def __post_init__(self) -> None:
-        for name, least in (("ahead", 0), ("first_capacity", 1)):
-            if getattr(self, name) < least:
-                raise ValueError(f"stream {name} must be at least {least}, got {getattr(self, name)}")
+        require_counts(self, "first_capacity")
+        require_counts(self, "ahead", least=0)
 
 
 class StreamSession:
@@ -149,23 +148,18 @@ class StreamSession:
     Args:
       model: the model; `model.config.refinement` sets when poses become final.
       variables: {"params": …}.
-      provisional, ahead, first_capacity: see `WindowSettings`.
+      settings: of the stream.
+      **options: fields of `WindowSettings` by name, in place of those of `settings`.
     """
 
     def __init__(
-        self,
-        model: LogVGGT,
-        variables: Variables,
-        *,
-        provisional: bool = False,
-        ahead: int = 1,
-        first_capacity: int = 256,
+        self, model: LogVGGT, variables: Variables, settings: WindowSettings = WindowSettings(), **options: Any
     ) -> None:
-        self._model, self._settings = model, WindowSettings(provisional, ahead, first_capacity)
+        self._model, self._settings = model, dataclasses.replace(settings, **options)
         # Once, not at every call: cast, and brought to the device where they are numpy arrays.
         self._variables = jax.device_put(in_compute_type(variables, model.config))
         self._windows = _without_refinement(model)
-        self._store = TokenStore(first_capacity=first_capacity)
+        self._store = TokenStore(first_capacity=self._settings.first_capacity)
         self._pending: list[np.ndarray] = []
         self._state: WindowState | None = None
         self._flights: deque[_Flight] = deque()
@@ -177,11 +171,6 @@ class StreamSession:
         self._encodings = np.zeros((0, 9), np.float32)
         self._handed_out = 0
         self._closed = False
-
-    @classmethod
-    def from_settings(cls, model: LogVGGT, variables: Variables, settings: WindowSettings) -> StreamSession:
-        """A session with these settings."""
-        return cls(model, variables, **dataclasses.asdict(settings))
 
     @property
     def num_frames(self) -> int:

@@ -8,24 +8,22 @@ from pathlib import Path
 import jax
 from absl import logging
 
-from logvggt_jax.data.dataset import Dataset
+from logvggt_jax.data.dataset import Dataset, Reader
 from logvggt_jax.data.errors import EmptySplit
 from logvggt_jax.data.feeding.batches import BatchIterator, training_batches
 from logvggt_jax.data.feeding.holdouts import check_disjoint, check_held_out
 from logvggt_jax.data.registry import DATASETS, open_dataset
-from logvggt_jax.data.rooms.pool import render_pool
-from logvggt_jax.data.rooms.rooms import Rooms
 from logvggt_jax.errors import InputError
 from logvggt_jax.training.config import DataConfig, SourceConfig, StageConfig
 
 
-def open_source(source: SourceConfig) -> Dataset:
+def open_source(source: SourceConfig) -> Reader:
     """The data set of one source, made with its options."""
     return open_dataset(source.name, source.root, source.split, **dict(source.options))
 
 
 def open_sources(config: DataConfig, validation: SourceConfig | None = None) -> dict[str, Dataset]:
-    """The mixture's data sets by name; rooms are rendered here, once, since rendering costs more than training.
+    """The mixture's data sets by name, in the form in which training reads them; what has to be made is made here.
 
     Raises InputError: folders of data sets do not exist and `config.allow_missing` is off, or none exists; a data set
     would train on sequences that `config.hold_out` or the `validation` source keeps.
@@ -45,9 +43,8 @@ def open_sources(config: DataConfig, validation: SourceConfig | None = None) -> 
         # Names of sequences do not depend on where a copy of the set lies.
         if validation is not None and validation.name == source.name:
             check_disjoint(source.name, dataset.sequences, open_source(validation).sequences)
-        if isinstance(dataset, Rooms):
-            dataset = render_pool(dataset, cache_dir=config.cache_dir, progress=jax.process_index() == 0)
-        datasets[source.name] = dataset
+        progress = jax.process_index() == 0
+        datasets[source.name] = dataset.for_training(cache_dir=config.cache_dir, progress=progress)
     return datasets
 
 

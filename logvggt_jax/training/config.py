@@ -115,7 +115,7 @@ class SourceConfig:
     """One data set of a mixture.
 
     `weight` is its share of the clips relative to the others'. `stride`, smallest and largest, takes the place of
-    the stage's. `options` (sorted pairs) are the keyword arguments of procedural rooms.
+    the stage's. `options` (sorted pairs) are further arguments of the set's reader.
     """
 
     name: str
@@ -138,7 +138,8 @@ class DataConfig:
     """The training mixture.
 
     Clips run backwards in time with probability `reverse`. `worker_count` processes read ahead (0: none, this
-    process reads), each with `num_threads` threads. Rendered rooms are kept in `cache_dir`, in memory if None.
+    process reads), each with `num_threads` threads. What a set has to make first, such as pictures of procedural
+    rooms, is kept in `cache_dir`, in memory if None.
     `hold_out` (sorted pairs of data set and rule) says what must not be trained on. A data set whose folder does not
     exist is an error, with `allow_missing` a warning: the others then share its part. `augmentation` changes the
     pictures' colours, None leaves them. A clip that cannot be read, or of whose pixels less than `min_valid_depth`

@@ -66,14 +66,20 @@ def dry_run(config: TrainConfig, mesh: Mesh, say: Callable[[str], None] = print)
     limit = device_bytes(mesh.devices.flat[0])
     memory = "memory not known" if limit is None else f"{limit / _GIB:.1f} GiB each"
     say(f"{mesh.size} x {mesh.devices.flat[0].device_kind}, {memory}; nothing is allocated or run")
+
+    # A compilation of minutes is made once for each shape, whoever asks for it.
+    @functools.cache
+    def costs_of(clips: int, clip_length: int, size: tuple[int, int]) -> StepCosts | None:
+        return step_costs(config, mesh, clips, clip_length, size)
+
     for stage in config.stages:
         for size in stage.sizes:
             clips = stage.batch_size // mesh.size
             name = f"{stage.name} {size[0]}x{size[1]}, {clips} x {stage.clip_length} frames a device"
             operations = step_flops(config.model, (stage.batch_size, stage.clip_length, *size))
-            costs = step_costs(config, mesh, stage, size, clips)
+            costs = costs_of(clips, stage.clip_length, size)
             say(f"{name}: {operations / 1e12:.4g} TFLOP in all without recomputation; {_described(costs, limit)}")
-        say(f"{stage.name}: {_largest_that_fits(config, mesh, stage, limit)}")
+        say(f"{stage.name}: {_largest_that_fits(costs_of, mesh, stage, limit)}")
 
 
 def described_mesh(topology: str) -> Mesh:
@@ -107,13 +113,13 @@ def step_flops(config: ModelConfig, clips: tuple[int, ...]) -> float:
 
 
 def step_costs(
-    config: TrainConfig, mesh: Mesh, stage: StageConfig, size: tuple[int, int], clips: int
+    config: TrainConfig, mesh: Mesh, clips: int, clip_length: int, size: tuple[int, int]
 ) -> StepCosts | None:
-    """Compiles the step for `clips` a device of a stage; None where the compiler finds that they do not fit."""
+    """Compiles the step for `clips` a device; None where the compiler finds that they do not fit."""
     params = abstract_parameters(config.model)
     optimizer, step = make_program(LogVGGT(config.model), config, params, mesh)
     state = jax.eval_shape(functools.partial(initial_state, optimizer=optimizer), params)
-    batch = abstract_clips(clips * mesh.size, stage.clip_length, size)
+    batch = abstract_clips(clips * mesh.size, clip_length, size)
     arguments = [
         jax.tree.map(lambda x, s=sharding: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=s), tree)
         for tree, sharding in ((state, replicated(mesh)), (batch, split(mesh)))
@@ -160,12 +166,17 @@ def collectives(program: str) -> dict[str, tuple[int, int]]:
     return found
 
 
-def _largest_that_fits(config: TrainConfig, mesh: Mesh, stage: StageConfig, limit: int | None) -> str:
+def _largest_that_fits(
+    costs_of: Callable[[int, int, tuple[int, int]], StepCosts | None],
+    mesh: Mesh,
+    stage: StageConfig,
+    limit: int | None,
+) -> str:
     if limit is None and mesh.devices.flat[0].platform != "tpu":  # a described TPU's compiler knows
         return "how many clips fit is not known, these devices do not say how much memory they have"
     size, fitting = max(stage.sizes, key=math.prod), 0
     for clips in _TRIED_CLIPS:
-        costs = step_costs(config, mesh, stage, size, clips)
+        costs = costs_of(clips, stage.clip_length, size)
         if costs is None or not _fits(costs, limit):
             break
         fitting = clips

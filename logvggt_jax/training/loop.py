@@ -26,7 +26,7 @@ from logvggt_jax.training.device_batches import DeviceBatches
 from logvggt_jax.training.initialization import initial_parameters
 from logvggt_jax.training.metrics_log import MetricsLog
 from logvggt_jax.training.processes import ASK_EVERY, any_process, check_agreement
-from logvggt_jax.training.program import make_program
+from logvggt_jax.training.program import abstract_parameters, make_program
 from logvggt_jax.training.progress import Speedometer, duration, progress_line
 from logvggt_jax.training.sharding import check_batch_size, replicated
 from logvggt_jax.training.state import TrainState, initial_state
@@ -78,8 +78,7 @@ class _Run:
         self.deadline = None if config.max_minutes is None else time.monotonic() + 60 * config.max_minutes
         model = LogVGGT(config.model)
         # Shapes alone: a run that goes on needs no initial weights.
-        # Deep stacks are trained as one loop over stacked layers: their step compiles once and updates few arrays.
-        self.shapes = jax.eval_shape(lambda: stack_layers(initial_parameters(config.model, seed=config.seed)))
+        self.shapes = abstract_parameters(config.model)
         self.optimizer, self.step = make_program(model, config, self.shapes, mesh)
         self.programs: dict[tuple[int, ...], jax.stages.Compiled] = {}
         self.validation = None if config.validation is None else Validation(model, config.validation, mesh)

@@ -1,15 +1,13 @@
 """The step that a run's settings ask for; training runs it, a dry run compiles it alone."""
 
-import dataclasses
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import optax
 from jax.sharding import Mesh
 
 from logvggt_jax.config import ModelConfig
-from logvggt_jax.model.logvggt import LogVGGT
+from logvggt_jax.model.logvggt import LogVGGT, variable_shapes
 from logvggt_jax.model.parameters import stack_layers
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.optimizer import learning_rate_schedule, make_optimizer
@@ -18,11 +16,7 @@ from logvggt_jax.training.step import make_loss_terms, make_train_step
 
 def abstract_parameters(config: ModelConfig) -> Any:
     """Shapes of what is trained: deep stacks are one loop over stacked layers, whose step compiles once for all."""
-    # They do not depend on the form of attention, and tracing cuDNN's asks for a GPU.
-    model = LogVGGT(dataclasses.replace(config, attention="xla"))
-    patch = config.encoder.patch_size
-    images = jax.ShapeDtypeStruct((1, 1, patch, patch, 3), jnp.uint8)
-    return jax.eval_shape(lambda x: stack_layers(model.init(jax.random.key(0), x)["params"]), images)
+    return jax.eval_shape(stack_layers, variable_shapes(config)["params"])
 
 
 def make_program(

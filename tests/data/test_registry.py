@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from logvggt_jax.data import DATASETS, open_dataset
@@ -13,7 +14,8 @@ from logvggt_jax.errors import InputError
 def test_every_name_has_a_reader_of_that_name():
     # The order and spelling of the project's public list.
     expected = "co3dv2 blendedmvs arkitscenes wildrgbd scannet mvs_synth pointodyssey virtual_kitti spring hypersim"
-    assert " ".join(DATASETS) == f"{expected} replica seven_scenes nrgbd sintel bonn kitti tum rooms"
+    others = "kitti_odometry tum_recording colmap"
+    assert " ".join(DATASETS) == f"{expected} replica seven_scenes nrgbd sintel bonn kitti tum rooms {others}"
     for name, reader in READERS.items():
         assert reader.name == name and "all" in reader.splits and reader.title and reader.expects
 
@@ -34,6 +36,19 @@ def test_rooms_open_without_a_folder():
     frames = rooms.read(rooms.sequences[0], [0])
     assert frames.images.shape == (1, 96, 128, 3)
     assert rooms.sequences[0] not in open_dataset("rooms", None, split="train").sequences
+
+
+def test_a_set_that_is_made_says_what_others_ask_of_it():
+    options = {"num_frames": 3, "num_rooms": 2, "seed": 5, "speed": (0.7, 1.3), "facing_north": 0.5}
+    rooms = open_dataset("rooms", None, "test", **READERS["rooms"].size_options((28, 42)), **options)
+    assert rooms.image_size(rooms.sequences[0]) == (28, 42)
+    training = rooms.training_split()
+    assert training is not None and training.identity == rooms.identity
+    assert len(training.sequences) == 1500 and set(training.sequences).isdisjoint(rooms.sequences)
+    pool = rooms.for_training(cache_dir=None, progress=False)
+    for dataset in (rooms, pool):
+        assert dataset.sfm_extrinsics(rooms.sequences[0], [0]) is None
+    np.testing.assert_array_equal(pool.read(rooms.sequences[1], [2]).images, rooms.read(rooms.sequences[1], [2]).images)
 
 
 def test_wrong_names_splits_and_roots_are_refused(tmp_path: Path):

@@ -6,10 +6,12 @@ import importlib.metadata
 import json
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from importlib import resources
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import jax
 import numpy as np
@@ -79,6 +81,27 @@ def test_a_part_that_fails_or_takes_too_long_is_a_finding(monkeypatch: pytest.Mo
     assert Finding("whole", "rate", 5.0) in shown, "what was found before the end counts"
 
 
+def test_a_part_ends_with_whoever_reads_its_findings(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither its process nor the timer of its limit outlives them."""
+    stand_ins(monkeypatch, {"whole": FOUND + "time.sleep(60)"})
+    processes: list[subprocess.Popen] = []
+    popen = examination.subprocess.Popen
+
+    def watched(*given: Any, **options: Any) -> subprocess.Popen:
+        processes.append(popen(*given, **options))
+        return processes[-1]
+
+    monkeypatch.setattr(examination.subprocess, "Popen", watched)
+    timers = {thread for thread in threading.enumerate() if isinstance(thread, threading.Timer)}
+    findings = examination._in_own_process("whole", 50.0, tiny=True, quick=True)
+    assert next(findings) == Finding("whole", "rate", 5.0)
+    findings.close()
+    (process,) = processes
+    assert process.returncode is not None
+    for thread in set(threading.enumerate()) - timers:
+        assert not isinstance(thread, threading.Timer) or thread.finished.is_set()
+
+
 def test_time_that_one_part_leaves_is_the_next_ones(monkeypatch: pytest.MonkeyPatch) -> None:
     limits: list[float] = []
     monkeypatch.setattr(examination, "_in_own_process", lambda part, limit, **_: limits.append(limit) or iter(()))
@@ -127,13 +150,15 @@ def test_a_back_end_that_failed_says_why_the_gpu_is_not_used(monkeypatch: pytest
 
 
 def test_builds_side_by_side_and_idle_gpus_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    names = ["jax", "nvidia-nccl-cu12", "nvidia-nccl-cu13", "nvidia-cudnn-cu13"]
+    names = ["jax", "nvidia-nccl-cu12", "nvidia-nccl-cu13", "nvidia-cudnn-cu13", "jax-cuda13-pjrt"]
+    names += ["jax-cuda12-plugin", "jax-cuda13-plugin"]
     installed = [SimpleNamespace(metadata={"Name": name}, version="1") for name in names]
     monkeypatch.setattr(importlib.metadata, "distributions", lambda: installed)
     monkeypatch.setattr(environment, "nvidia_gpu_present", lambda: True)
     wrong = {finding.what: finding for finding in environment.examine() if finding.ok is False}
     assert wrong["builds of nvidia-nccl-cu*"].value == "nvidia-nccl-cu12, nvidia-nccl-cu13"
-    assert "builds of nvidia-cudnn-cu*" not in wrong
+    assert wrong["builds of jax-cuda*-plugin"].value == "jax-cuda12-plugin, jax-cuda13-plugin"
+    assert "builds of nvidia-cudnn-cu*" not in wrong and "builds of jax-cuda*-pjrt" not in wrong
     assert "logvggt-jax[cuda]" in wrong["NVIDIA GPU"].note
     assert wrong["flax"].value_text() == "-"
 

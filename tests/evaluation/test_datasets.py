@@ -20,7 +20,7 @@ from logvggt_jax.evaluation.protocols.images import PrincipalPointCrop
 from logvggt_jax.evaluation.report.report import tables, write_report
 from logvggt_jax.evaluation.runner import evaluate
 
-SETTINGS = ProtocolSettings(longer_edge=70, max_points=500, rooms={"num_rooms": 1, "num_frames": 16})
+SETTINGS = ProtocolSettings(longer_edge=70, max_points=500, options={"rooms": {"num_rooms": 1, "num_frames": 16}})
 
 
 def write_seven_scenes(root: Path, count: int = 12, *, listed: bool = True) -> None:

@@ -31,7 +31,7 @@ def test_an_evaluation_leaves_tables_json_and_figures(
         "--compilation_cache=none",
         "--config.methods=('windows',)",
         "--config.baselines=False",
-        "--config.rooms.num_rooms=1",
+        "--config.options.num_rooms=1",
         "--config.evaluation.image_size=(28, 42)",
         "--config.evaluation.clip_lengths=(4,)",
     )
@@ -111,7 +111,7 @@ def test_the_papers_benchmarks_run_on_real_frames_and_go_on_after_a_kill(
     (tmp_path / "data" / "seven_scenes").symlink_to(seven_scenes_dir)
     options = ["--config=configs/eval/paper.py", "--config.protocol.longer_edge=42", f"--output={tmp_path / 'out'}"]
     options += [f"--checkpoint={tmp_path / 'model'}", f"--data_root={tmp_path / 'data'}", "--compilation_cache=none"]
-    options += ["--config.protocol.max_points=5000", "--config.protocol.rooms.num_rooms=1"]
+    options += ["--config.protocol.max_points=5000", "--config.protocol.options.rooms.num_rooms=1"]
     options += ["--config.timings.lengths=(20, 40)", "--config.timings.rounds=1"]
     first = run_eval(*options, "--config.benchmarks=('seven_scenes-reconstruction-*', 'rooms-12', 'bonn-*')")
     assert first.returncode == 0, first.stderr

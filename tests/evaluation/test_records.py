@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +13,12 @@ from layouts import co3dv2
 
 from logvggt_jax.data.readers.co3dv2 import Co3Dv2
 from logvggt_jax.data.rooms.rooms import Rooms
+from logvggt_jax.errors import InputError
 from logvggt_jax.evaluation import environment, runner
 from logvggt_jax.evaluation.environment import code_version
 from logvggt_jax.evaluation.methods.baselines import static_camera
 from logvggt_jax.evaluation.runner import Benchmark
+from logvggt_jax.streaming import PredictionError
 
 
 def records(folder: Path) -> list[dict[str, Any]]:
@@ -32,13 +36,64 @@ def test_a_killed_evaluation_goes_on_where_it_stopped(rooms: Rooms, tmp_path: Pa
     # What a kill in the middle of a write leaves behind.
     with lines.open("a") as file:
         file.write('{"key": "half')
-    resumed = run(rooms, [method], tmp_path / "killed")
+    with pytest.warns(UserWarning, match=r"clips\.jsonl: line 4 is cut off or damaged"):
+        resumed = run(rooms, [method], tmp_path / "killed")
     assert len(calls) == 3 + 2, "two of four clips were left, and the third call had failed"
     assert resumed["summary"] == whole["summary"]
     again = run(rooms, [method], tmp_path / "killed")
     assert len(calls) == 5 and again["summary"] == whole["summary"]
     for name in ("whole", "killed"):
         assert len(records(tmp_path / name)) == 4
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda line: line[:5] + b"\xff" + line[6:],
+        lambda line: line[:-9],
+        lambda line: b"\0" * len(line),
+        lambda line: b"7",
+        lambda line: b"[" * 100_000,
+        # Another number, another key and another field are as good JSON as before.
+        lambda line: line.replace(b'"frames_used": 4', b'"frames_used": 5'),
+        lambda line: re.sub(rb'"key": "..', b'"key": "zz', line),
+        lambda line: line.replace(b'"digest"', b'"dagest"'),
+        lambda line: line.replace(b'"metrics"', b'"matrics"'),
+    ],
+)
+def test_damaged_lines_are_left_out_and_the_others_count(
+    rooms: Rooms, tmp_path: Path, damage: Callable[[bytes], bytes]
+) -> None:
+    method, calls = failing("", at_call=-1)
+    whole = run(rooms, [method], tmp_path)
+    file = tmp_path / "clips.jsonl"
+    lines = file.read_bytes().splitlines()
+    place = next(number for number, line in enumerate(lines) if b'"frames_used": 4' in line)
+    lines[place] = damage(lines[place])
+    file.write_bytes(b"\n".join(lines) + b"\n")
+    with pytest.warns(UserWarning, match=rf"{tmp_path}/clips\.jsonl: line {place + 1} is cut off or damaged"):
+        again = run(rooms, [method], tmp_path)
+    assert len(calls) == 4 + 1 and again["summary"] == whole["summary"] and len(records(tmp_path)) == 4
+
+
+def test_records_of_before_they_had_digests_count(rooms: Rooms, tmp_path: Path) -> None:
+    method, calls = failing("", at_call=-1)
+    run(rooms, [method], tmp_path)
+    file = tmp_path / "clips.jsonl"
+    lines = [json.loads(line) for line in file.read_text().splitlines()]
+    for line in lines:
+        line.pop("digest", None)
+    lines[-1]["figures"] = ["figures/../../secret.png"]
+    file.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    with pytest.warns(UserWarning, match=r"line 5 is cut off or damaged"):
+        run(rooms, [method], tmp_path)
+    assert len(calls) == 4 + 1
+
+
+def test_records_that_cannot_be_read_are_named(rooms: Rooms, tmp_path: Path) -> None:
+    (tmp_path / "clips.jsonl").mkdir()
+    with pytest.raises(InputError, match=r"clips\.jsonl is no file"):
+        run(rooms, [static_camera()], tmp_path)
 
 
 def test_results_of_other_settings_or_parameters_are_not_taken_over(rooms: Rooms, tmp_path: Path) -> None:
@@ -121,10 +176,12 @@ def test_the_version_of_the_code_is_that_of_its_statements(tmp_path: Path) -> No
 
 
 def test_other_results_stay_until_the_new_ones_are_complete(rooms: Rooms, tmp_path: Path) -> None:
+    drawn = dataclasses.replace(SETTINGS, figures=1)
     old, _ = failing("", at_call=-1)
-    run(rooms, [old], tmp_path)
+    run(rooms, [old], tmp_path, drawn)
     figures = tmp_path / "figures"
-    figures.mkdir()
+    old_pictures = {f"figures/{path.name}": path.read_bytes() for path in figures.iterdir()}
+    assert old_pictures
     theirs = [tmp_path / "report.md", tmp_path / "results.json", figures / "a_room_from_0_9_frames_depth.png"]
     for path in (theirs[0], theirs[2], tmp_path / "notes.txt", figures / "mine.png"):
         path.write_text("old")
@@ -132,11 +189,15 @@ def test_other_results_stay_until_the_new_ones_are_complete(rooms: Rooms, tmp_pa
     new, _ = failing("killed", at_call=3)
     new = dataclasses.replace(new, identity="new")
     with pytest.raises(RuntimeError, match="killed"):
-        run(rooms, [new], tmp_path)
+        run(rooms, [new], tmp_path, drawn)
     assert theirs[1].read_text() == before and theirs[0].exists() and theirs[2].exists()
     assert records(tmp_path)[:4] == measured and len(records(tmp_path)) == 4 + 2
-    run(rooms, [new], tmp_path)
+    # Those of the same clip by another method or model beside them, under other names.
+    pictures = {picture: (tmp_path / picture).read_bytes() for record in measured for picture in record["figures"]}
+    assert pictures == old_pictures
+    run(rooms, [new], tmp_path, drawn)
     assert len(records(tmp_path)) == 4
+    assert not any((tmp_path / picture).exists() for picture in old_pictures)
     assert theirs[1].read_text() != "old" and not theirs[0].exists() and not theirs[2].exists()
     assert (tmp_path / "notes.txt").exists() and (figures / "mine.png").exists()
 
@@ -149,3 +210,29 @@ def test_results_name_the_environments_that_measured_them(
         rows = [static_camera(), dataclasses.replace(static_camera(), name="another")]
         results = run(rooms, rows[:methods], tmp_path)
     assert [each["device"] for each in results["environments"]] == ["first", "second"]
+
+
+def test_pictures_that_are_missing_are_drawn_at_a_second_start(rooms: Rooms, tmp_path: Path) -> None:
+    """Of the clips that are drawn alone, by the first method alone; a failure then costs no number."""
+    first, calls = failing("no memory", at_call=9, error=PredictionError)
+    second, others = failing("", at_call=-1)
+    methods = [first, dataclasses.replace(second, name="second")]
+    run(rooms, methods, tmp_path)
+    assert (len(calls), len(others)) == (4, 4) and not list(tmp_path.rglob("*.png"))
+    drawing = dataclasses.replace(SETTINGS, figures=1)
+
+    def draw() -> dict[str, Any]:
+        return run(rooms, methods, tmp_path, drawing)
+
+    results = draw()
+    assert (len(calls), len(others)) == (6, 4), "one clip of each length"
+    pictures = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.png")}
+    assert pictures == set(results["figures"]) and len(pictures) == 2
+    draw()
+    assert len(calls) == 6
+    (tmp_path / min(pictures)).unlink()
+    assert draw()["figures"] == results["figures"] and len(calls) == 7 and (tmp_path / min(pictures)).exists()
+    # The ninth call fails, and what was measured before stays.
+    for name in pictures:
+        (tmp_path / name).unlink()
+    assert draw()["summary"] == results["summary"] and len(calls) == 9 and len(records(tmp_path)) == 8

@@ -13,7 +13,7 @@ import pytest
 from rich.console import Console
 
 from logvggt_jax.config import ModelConfig
-from logvggt_jax.errors import InputError
+from logvggt_jax.errors import InputError, OutputExists
 from logvggt_jax.evaluation.report.report import print_report
 from logvggt_jax.evaluation.run import run_evaluation
 from logvggt_jax.weights import save_model
@@ -41,8 +41,12 @@ def configuration(name: str, changes: dict[str, Any]) -> dict[str, Any]:
         ("rooms", {}, None, "no-model"),
         ("rooms", {}, "d", "leave --data_root=d out"),
         ("rooms", {"evaluation.stride": 0}, None, r"config\.evaluation\.stride must be"),
-        ("rooms", {"references.chunk_overlap": 12}, None, "below the chunk size 12, got 12"),
-        ("rooms", {"rooms.number": 3}, None, "unknown option 'number'"),
+        ("rooms", {"settings.chunks.overlap": 12}, None, "below the chunk size 12, got 12"),
+        ("rooms", {"options.number": 3}, None, "unknown option 'number'"),
+        ("rooms", {"options.height": 28}, None, "rooms: height follows from the rest of the run"),
+        ("paper", {"protocol.options.room": {}}, None, "unknown data set 'room'"),
+        ("paper", {"protocol.options.rooms.number": 3}, None, "rooms: unknown option 'number'"),
+        ("paper", {"protocol.options.rooms.num_frames": 0}, None, "rooms: num_frames must be at least 1"),
         ("seven_scenes", {}, None, "give its folder with --data_root"),
         ("seven_scenes", {}, "no-data", "no-data"),
         ("paper", {}, "no-data", "no-data: no such folder"),
@@ -64,7 +68,7 @@ def test_the_model_and_all_baselines_make_a_table(
     save_model(tmp_path / "model", small_config, small_variables["params"])
     clips = {"image_size": (28, 42), "clip_lengths": (4,), "max_points": 800, "figures": 1}
     changes = {f"evaluation.{name}": value for name, value in clips.items()}
-    changes |= {"rooms.num_rooms": 1, "methods": ("windows",)}
+    changes |= {"options.num_rooms": 1, "methods": ("windows",)}
     values, output = configuration("rooms", changes), tmp_path / "out"
     results = run_evaluation(values, tmp_path / "model", output, command="command")
     assert json.loads((output / "results.json").read_text()) == results
@@ -79,8 +83,8 @@ def test_the_model_and_all_baselines_make_a_table(
     markdown, shown = (output / "report.md").read_text(), f"{trained['scale/abs_rel']:.4f}"
     for text in (terminal.getvalue(), markdown):
         assert all(name in text for name in names)
-        assert "training rooms" in text and "†" in text and shown in text
-        assert "To get these numbers again: command" in text
+        assert "training split of procedural rooms" in text and "†" in text and shown in text
+        assert re.search(r"To get these numbers again:\s+command\n", text)
     # The pictures of the first clip are drawn for the first row, and the page holds them.
     stems = {path.stem.rpartition("_")[2] for path in (output / "figures").iterdir()}
     assert stems == {"depth", "points", "trajectory"}
@@ -90,3 +94,15 @@ def test_the_model_and_all_baselines_make_a_table(
     rows = list(csv.reader((output / "tables" / "01-depth-clips-of-4-frames.csv").read_text().splitlines()))
     assert rows[0][:2] == ["method", "Abs Rel (scale) ↓"]
     assert rows[1][:2] == ["LoG-VGGT", shown]
+
+
+def test_only_a_new_folder_or_an_evaluations_is_written_to(tmp_path: Path) -> None:
+    values, output = configuration("rooms", {}), tmp_path / "out"
+    output.mkdir()
+    (output / "results.json").write_text("another program's")
+    with pytest.raises(OutputExists, match=r"out is not overwritten: it holds no clips\.jsonl"):
+        run_evaluation(values, tmp_path / "no-model", output, command="command")
+    assert [path.name for path in output.iterdir()] == ["results.json"]
+    (output / "clips.jsonl").touch()
+    with pytest.raises(InputError, match="no-model"):
+        run_evaluation(values, tmp_path / "no-model", output, command="command")

@@ -8,7 +8,7 @@ import pytest
 from known_answers import SETTINGS, clip_of, oracle
 
 from logvggt_jax.data.rooms.rooms import Rooms
-from logvggt_jax.evaluation import scratch
+from logvggt_jax.evaluation import scores, scratch
 from logvggt_jax.evaluation.methods.baselines import static_camera
 from logvggt_jax.evaluation.methods.method import Method
 from logvggt_jax.evaluation.protocols import PointsMeasure
@@ -24,6 +24,7 @@ from logvggt_jax.evaluation.scores import (
 from logvggt_jax.evaluation.scratch import scratch_array
 from logvggt_jax.metrics import depth_metrics
 from logvggt_jax.metrics.depth import pixel_errors, resize_depth
+from logvggt_jax.metrics.pose import relative_pose_errors
 from logvggt_jax.types import Frames
 
 PROTOCOL = clip_protocols("rooms", "test", SETTINGS)[0]
@@ -93,6 +94,20 @@ def test_errors_against_a_second_set_of_poses_stand_beside_the_first(rooms: Room
     assert score.metrics["ate"] < 1e-5 < 0.01 < score.metrics["sfm/ate"]
     mean = benchmark_score(PROTOCOL, oracle(frames), [("a", score)], 1)
     assert mean["sfm/ate"] == score.metrics["sfm/ate"] and mean["clips_sfm/trajectory"] == 1
+
+
+def test_a_motionless_camera_is_judged_once_a_clip(rooms: Rooms, monkeypatch: pytest.MonkeyPatch) -> None:
+    still: list[int] = []
+
+    def counted(predicted: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        still.append(int((predicted[:, :3, :3] == np.eye(3)).all()))
+        return relative_pose_errors(predicted, true)
+
+    monkeypatch.setattr(scores, "relative_pose_errors", counted)
+    frames = rooms.read(rooms.sequences[0], [0, 2, 4, 6])
+    truth = prepare_truth(clip_of(frames), None)
+    found = [score_of(frames, truth).metrics["identity_rotation_error"] for _ in range(3)]
+    assert sum(still) == 1 and len(still) == 4 and found[0] == found[2] > 0
 
 
 def test_score_weighs_depth_by_pixels_and_poses_plainly() -> None:

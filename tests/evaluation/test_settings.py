@@ -7,6 +7,7 @@ import pytest
 from logvggt_jax.errors import InputError
 from logvggt_jax.evaluation.protocols.clips import ClipSettings
 from logvggt_jax.evaluation.settings import ClipRun, PaperRun, read_run
+from logvggt_jax.streaming import ChunkPlan
 
 CLIPS = {"image_size": [28, 42], "clip_lengths": [4]}
 CLIP_RUN = {"title": "t", "dataset": "rooms", "split": "test", "baselines": False, "evaluation": CLIPS}
@@ -45,8 +46,11 @@ def test_wrong_clips_are_named(values: dict[str, Any], message: str) -> None:
         ("protocol", {"max_points": 0}, r"config\.protocol\.max_points must be"),
         ("benchmarks", (), r"config\.benchmarks must name at least one"),
         ("max_sequences", 0, r"config\.max_sequences must be a positive integer"),
-        ("references", {"max_frames": 0}, r"config\.references: OfflineSettings.max_frames must be"),
-        ("references", {"chunk_size": 4, "chunk_overlap": 4}, "below the chunk size 4, got 4"),
+        ("methods", ("window",), r"config\.methods: unknown 'window'; known are windows, "),
+        ("settings", {"offlin": {}}, r"config\.settings: unknown 'offlin'; known are windows, "),
+        ("settings", {"offline": {"max_frames": 0}}, r"config: settings\.offline\.max_frames must be"),
+        ("settings", {"chunks": {"overlaps": 4}}, r"unknown field settings\.chunks\.overlaps; did you mean overlap\?"),
+        ("settings", {"chunks": {"size": 4, "overlap": 4}}, "below the chunk size 4, got 4"),
         ("timings", {"lengths": (0,)}, r"config\.timings\.lengths must be numbers of frames, 1 or more each"),
         ("timings", {"rounds": 0}, r"config\.timings\.rounds must be"),
         ("timings", {"length": (5,)}, r"unknown field config\.timings\.length"),
@@ -55,6 +59,11 @@ def test_wrong_clips_are_named(values: dict[str, Any], message: str) -> None:
 def test_wrong_settings_of_the_papers_run_are_named(field: str, value: Any, message: str) -> None:
     with pytest.raises(InputError, match=message):
         read_run({**PAPER_RUN, field: value})
+
+
+def test_settings_of_a_method_are_of_its_own_class() -> None:
+    found = read_run({**CLIP_RUN, "methods": ["chunks", "windows"], "settings": {"chunks": {"size": 6, "overlap": 3}}})
+    assert found.settings_of("chunks") == ChunkPlan(6, 3) and found.settings_of("windows") is None
 
 
 def test_missing_and_unknown_fields_are_named() -> None:

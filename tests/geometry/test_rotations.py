@@ -5,7 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from logvggt_jax.geometry import matrix_to_quaternion, nearest_rotation, quaternion_to_matrix, rotation_angle
+from logvggt_jax.geometry import (
+    is_rotation,
+    matrix_to_quaternion,
+    nearest_rotation,
+    quaternion_to_matrix,
+    rotation_angle,
+)
 
 
 def axis_angle(axis, angle: float) -> np.ndarray:
@@ -73,3 +79,10 @@ def test_nearest_rotation(convert) -> None:
     mirrored = np.asarray(nearest_rotation(convert(rotation @ np.diag([1.0, 1.0, -0.1]))))
     assert np.linalg.det(mirrored) == pytest.approx(1.0, abs=1e-5)
     np.testing.assert_allclose(mirrored, rotation, atol=1e-5)
+
+
+def test_rotations_are_told_from_other_matrices() -> None:
+    matrices = quaternion_to_matrix(quaternions())
+    assert is_rotation(matrices).all() and is_rotation(matrices.astype(np.float32)).all()
+    for other in (-matrices, 1.01 * matrices, np.nan * matrices, np.diag([1, 1, 0.99]) @ matrices):
+        assert not is_rotation(other).any()

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from logvggt_jax import LogVGGT, ModelConfig, RefinementConfig
-from logvggt_jax.model.refinement import num_triggers, trigger_range
+from logvggt_jax.model.refinement import num_triggers
 
 WIDTH = 64
 FRAMES = 11
@@ -118,12 +118,19 @@ def test_a_period_of_all_frames_is_the_full_refinement(small_config, small_varia
     close(periodic, once)
 
 
+def refined_frames(trigger: int, num_frames: int, period: int | None) -> tuple[int, int]:
+    """Frames [start, stop) that a trigger (from 0) refines; they see the registers of frames [0, stop)."""
+    if period is None:
+        return 0, num_frames
+    return trigger * period, min((trigger + 1) * period, num_frames)
+
+
 @pytest.mark.parametrize("period", [2, 3, 4])
 def test_periodic_poses_know_the_past_only_and_stay(small_config, small_variables, period):
     run = sequence(with_refinement(small_config, period=period))
     camera, register = tokens()
     for trigger in range(num_triggers(FRAMES, period) - 1):
-        _, stop = trigger_range(trigger, FRAMES, period)
+        _, stop = refined_frames(trigger, FRAMES, period)
         other_camera, other_register = camera.copy(), register.copy()
         other_camera[:, stop:], other_register[:, stop:] = (x[:, stop:] for x in tokens(seed=2))
         before = run(small_variables, camera, register, full())
@@ -140,7 +147,7 @@ def by_hand(config: ModelConfig, settings: RefinementConfig, variables, camera, 
     refined = camera.copy()
     poses = []
     for trigger in range(num_triggers(num_frames, settings.period)):
-        start, stop = trigger_range(trigger, num_frames, settings.period)
+        start, stop = refined_frames(trigger, num_frames, settings.period)
         past = register[:, :stop]
         refined[:, start:stop] = refine_tokens(variables, camera[:, start:stop], past, full(stop))
         if settings.context is None:

@@ -63,9 +63,8 @@ class Recorder:
 def reconstruct_recorded(predictor: Recorder, source: Source | Path, output: Path, **options: Any) -> Reconstruction:
     """A reconstruction by a method whose predictor this is."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(
-            METHODS, "recorder", Method(lambda *_: predictor, WindowSettings, "windows", "records", window_program)
-        )
+        method = Method("recorder", lambda *_: predictor, WindowSettings, "windows", "records", window_program)
+        patch.setitem(METHODS, "recorder", method)
         return reconstruct(
             source, output, model=LogVGGT(), variables={}, method="recorder", longer_edge=LONGER_EDGE, **options
         )

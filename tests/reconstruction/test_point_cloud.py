@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -95,10 +96,54 @@ def test_other_and_damaged_files_are_named(tmp_path: Path) -> None:
         count_points(path)
     write_points(path, 3, [np.zeros(3, VERTEX)])
     whole = path.read_bytes()
-    for content in (whole[:-1], whole + b"\0", whole[:50], b"", whole.replace(b"float x", b"float w")):
+    for content, complaint in (
+        (whole[:-1], "cut off: 3 points need 220 bytes, it has 219"),
+        (whole + b"\0", "longer than its header says: 3 points need 220 bytes, it has 221"),
+        (whole[:50], "cut off in its header"),
+        (b"", "empty"),
+        (b"\x89PNG", "no PLY file"),
+        (whole.replace(b"float x", b"float w"), "a PLY file of another program"),
+        (whole.replace(b"vertex 3", b"vertex 3" + 30 * b"0"), "a PLY file of another program"),
+    ):
         path.write_bytes(content)
-        with pytest.raises(InputError, match=r"p\.ply is not a point cloud of this program, or is cut off"):
+        with pytest.raises(InputError, match=rf"p\.ply is {complaint}"):
             count_points(path)
+
+
+def test_a_cloud_with_points_that_are_not_finite_is_refused(tmp_path: Path) -> None:
+    vertices = np.zeros(3, VERTEX)
+    vertices["y"][1] = np.nan
+    write_points(tmp_path / "p.ply", 3, [vertices])
+    with pytest.raises(InputError, match=r"p\.ply is damaged: 1 of its 3 points are not finite"):
+        read_points(tmp_path / "p.ply")
+
+
+def test_candidates_stay_within_bounds_whatever_length_was_announced() -> None:
+    """A header may say one frame where a thousand follow: the samples of all together keep to the bound."""
+    frames = random_frames(40)
+    point_filter = PointFilter(0, edge_threshold=None, max_points=40_000)
+    sizes: dict[int, int] = {}
+    for announced in (1, 1000):
+        tracemalloc.start()
+        selection = PointSelection(point_filter, announced)
+        for index in range(1000):
+            selection.see(index, *frames[index % 40])
+        sizes[announced] = tracemalloc.get_traced_memory()[0]
+        tracemalloc.stop()
+    # Twice the points wanted, 17 bytes each, and what a thousand small objects weigh.
+    assert sizes[1] < 1.1 * sizes[1000] and sizes[1000] < 80_000 * 17 + 1000 * 1500
+
+
+@pytest.mark.parametrize("announced", [1, 7, 100])
+def test_a_wrong_length_changes_neither_number_nor_determinism(announced: int) -> None:
+    frames = random_frames(60)
+    for depth, _, _ in frames[::2]:
+        depth[:12] = 0
+    point_filter = PointFilter(25, max_points=5000)
+    selection, chosen = select(point_filter, frames, expected_frames=announced)
+    assert sum(len(points.indices) for points in chosen) == selection.num_points == 5000
+    for again, before in zip(select(point_filter, frames, expected_frames=announced, seed=1)[1], chosen, strict=True):
+        np.testing.assert_array_equal(again.indices, before.indices)
 
 
 @pytest.mark.parametrize("most", [3, 4, 99, 100, 12345])
@@ -224,6 +269,15 @@ def test_stride_invalid_depth_and_edges() -> None:
     expected = np.zeros((6, 8), bool)
     expected[:, 3:5] = True
     np.testing.assert_array_equal(edges, expected)
+
+
+@pytest.mark.parametrize("lowest", [-0.0, -1.0, 0.0])
+def test_confidences_of_nothing_and_less_are_the_lowest(lowest: float) -> None:
+    confidence = np.full((4, 5), 2.0, np.float32)
+    confidence[0] = lowest
+    frames = [(np.ones((4, 5), np.float32), confidence, np.zeros((4, 5, 3), np.uint8))]
+    _, chosen = select(PointFilter(25, max_points=None), frames)
+    assert chosen[0].indices.tolist() == list(range(5, 20))
 
 
 def test_nothing_valid_gives_no_points() -> None:

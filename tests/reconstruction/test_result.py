@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +14,7 @@ from result_folder import SIZE, write_result
 
 from logvggt_jax.errors import InputError
 from logvggt_jax.geometry import camera_centres
+from logvggt_jax.reconstruction.depth_files import write_picture
 from logvggt_jax.reconstruction.exporters import EXPORTERS
 from logvggt_jax.reconstruction.exporters.tum import read_trajectory
 from logvggt_jax.reconstruction.point_cloud import PointFilter, read_points
@@ -53,6 +57,71 @@ def test_a_damaged_file_is_named_when_it_is_read(tmp_path: Path, name: str, kept
         result.depth(1)
         result.image(1)
     assert "\n" not in str(caught.value)
+
+
+def with_cameras(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """Changes the content of cameras.json."""
+    document = json.loads((folder / "cameras.json").read_text())
+    change(document)
+    (folder / "cameras.json").write_text(json.dumps(document))
+
+
+def frame_with(**values: Any) -> Callable[[dict[str, Any]], object]:
+    return lambda document: document["frames"][1].update(values)
+
+
+EYE = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        (lambda d: d.update(frames=[]), "frames must be a list of cameras"),
+        (lambda d: d.update(frames={"0": 1}), "frames must be a list of cameras"),
+        (lambda d: d["frames"].append(7), "frame 3 is no object"),
+        (lambda d: d.pop("depth_size"), "depth_size must be height and width"),
+        (lambda d: d.update(image_size=[0, 64]), "image_size must be height and width"),
+        (lambda d: d.update(depth_size=[24, 1e400]), "depth_size must be height and width"),
+        (lambda d: d.update(depth_size=[48, 32]), r"depth/0\.npz: depth must be floats \[48, 32\].*got \[24, 32\]"),
+        (frame_with(name="../../secret"), "cannot be that of a file"),
+        (frame_with(name=".."), "cannot be that of a file"),
+        (frame_with(name="a\0b"), "cannot be that of a file"),
+        (frame_with(name=7), "cannot be that of a file"),
+        (frame_with(name="0"), "two frames have the name '0'"),
+        (frame_with(name=300 * "n"), "too long"),
+        (frame_with(timestamp="soon"), "the timestamp of frame 1, '1', must be a number"),
+        (frame_with(timestamp=float("nan")), "must be finite"),
+        (frame_with(extrinsics=EYE), r"the extrinsics of frame 1, '1', must be numbers \[3, 4\]"),
+        (frame_with(extrinsics=[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1]]), "must be numbers"),
+        (frame_with(extrinsics=[[1, 0, 0, 1e300], [0, 1, 0, 0], [0, 0, 1, 0]]), "must be finite"),
+        (frame_with(extrinsics=[[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]), "hold no rotation"),
+        (frame_with(extrinsics=[[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]), "hold no rotation"),
+        (frame_with(intrinsics=[[0, 0, 0], [0, 1, 0], [0, 0, 1]]), "not those of a pinhole camera"),
+        (frame_with(depth_intrinsics=[[10**400, 0, 0], [0, 1, 0], [0, 0, 1]]), "must be numbers"),
+    ],
+)
+def test_cameras_that_cannot_be_used_are_refused_and_named(
+    tmp_path: Path, change: Callable[[dict[str, Any]], object], complaint: str
+) -> None:
+    write_result(tmp_path)
+    with_cameras(tmp_path, change)
+    with pytest.raises(InputError, match=complaint) as caught:
+        Reconstruction.open(tmp_path).depth(0)
+    assert str(tmp_path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_depth_and_images_of_another_kind_or_size_are_named(tmp_path: Path) -> None:
+    write_result(tmp_path)
+    result = Reconstruction.open(tmp_path)
+    np.savez(tmp_path / "depth" / "0.npz", depth=np.zeros(SIZE, complex), confidence=np.zeros(SIZE, np.float16))
+    with pytest.raises(InputError, match=r"depth/0\.npz: depth must be floats .* got \[24, 32\] of complex128"):
+        result.depth(0)
+    np.savez(tmp_path / "depth" / "0.npz", depth=np.zeros(SIZE, np.float16), confidence=np.zeros(5, np.float16))
+    with pytest.raises(InputError, match=r"depth/0\.npz: confidence must be floats .* got \[5\]"):
+        result.depth(0)
+    write_picture(tmp_path / "images" / "0.jpg", np.zeros((8, 8, 3), np.uint8))
+    with pytest.raises(InputError, match=r"images/0\.jpg has 8 x 8 pixels, expected 24 x 32"):
+        result.image(0)
 
 
 def test_results_of_before_images_were_kept_still_open(tmp_path: Path) -> None:

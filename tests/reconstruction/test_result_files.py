@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from logvggt_jax.errors import InputError
 from logvggt_jax.geometry import camera_centres, invert, quaternion_to_matrix, rotation_angle
 from logvggt_jax.reconstruction.cameras_file import read_cameras, write_cameras
 from logvggt_jax.reconstruction.depth_files import (
     depth_picture,
     read_depth,
+    read_picture,
     write_depth,
     write_picture,
 )
 from logvggt_jax.reconstruction.exporters.tum import read_trajectory, write_trajectory
+from logvggt_jax.reconstruction.point_cloud import read_points
 from logvggt_jax.reconstruction.room_sequence import write_room_sequence
 
 
@@ -64,17 +68,49 @@ def test_cameras_round_trip(tmp_path: Path) -> None:
         extrinsics=extrinsics,
         intrinsics=intrinsics,
         image_size=(480, 640),
-        model_intrinsics=intrinsics / 2,
+        model_intrinsics=np.diag([0.5, 0.5, 1]) @ intrinsics,
         model_size=(240, 320),
     )
     cameras = read_cameras(tmp_path / "cameras.json")
     assert cameras["image_size"] == [480, 640]
     assert [frame["name"] for frame in cameras["frames"]] == ["a", "b", "c", "d"]
     np.testing.assert_array_equal([frame["extrinsics"] for frame in cameras["frames"]], extrinsics)
-    np.testing.assert_array_equal([frame["depth_intrinsics"] for frame in cameras["frames"]], intrinsics / 2)
+    np.testing.assert_array_equal(
+        [frame["depth_intrinsics"] for frame in cameras["frames"]], np.diag([0.5, 0.5, 1]) @ intrinsics
+    )
 
 
-@pytest.mark.parametrize("content", ["{", "[]", "{}", json.dumps({"format": "other", "frames": []})])
+@pytest.mark.parametrize(
+    ("content", "complaint"),
+    [
+        (b"0 1 2 3 0 0 0 1\n\xff\xfe 1 2 3 0 0 0 1\n", r"bad\.txt:2: expected 8 numbers"),
+        (b"0 1 2 nan 0 0 0 1\n", r"bad\.txt:1: expected 8 numbers .* finite ones"),
+        (b"inf 1 2 3 0 0 0 1\n", r"bad\.txt:1: expected 8 numbers .* finite ones"),
+        (b"0 1 2 1e300 0 0 0 1\n", r"bad\.txt:1: expected 8 numbers .* finite ones"),
+        (b"# two\n0 1 2 3 0 0 0 0\n", r"bad\.txt:2: the quaternion qx qy qz qw is zero"),
+        (b"", r"bad\.txt holds no pose"),
+    ],
+)
+def test_what_is_wrong_with_a_trajectory_is_named_with_its_line(tmp_path: Path, content: bytes, complaint: str) -> None:
+    (tmp_path / "bad.txt").write_bytes(content)
+    with pytest.raises(InputError, match=complaint) as caught:
+        read_trajectory(tmp_path / "bad.txt")
+    assert "\n" not in str(caught.value)
+
+
+def test_times_in_nanoseconds_are_times(tmp_path: Path) -> None:
+    (tmp_path / "t.txt").write_text("1600000000000000000 1 2 3 0 0 0 1\n")
+    assert read_trajectory(tmp_path / "t.txt")[0].tolist() == [1.6e18]
+
+
+def test_a_pipe_is_no_file_and_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for read in (read_trajectory, read_cameras, read_depth, read_picture, read_points):
+        with pytest.raises(InputError, match="pipe is no file"):
+            read(tmp_path / "pipe")
+
+
+@pytest.mark.parametrize("content", ["{", "[]", "[" * 100_000, "{}", json.dumps({"format": "other", "frames": []})])
 def test_other_files_are_no_cameras(tmp_path: Path, content: str) -> None:
     (tmp_path / "cameras.json").write_text(content)
     with pytest.raises(ValueError, match=r"cameras\.json"):

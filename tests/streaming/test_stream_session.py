@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from logvggt_jax import LogVGGT, ModelConfig, Predictions, RefinementConfig, WindowConfig
+from logvggt_jax.errors import InputError
 from logvggt_jax.streaming import windows as session_module
-from logvggt_jax.streaming.windows import FrameResult, StreamSession
+from logvggt_jax.streaming.windows import FrameResult, StreamSession, WindowSettings
 
 HEIGHT, WIDTH = 28, 42
 LENGTHS = np.tri(13, dtype=bool)  # frame masks of 1, 2 … 13 frames
@@ -271,3 +272,25 @@ def test_a_closed_session_takes_no_frames(small_config: ModelConfig, small_varia
     session.close()
     with pytest.raises(ValueError, match="closed"):
         session.push(np.zeros((28, 42, 3), np.float32))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"ahead": -1}, "ahead must be an integer of at least 0, got -1"),
+        ({"ahead": 0.5}, "ahead must be an integer of at least 0, got 0.5"),
+        ({"first_capacity": 0}, "first_capacity must be a positive integer, got 0"),
+    ],
+)
+def test_settings_out_of_range_are_the_users(options: dict, message: str) -> None:
+    with pytest.raises(InputError, match=rf"WindowSettings\.{message}"):
+        WindowSettings(**options)
+
+
+def test_options_by_name_take_the_place_of_settings(small_config: ModelConfig, small_variables: dict) -> None:
+    model, settings = with_modes(small_config), WindowSettings(ahead=0, first_capacity=4)
+    assert StreamSession(model, small_variables, settings)._settings == settings
+    by_name = StreamSession(model, small_variables, settings, provisional=True)
+    assert by_name._settings == WindowSettings(provisional=True, ahead=0, first_capacity=4)
+    with pytest.raises(TypeError, match="unknown"):
+        StreamSession(model, small_variables, unknown=1)

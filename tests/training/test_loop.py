@@ -54,6 +54,7 @@ def finished(straight: tuple[TrainState, Path], tmp_path: Path) -> Path:
 def _use(patch: pytest.MonkeyPatch, model: Any, params: Any) -> None:
     patch.setattr(loop, "LogVGGT", lambda _: model)
     patch.setattr(loop, "initial_parameters", lambda *_, **__: jax.tree.map(jnp.array, params))
+    patch.setattr(loop, "abstract_parameters", lambda _: jax.eval_shape(lambda: params))
 
 
 def _at_step(monkeypatch: pytest.MonkeyPatch, step: int, action: Callable[[], None]) -> None:

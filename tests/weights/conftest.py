@@ -1,57 +1,19 @@
 """State dicts in VGGT's form and files as `torch.save` writes them, made without PyTorch."""
 
-import dataclasses
-import struct
-import zipfile
-
-import ml_dtypes
-import numpy as np
 import pytest
-
-from logvggt_jax.config import (
-    AggregatorConfig,
-    CameraHeadConfig,
-    DPTConfig,
-    EncoderConfig,
-    ModelConfig,
-    RefinementConfig,
-)
-from logvggt_jax.weights.vggt import vggt_rules
-
-STORAGES = {
-    np.dtype(np.float32): "FloatStorage",
-    np.dtype(np.float16): "HalfStorage",
-    np.dtype(ml_dtypes.bfloat16): "BFloat16Storage",
-    np.dtype(np.int64): "LongStorage",
-}
+import torch_files
 
 
 @pytest.fixture(scope="session")
 def vggt_config():
     """VGGT's depth of 24, which its key layers need, at the smallest widths."""
-    head = DPTConfig(features=8, out_channels=(4, 8, 12, 8))
-    return ModelConfig(
-        encoder=EncoderConfig(embed_dim=16, depth=1, num_heads=2, position_grid=3),
-        aggregator=AggregatorConfig(num_heads=2),
-        camera_head=CameraHeadConfig(depth=1, num_heads=2),
-        depth_head=head,
-        point_head=head,
-        refinement=RefinementConfig(num_heads=2),
-    )
+    return torch_files.small_vggt_config()
 
 
 @pytest.fixture(scope="session")
 def random_state_dict():
     """Random tensors for a configuration, two tensors of a track head included: `random_state_dict(config)`."""
-
-    def make(config):
-        rng = np.random.default_rng(0)
-        tensors = {rule.name: rng.standard_normal(rule.shape, np.float32) for rule in vggt_rules(config)}
-        for name in ("feature_extractor.norm.weight", "tracker.fnet.bias"):
-            tensors[f"track_head.{name}"] = rng.standard_normal(5, np.float32)
-        return tensors
-
-    return make
+    return torch_files.random_state_dict
 
 
 @pytest.fixture(scope="session")
@@ -60,81 +22,11 @@ def vggt_state_dict(vggt_config, random_state_dict):
     return random_state_dict(vggt_config)
 
 
-@dataclasses.dataclass(frozen=True)
-class View:
-    """A tensor as torch sees it: a shape and strides (in elements) over a storage."""
-
-    storage: np.ndarray
-    offset: int
-    shape: tuple[int, ...]
-    strides: tuple[int, ...]
-
-
-def _text(value):
-    data = value.encode()
-    return b"X" + struct.pack("<I", len(data)) + data
-
-
-def _integer(value):
-    return b"J" + struct.pack("<i", value)
-
-
-def _tuple(*items):
-    return b"(" + b"".join(items) + b"t"
-
-
-def _global(module, name):
-    return f"c{module}\n{name}\n".encode()
-
-
-_EMPTY_ORDERED_DICT = _global("collections", "OrderedDict") + b")R"
-
-
-def _tensor(view, key):
-    storage = _tuple(
-        _text("storage"),
-        _global("torch", STORAGES[view.storage.dtype]),
-        _text(key),
-        _text("cpu"),
-        _integer(view.storage.size),
-    )
-    arguments = _tuple(
-        storage + b"Q",
-        _integer(view.offset),
-        _tuple(*map(_integer, view.shape)),
-        _tuple(*map(_integer, view.strides)),
-        b"\x89",
-        _EMPTY_ORDERED_DICT,
-    )
-    return _global("torch._utils", "_rebuild_tensor_v2") + arguments + b"R"
-
-
 @pytest.fixture(scope="session")
 def write_torch_file():
     """Writes a `.pt` file: `write(path, tensors, pickled=None, byteorder=b"little", compression=ZIP_STORED)`.
 
-    `tensors` maps names to arrays or `View`s; equal storages are stored once. `pickled` replaces the pickle.
+    `tensors` maps names to arrays or `write.view`s; equal storages are stored once. `pickled` replaces the pickle.
     """
-
-    def write(path, tensors, *, pickled=None, byteorder=b"little", compression=zipfile.ZIP_STORED):
-        storages, items = {}, b""
-        for name, tensor in tensors.items():
-            if isinstance(tensor, np.ndarray):
-                strides = tuple(s // tensor.itemsize for s in tensor.strides)
-                tensor = View(np.ravel(tensor), 0, tensor.shape, strides)
-            key, _ = storages.setdefault(id(tensor.storage), (str(len(storages)), tensor.storage))
-            items += _text(name) + _tensor(tensor, key)
-        # An OrderedDict whose module metadata is an attribute, as Module.state_dict() returns it.
-        metadata = b"}" + _text("_metadata") + _EMPTY_ORDERED_DICT + b"s"
-        state_dict = b"\x80\x02" + _EMPTY_ORDERED_DICT + b"(" + items + b"u" + metadata + b"b."
-        root = path.stem
-        with zipfile.ZipFile(path, "w", compression) as archive:
-            archive.writestr(f"{root}/data.pkl", state_dict if pickled is None else pickled)
-            archive.writestr(f"{root}/byteorder", byteorder)
-            for key, storage in storages.values():
-                archive.writestr(f"{root}/data/{key}", storage.tobytes())
-            archive.writestr(f"{root}/version", b"3\n")
-        return path
-
-    write.view = View
-    return write
+    torch_files.write_torch_file.view = torch_files.View
+    return torch_files.write_torch_file

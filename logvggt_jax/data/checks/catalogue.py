@@ -4,6 +4,7 @@ import textwrap
 
 from logvggt_jax.data.dataset import Reader
 from logvggt_jax.data.registry import READERS
+from logvggt_jax.errors import install_line
 
 UNPACKING = "Archives are never unpacked by this package: unpack them with your own tools, as each entry says."
 
@@ -25,7 +26,7 @@ def _entry(reader: type[Reader], width: int) -> str:
         "size": about.size,
     }
     if about.extra:
-        fields["install"] = f'pip install "logvggt-jax[{about.extra}]"'
+        fields["install"] = install_line(about.extra)
     lines = [f"{reader.name}: {reader.title}"]
     for key, value in fields.items():
         lines += textwrap.wrap(

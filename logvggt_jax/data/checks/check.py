@@ -13,12 +13,13 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from logvggt_jax.data.checks.consistency import depth_consistency, visible_shares
 from logvggt_jax.data.checks.picture import check_picture_path, write_check_picture
+from logvggt_jax.data.checks.plausibility import complaints
 from logvggt_jax.data.checks.report import CheckReport, DepthRange, Problem, SequenceReport
 from logvggt_jax.data.dataset import check_frames
 from logvggt_jax.data.errors import MissingFiles
 from logvggt_jax.data.readers.folder_dataset import FolderDataset
 from logvggt_jax.data.registry import READERS, open_dataset
-from logvggt_jax.errors import InputError
+from logvggt_jax.errors import InputError, one_line
 
 INCONSISTENT = 0.1
 """Relative difference above which depth, intrinsics and poses are said not to belong together.
@@ -47,7 +48,8 @@ def check_copy(
 
     Damage never ends the walk: a sequence that cannot be listed (a file is missing, a calibration or pose is broken)
     is reported with its files and the next one is looked at; its pictures are first opened when that is mended. A frame
-    that cannot be decoded is reported and the next one decoded.
+    that cannot be decoded is reported and the next one decoded. Frames that decode are looked at: blank pictures, depth
+    in another unit and calibrations of another size are problems too (see `plausibility`).
 
     Args:
       name: one of `READERS`.
@@ -107,6 +109,7 @@ class _Frame:
     size: tuple[int, int]
     valid: int  # pixels
     depth: tuple[float, float, float] | None  # minimum, median, maximum
+    complaints: tuple[tuple[str, str], ...]  # kind and message of what is implausible
 
 
 class _Problems:
@@ -127,7 +130,7 @@ class _Problems:
             for path, reason in error.reasons.items():
                 self.add(error.kind, f"{path}: no such file, {reason}")
             return
-        message = " ".join(str(error).split())
+        message = one_line(error)
         if isinstance(error, InputError):
             self.add(getattr(error, "kind", "damaged file"), message)
         elif isinstance(error, OSError):
@@ -194,6 +197,8 @@ def _decode(
             first = next(iter(frames), index)
             if first == index or found.size == frames[first].size:
                 frames[index] = found
+                for kind, message in found.complaints:
+                    problems.add(kind, message)
             else:
                 try:  # The reader says which files differ.
                     dataset.read(sequence, [first, index])
@@ -215,7 +220,8 @@ def _attempt(dataset: FolderDataset, sequence: str) -> Callable[[int], _Frame | 
         depth = frames.depth[0]
         valid = depth[depth > 0]
         statistics = (float(valid.min()), float(np.median(valid)), float(valid.max())) if valid.size else None
-        return _Frame((depth.shape[0], depth.shape[1]), valid.size, statistics)
+        found = tuple(complaints(dataset, dataset.record(sequence, index), frames))
+        return _Frame((depth.shape[0], depth.shape[1]), valid.size, statistics, found)
 
     return decode
 

@@ -9,7 +9,7 @@ import numpy as np
 from logvggt_jax.data.checks.report import SequenceReport
 from logvggt_jax.data.errors import MissingFiles
 from logvggt_jax.data.readers.folder_dataset import FolderDataset
-from logvggt_jax.errors import InputError, MissingPackage
+from logvggt_jax.errors import InputError, MissingPackage, install_line
 from logvggt_jax.files import atomic_file
 from logvggt_jax.frames import Frames
 from logvggt_jax.geometry import camera_centres, unproject
@@ -116,7 +116,5 @@ def _figure_class() -> Any:
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise MissingPackage(
-            f'the picture of a check needs matplotlib ({error}): pip install "logvggt-jax[eval]"'
-        ) from error
+        raise MissingPackage(f"the picture of a check needs matplotlib ({error}): {install_line('eval')}") from error
     return Figure

@@ -5,7 +5,7 @@ from typing import Any
 
 from absl import logging
 
-from logvggt_jax.errors import InputError
+from logvggt_jax.errors import InputError, one_line
 
 # The share is of this many clips at least, so that one broken file among the first few does not end a run.
 FEWEST_CLIPS = 1000
@@ -59,5 +59,5 @@ class BrokenClips:
 
 def describe(error: Exception) -> str:
     """One line that says what was wrong; errors that are not made for readers are named by their type."""
-    text = " ".join(str(error).split())
+    text = one_line(error)
     return text if isinstance(error, InputError) else f"{type(error).__name__}: {text}"

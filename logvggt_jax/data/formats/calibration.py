@@ -6,7 +6,7 @@ import numpy as np
 
 from logvggt_jax.data.errors import AbsurdIntrinsics, BadPose
 from logvggt_jax.errors import InputError
-from logvggt_jax.geometry import invert, nearest_rotation
+from logvggt_jax.geometry import invert, nearest_rotation, quaternion_to_matrix
 
 # Camera axes x right, y up, z back to x right, y down, z forward, and the reverse; multiplied from the right onto
 # camera-to-world, from the left onto world-to-camera matrices.
@@ -32,6 +32,13 @@ def numbers(text: str, where: str | Path, *, count: int | None = None) -> np.nda
     return values
 
 
+def whole_number(value: float, where: str | Path) -> int:
+    """A number of `numbers` as an integer; InputError naming `where` for one that is none."""
+    if not float(value).is_integer():
+        raise InputError(f"{where}: expected a whole number, got {value:g}: fetch the file again")
+    return int(value)
+
+
 def pinhole(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
     """Intrinsics [3, 3] float64, pixels with centres at integers."""
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
@@ -40,7 +47,8 @@ def pinhole(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
 def scaled(intrinsics: np.ndarray, scale_x: float, scale_y: float) -> np.ndarray:
     """Intrinsics [3, 3] of a picture resized by these factors: f' = s f, c' = (c + 0.5) s - 0.5."""
     shift = np.array([[scale_x, 0, 0.5 * scale_x - 0.5], [0, scale_y, 0.5 * scale_y - 0.5], [0, 0, 1]])
-    return shift @ intrinsics
+    with np.errstate(invalid="ignore"):  # what is not finite is refused when it is used
+        return shift @ intrinsics
 
 
 def world_to_camera(pose: np.ndarray, where: str | Path, *, stored: str) -> np.ndarray | None:
@@ -52,9 +60,11 @@ def world_to_camera(pose: np.ndarray, where: str | Path, *, stored: str) -> np.n
     """
     if not np.isfinite(pose).all():
         return None
-    rotation = nearest_rotation(np.asarray(pose[:3, :3], np.float64))
+    stored_rotation = np.asarray(pose[:3, :3], np.float64)
+    # Numbers of another magnitude would overflow in the decomposition.
+    rotation = nearest_rotation(stored_rotation) if np.abs(stored_rotation).max() < 2 else np.zeros((3, 3))
     last_row_fits = len(pose) == 3 or np.abs(pose[3] - [0, 0, 0, 1]).max() < 1e-3
-    if not last_row_fits or np.abs(pose[:3, :3] - rotation).max() > _ROTATION_TOLERANCE:
+    if not last_row_fits or np.abs(stored_rotation - rotation).max() > _ROTATION_TOLERANCE:
         raise BadPose(
             f"{where}: not a rigid transform (a rotation to {_ROTATION_TOLERANCE} and the last row 0 0 0 1 are "
             "expected): fetch the file again"
@@ -68,8 +78,27 @@ def world_to_camera(pose: np.ndarray, where: str | Path, *, stored: str) -> np.n
     raise ValueError(f"stored must be camera_to_world or world_to_camera, got {stored!r}")
 
 
-def check_intrinsics(intrinsics: np.ndarray, size: tuple[int, int], where: str | Path) -> None:
-    """Raises InputError naming `where` unless intrinsics [3, 3] can belong to a picture of `size` (H, W).
+def pose_from_quaternion(
+    quaternion: np.ndarray, position: np.ndarray, where: str | Path, *, stored: str
+) -> np.ndarray | None:
+    """World-to-camera [4, 4] float64 of a pose that is `stored` as in `world_to_camera`: `quaternion` x y z w, [4], and
+    `position` [3]; None where it is not finite.
+
+    Raises BadPose naming `where` for a quaternion whose length is not 1 to 0.01.
+    """
+    if not (np.isfinite(quaternion).all() and np.isfinite(position).all()):
+        return None
+    # Numbers of another magnitude would overflow in the length.
+    if np.abs(quaternion).max() > 2 or abs(np.linalg.norm(quaternion) - 1) > _ROTATION_TOLERANCE:
+        raise BadPose(f"{where}: expected a unit quaternion, got {quaternion} (x y z w): fetch the file again")
+    pose = np.concatenate([quaternion_to_matrix(quaternion), position[:, None]], axis=1)
+    return world_to_camera(pose, where, stored=stored)
+
+
+def check_intrinsics(intrinsics: np.ndarray, size: tuple[int, int], picture: Path, calibration: Path | None) -> None:
+    """Raises InputError unless intrinsics [3, 3] can belong to `picture`, which has `size` (H, W).
+
+    It names the file `calibration` that they are from, and the picture; only that where the set's cameras are constant.
 
     Expected: finite, focal lengths of 0.1 to 50 times the longer edge, a principal point within half a picture of
     the picture, no more than a little skew, the last row 0 0 1.
@@ -90,8 +119,8 @@ def check_intrinsics(intrinsics: np.ndarray, size: tuple[int, int], where: str |
     )
     if not plausible:
         raise AbsurdIntrinsics(
-            f"{where}: intrinsics fx={fx:g} fy={fy:g} cx={cx:g} cy={cy:g} cannot belong to a picture of "
-            f"{width} x {height}: fetch the calibration again"
+            f"{calibration or picture}: intrinsics fx={fx:g} fy={fy:g} cx={cx:g} cy={cy:g} cannot belong to a picture "
+            f"of {width} x {height}, as {picture.name} is: fetch the calibration again"
         )
 
 
@@ -100,16 +129,21 @@ def relative(intrinsics: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return scaled(intrinsics, 1 / size[1], 1 / size[0])
 
 
-def in_pixels(intrinsics: np.ndarray, size: tuple[int, int], picture: Path) -> np.ndarray:
+def in_pixels(
+    intrinsics: np.ndarray, size: tuple[int, int], picture: Path, calibration: Path | None = None
+) -> np.ndarray:
     """Intrinsics [3, 3] of a picture of one pixel as those of `picture`, which has `size` (H, W).
 
-    Raises InputError naming `picture` where its pixels would be far from square: it was turned or cropped.
+    Raises InputError naming `picture`, and the file `calibration` that they are from, where its pixels would be far
+    from square: it was turned or cropped.
     """
     matrix = scaled(intrinsics, size[1], size[0])
-    aspect = matrix[0, 0] / matrix[1, 1]
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+        aspect = matrix[0, 0] / matrix[1, 1]
     if not 1 / _PIXEL_ASPECT < aspect < _PIXEL_ASPECT:
         raise InputError(
-            f"{picture}: a picture of {size[1]} x {size[0]} does not have the shape of its calibration (fx / fy would "
-            f"be {aspect:.3g}, expected about 1): fetch both again"
+            f"{picture}: a picture of {size[1]} x {size[0]} does not have the shape of its calibration"
+            f"{f' {calibration}' if calibration else ''} (fx / fy would be {aspect:.3g}, expected about 1): fetch both "
+            "again"
         )
     return matrix

@@ -4,8 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
-from logvggt_jax.data.errors import BrokenPicture, missing_file
-from logvggt_jax.errors import MissingPackage
+from logvggt_jax.data.errors import BrokenPicture
+from logvggt_jax.data.formats.source_files import check_regular
+from logvggt_jax.errors import MissingPackage, install_line
 
 
 def read_exr(path: str | Path) -> np.ndarray:
@@ -17,9 +18,8 @@ def read_exr(path: str | Path) -> np.ndarray:
     try:
         import OpenEXR
     except ImportError as error:
-        raise MissingPackage(f'{path}: reading EXR needs OpenEXR: pip install "logvggt-jax[data]"') from error
-    if not Path(path).is_file():
-        raise missing_file(path)
+        raise MissingPackage(f"{path}: reading EXR needs OpenEXR: {install_line('data')}") from error
+    check_regular(path)
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             count = len(file.parts)

@@ -5,8 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from logvggt_jax.data.errors import BrokenPicture, missing_file
-from logvggt_jax.errors import MissingPackage
+from logvggt_jax.data.errors import BrokenPicture
+from logvggt_jax.data.formats.source_files import check_regular
+from logvggt_jax.errors import MissingPackage, install_line
 
 
 def read_hdf5(
@@ -21,9 +22,9 @@ def read_hdf5(
     try:
         import h5py
     except ImportError as error:
-        raise MissingPackage(f'{path}: reading HDF5 needs h5py: pip install "logvggt-jax[data]"') from error
-    if content is None and not Path(path).is_file():
-        raise missing_file(path)
+        raise MissingPackage(f"{path}: reading HDF5 needs h5py: {install_line('data')}") from error
+    if content is None:
+        check_regular(path)
     try:
         with h5py.File(path if content is None else io.BytesIO(content), "r") as file:
             names = list(file)

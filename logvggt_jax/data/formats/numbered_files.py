@@ -6,6 +6,7 @@ from pathlib import Path
 
 from logvggt_jax.data.errors import MissingFiles, missing_files
 from logvggt_jax.data.formats.source_files import SourceFiles
+from logvggt_jax.errors import InputError
 
 _PLACE = re.compile(r"\{[^}]*\}")
 
@@ -13,17 +14,23 @@ _PLACE = re.compile(r"\{[^}]*\}")
 def numbered_files(files: SourceFiles, folder: Path, template: str) -> dict[int, Path]:
     """Files of `folder` by number, in numeric order.
 
-    `template` is the format of the names with one number, `frame{:06d}.jpg` or, unpadded, `{}.jpg`; all other names are
-    passed over. Raises MissingFiles where there is no such folder, or no such file in it.
+    `template` is the format of the names with one number: `frame{:06d}.jpg`, or `{}.jpg` for numbers that may be padded
+    with zeros or not, as exporters differ; all other names are passed over. Raises MissingFiles where there is no such
+    folder, or no such file in it, and InputError for two files of one number.
     """
     before, after = _PLACE.split(template)
     pattern = re.compile(f"{re.escape(before)}([0-9]+){re.escape(after)}")
-    matches = (pattern.fullmatch(name) for name in files.names(folder, f"files like {template.format(0)}"))
-    numbers = (int(match[1]) for match in matches if match and template.format(int(match[1])) == match[0])
-    found = {number: folder / template.format(number) for number in sorted(numbers)}
+    found: dict[int, Path] = {}
+    for name in files.names(folder, f"files like {template.format(0)}"):
+        match = pattern.fullmatch(name)
+        if match is None or ("{}" not in template and template.format(int(match[1])) != name):
+            continue
+        path = found.setdefault(int(match[1]), folder / name)
+        if path.name != name:
+            raise InputError(f"{folder / name} and {path.name} have the same number: remove one of them")
     if not found:
         raise MissingFiles(f"{folder}: no files like {template.format(0)}; fetch or unpack the sequence again")
-    return found
+    return dict(sorted(found.items()))
 
 
 def numbered_frames(files: SourceFiles, *kinds: tuple[Path, str]) -> dict[int, tuple[Path, ...]]:

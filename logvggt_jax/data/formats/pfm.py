@@ -5,10 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from logvggt_jax.data.errors import BrokenPicture, missing_file
+from logvggt_jax.data.errors import BrokenPicture
+from logvggt_jax.data.formats.source_files import read_regular
 
 # One white space ends the header; what follows belongs to the numbers.
-_HEADER = re.compile(rb"(P[fF])\s+(\d+)\s+(\d+)\s+([+-]?[0-9.]+(?:[eE][+-]?\d+)?)\s")
+_HEADER = re.compile(rb"(P[fF])\s+(\d{1,9})\s+(\d{1,9})\s+([+-]?[0-9.]+(?:[eE][+-]?\d+)?)\s")
 
 
 def read_pfm(path: str | Path) -> np.ndarray:
@@ -17,10 +18,7 @@ def read_pfm(path: str | Path) -> np.ndarray:
     A negative scale in the header means little-endian numbers; its size is no unit and is ignored. Raises MissingFiles,
     or InputError naming the file: no header of a single-channel map, or another number of bytes than it promises.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise missing_file(path)
-    data = path.read_bytes()
+    data = read_regular(path)
     header = _HEADER.match(data)
     if header is None or header[1] != b"Pf":
         raise BrokenPicture(

@@ -1,4 +1,4 @@
-"""Text files that hold the poses of all frames of a sequence as 4x4 matrices."""
+"""Text files that hold the poses of all frames of a sequence as matrices."""
 
 from pathlib import Path
 
@@ -12,15 +12,16 @@ from logvggt_jax.data.formats.source_files import SourceFiles
 def read_pose_list(files: SourceFiles, path: Path, *, count: int, numbers_per_line: int = 16) -> np.ndarray:
     """Matrices [count, 4, 4] float64 as stored, row-major; NaN and infinite entries are kept. Empty lines are skipped.
 
-    A line has 16 numbers, or 4 where a matrix takes four lines. Raises MissingFiles, or InputError naming file and
-    line: other words or another number of them, or another number of matrices than the `count` of frames.
+    A line has 16 numbers, or 4 where a matrix takes four lines, or 12 for matrices [count, 3, 4]. Raises MissingFiles,
+    or InputError naming file and line: other words or another number of them, or another number of matrices than the
+    `count` of frames.
     """
     lines = enumerate(files.text(path, "the poses of the sequence's frames").splitlines(), 1)
     rows = [numbers(line, f"{path}, line {i}", count=numbers_per_line) for i, line in lines if line.strip()]
-    lines_per_pose = 16 // numbers_per_line
+    lines_per_pose = 4 if numbers_per_line == 4 else 1
     if len(rows) != count * lines_per_pose:
         raise UnequalCounts(
             f"{path}: expected {count} poses of {lines_per_pose} lines for {count} pictures, got {len(rows)} lines: "
             "fetch the file and the pictures again"
         )
-    return np.reshape(rows, (count, 4, 4))
+    return np.reshape(rows, (count, -1, 4))

@@ -1,16 +1,22 @@
 """The folders and text files that a listing is made from, read with their state remembered."""
 
 import re
+import stat
 from pathlib import Path
 
-from logvggt_jax.data.errors import MissingFiles
-from logvggt_jax.errors import InputError
+from logvggt_jax.data.errors import MissingFiles, missing_file
+from logvggt_jax.errors import DiskError, InputError
 
 _ABSENT = -1
 
 
 class SourceFiles:
-    """Reads the folders and files that a listing is made from, and remembers their state."""
+    """Reads the folders and files that a listing is made from, and remembers their state.
+
+    Only regular files, and links to them, are opened: a pipe in the place of a file would be waited for without end.
+    All methods raise InputError naming the path where its name cannot be one, and DiskError where the operating system
+    refuses to look at it.
+    """
 
     def __init__(self) -> None:
         self.states: dict[str, list[int]] = {}
@@ -22,11 +28,16 @@ class SourceFiles:
             return sorted(path.name for path in folder.iterdir())
         except (FileNotFoundError, NotADirectoryError) as error:
             raise MissingFiles(f"{folder}: no such folder; expected {expected}") from error
+        except OSError as error:
+            raise refused(folder, error) from error
 
     def folders(self, parent: Path, expected: str, named: re.Pattern[str] | None = None) -> dict[str, Path]:
         """Folders in `parent` by name, sorted, of those with a pattern the ones `named` so; MissingFiles as `names`."""
         chosen = [name for name in self.names(parent, expected) if named is None or named.fullmatch(name)]
-        return {name: parent / name for name in chosen if (parent / name).is_dir()}
+        try:
+            return {name: parent / name for name in chosen if (parent / name).is_dir()}
+        except OSError as error:
+            raise refused(parent, error) from error
 
     def text(self, path: Path, expected: str) -> str:
         """A text file's content; MissingFiles saying what was `expected`, InputError for other bytes."""
@@ -38,24 +49,60 @@ class SourceFiles:
     def content(self, path: Path, expected: str) -> bytes:
         """A file's bytes; MissingFiles saying what was `expected`."""
         self._note(path)
-        try:
-            return path.read_bytes()
-        except (FileNotFoundError, IsADirectoryError, NotADirectoryError) as error:
-            raise MissingFiles(f"{path}: no such file; expected {expected}") from error
+        return read_regular(path, f"; expected {expected}")
+
+    def regular(self, path: Path, expected: str) -> None:
+        """For files that a library opens: MissingFiles saying what was `expected` unless there is a regular file."""
+        self._note(path)
+        check_regular(path, f"; expected {expected}")
 
     def exists(self, path: Path) -> bool:
         """Whether a file or folder is there now."""
         self._note(path)
-        return path.exists()
+        return self.states[str(path)] != [_ABSENT, _ABSENT]
 
     def _note(self, path: Path) -> None:
         self.states[str(path)] = file_state(path)
 
 
 def file_state(path: Path) -> list[int]:
-    """Time of change and size; a folder's time changes with the names in it."""
+    """Time of change and size; a folder's time changes with the names in it.
+
+    Raises InputError naming what cannot be a path, as damaged lists may have it.
+    """
     try:
         status = path.stat()
+        return [status.st_mtime_ns, status.st_size if stat.S_ISREG(status.st_mode) else 0]
     except OSError:
         return [_ABSENT, _ABSENT]
-    return [status.st_mtime_ns, status.st_size if path.is_file() else 0]
+    except ValueError as error:  # a zero byte, or half of a pair of UTF-16 codes
+        raise InputError(f"{str(path)!r} cannot be the name of a file ({error}): fetch what names it again") from error
+
+
+def check_regular(path: str | Path, reason: str | None = None) -> None:
+    """Raises MissingFiles, with `reason` at its end, unless `path` is a regular file or a link to one.
+
+    DiskError where the operating system refuses to say.
+    """
+    try:
+        is_regular = stat.S_ISREG(Path(path).stat().st_mode)
+    except (FileNotFoundError, NotADirectoryError):
+        is_regular = False
+    except OSError as error:
+        raise refused(path, error) from error
+    if not is_regular:
+        raise missing_file(path) if reason is None else missing_file(path, reason)
+
+
+def read_regular(path: str | Path, reason: str | None = None) -> bytes:
+    """Bytes of a file; errors as in `check_regular`."""
+    check_regular(path, reason)
+    try:
+        return Path(path).read_bytes()
+    except OSError as error:
+        raise refused(path, error) from error
+
+
+def refused(path: str | Path, error: OSError) -> DiskError:
+    """The error for a file or folder at which the operating system refuses to look."""
+    return DiskError(f"{path}: {error.strerror or error}: make it readable or fetch it again")

@@ -91,11 +91,11 @@ class BlendedMVS(FolderDataset):
         paths = numbered_frames(files, *((folder / place, template) for place, template in kinds))
         for image, depth, camera in paths.values():
             intrinsics, stored = _camera(files.text(camera, "the frame's camera"), camera)
-            yield frame(image, depth, intrinsics, world_to_camera(stored, camera, stored="world_to_camera"))
+            extrinsics = world_to_camera(stored, camera, stored="world_to_camera")
+            yield frame(image, depth, intrinsics, extrinsics, calibration=camera)
 
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        depth = read_pfm(record.depth)
-        return read_rgb(record.image), np.where(np.isfinite(depth) & (depth > 0), depth, 0), record.intrinsics
+        return read_rgb(record.image), read_pfm(record.depth), record.intrinsics
 
 
 def _camera(text: str, path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -125,7 +125,7 @@ def _pairs(text: str, path: Path) -> list[tuple[int, list[tuple[int, float]]]]:
             pairs.append((image, list(zip(map(int, scores[::2]), scores[1::2], strict=True))))
             position = end
         complete = position == len(values)
-    except (IndexError, ValueError):
+    except (IndexError, ValueError, OverflowError):
         complete = False
     if not complete:
         raise InputError(

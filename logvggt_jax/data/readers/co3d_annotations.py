@@ -1,7 +1,6 @@
 """Annotations of Co3Dv2: gzip JSON of hundreds of megabytes a category, kept in compact form."""
 
 import gzip
-import json
 import sys
 import zlib
 from collections.abc import Callable
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from logvggt_jax.data.formats.calibration import pinhole, world_to_camera
+from logvggt_jax.data.formats.json_values import expecting, read_json, text_of
 from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.errors import InputError
 
@@ -19,6 +19,7 @@ from logvggt_jax.errors import InputError
 _PYTORCH3D_AXES = np.diag([-1.0, -1.0, 1.0])
 # Units of a scene are about the object's size; reconstructions that failed put cameras beyond this.
 _MAX_DISTANCE = 1e5
+_MAX_DEPTH_SCALE = 1e6
 _FORMATS = ("ndc_isotropic", "ndc_norm_image_bounds")
 
 
@@ -55,7 +56,7 @@ class FrameAnnotation:
         if self.camera is None:
             return None
         rotation, translation = self.camera[:9].reshape(3, 3), self.camera[9:12]
-        if np.abs(translation).max() > _MAX_DISTANCE:
+        if not np.abs(translation).max() <= _MAX_DISTANCE or not np.isfinite(rotation).all():
             return None
         pose = np.column_stack([_PYTORCH3D_AXES @ rotation.T, _PYTORCH3D_AXES @ translation])
         return world_to_camera(pose, where, stored="world_to_camera")
@@ -106,26 +107,19 @@ def quality_scores(files: SourceFiles, path: Path) -> dict[str, float]:
     """
     scores = {}
     for sequence in _content(files, path, None):
-        try:
+        with expecting(path, "sequences with sequence_name and viewpoint_quality_score"):
             score = sequence["viewpoint_quality_score"]
-            scores[str(sequence["sequence_name"])] = -np.inf if score is None else float(score)
-        except (KeyError, TypeError, ValueError) as error:
-            raise InputError(
-                f"{path}: expected sequences with sequence_name and viewpoint_quality_score ({error!r}): fetch it again"
-            ) from error
+            scores[text_of(sequence["sequence_name"])] = -np.inf if score is None else float(score)
     return scores
 
 
 def _content(files: SourceFiles, path: Path, hook: Callable[[dict], Any] | None) -> list:
     data = files.content(path, "the category's annotations; unpack its first zip file again")
     try:
-        content = json.loads(gzip.decompress(data), object_hook=hook)
+        text = gzip.decompress(data)
     except (OSError, EOFError, zlib.error) as error:
         raise InputError(f"{path}: truncated or damaged gzip file ({error}): fetch it again") from error
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path}: not JSON ({error}): fetch it again") from error
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: not the frame annotations of Co3Dv2 ({error!r}): fetch it again") from error
+    content = read_json(text, path, hook)
     if not isinstance(content, list):
         raise InputError(f"{path}: expected a JSON list, got {type(content).__name__}: fetch it again")
     return content
@@ -138,19 +132,26 @@ def _compact(value: dict) -> dict | FrameAnnotation:
     depth, viewpoint = value.get("depth") or {}, value.get("viewpoint")
     kind = (viewpoint or {}).get("intrinsics_format", "ndc_norm_image_bounds")
     if kind not in _FORMATS:
-        raise InputError(f"intrinsics_format {kind!r} is none of {', '.join(_FORMATS)}")
-    height, width = value["image"]["size"]
+        raise ValueError(f"intrinsics_format {kind!r:.40} is none of {', '.join(_FORMATS)}")
+    height, width = (int(length) for length in value["image"]["size"])
+    depth_scale = float(depth.get("scale_adjustment", 1.0))
+    if min(height, width) < 1 or not 0 < depth_scale <= _MAX_DEPTH_SCALE:
+        raise ValueError(f"an image of {width} x {height} and scale_adjustment {depth_scale:g}")
     return FrameAnnotation(
-        sequence=sys.intern(value["sequence_name"]),
+        sequence=sys.intern(text_of(value["sequence_name"])),
         number=int(value["frame_number"]),
-        image=value["image"]["path"],
-        depth=depth.get("path"),
-        depth_mask=depth.get("mask_path"),
-        size=(int(height), int(width)),
-        depth_scale=float(depth.get("scale_adjustment", 1.0)),
+        image=text_of(value["image"]["path"]),
+        depth=_optional_text(depth.get("path")),
+        depth_mask=_optional_text(depth.get("mask_path")),
+        size=(height, width),
+        depth_scale=depth_scale,
         camera=None if viewpoint is None else _camera(viewpoint),
         format=kind,
     )
+
+
+def _optional_text(value: Any) -> str | None:
+    return None if value is None else text_of(value)
 
 
 def _camera(viewpoint: dict) -> np.ndarray:

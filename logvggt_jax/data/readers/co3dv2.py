@@ -9,7 +9,6 @@ Cameras are PyTorch3D's (see `co3d_annotations`), with a pixel's centre at half 
 reconstruction, stored as the bits of 16-bit floats in 16-bit PNG files, times the frame's `scale_adjustment`.
 """
 
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,11 +20,11 @@ from logvggt_jax.data.dataset import EVALUATION, TRAINING, About
 from logvggt_jax.data.errors import EmptySplit, MissingFiles, UnequalSizes, missing_files
 from logvggt_jax.data.formats.calibration import in_pixels, relative
 from logvggt_jax.data.formats.image import read_depth, read_rgb
+from logvggt_jax.data.formats.json_values import expecting, read_json
 from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.data.formats.split_lists import sequences_present
 from logvggt_jax.data.readers.co3d_annotations import FrameAnnotation, frame_annotations, quality_scores
 from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame
-from logvggt_jax.errors import InputError
 
 _FRAMES, _SEQUENCES = "frame_annotations.jgz", "sequence_annotations.jgz"
 _MIN_QUALITY = 0.5
@@ -153,11 +152,12 @@ class Co3Dv2(FolderDataset):
             mask = self.root / annotation.depth_mask if annotation.depth_mask else None
             for path in filter(None, (image, depth, mask)):
                 if path.parent not in present:
-                    present[path.parent] = set(files.names(path.parent, f"{path.name}, which {_FRAMES} names"))
+                    present[path.parent] = set(files.names(path.parent, f"{path.name}, which {source} names"))
                 if path.name not in present[path.parent]:
                     absent.append(path)
             intrinsics = relative(annotation.intrinsics(), annotation.size)
-            yield frame(image, depth, intrinsics, extrinsics, companion=mask, depth_scale=annotation.depth_scale)
+            others = {"companion": mask, "calibration": source, "depth_scale": annotation.depth_scale}
+            yield frame(image, depth, intrinsics, extrinsics, **others)
         if absent:
             raise missing_files(dict.fromkeys(absent, f"but {source} names it; unpack the sequence again"))
 
@@ -173,7 +173,6 @@ class Co3Dv2(FolderDataset):
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         image = read_rgb(record.image)
         depth = read_depth(record.depth).view(np.float16).astype(np.float32) * np.float32(record.depth_scale)
-        valid = np.isfinite(depth) & (depth > 0)
         if record.companion is not None:
             mask = read_rgb(record.companion)[..., 0]
             if mask.shape != depth.shape:
@@ -181,21 +180,16 @@ class Co3Dv2(FolderDataset):
                     f"{record.companion}: size {mask.shape} differs from {depth.shape} of {record.depth.name}: "
                     "fetch both again"
                 )
-            valid &= mask > 0
-        return image, np.where(valid, depth, 0), in_pixels(record.intrinsics, image.shape[:2], record.image)
+            depth[mask == 0] = 0
+        intrinsics = in_pixels(record.intrinsics, image.shape[:2], record.image, record.calibration)
+        return image, depth, intrinsics
 
 
 def _listed(files: SourceFiles, paths: list[Path], part: str) -> set[tuple[str, int]]:
     """Sequence and number of the frames that the lists have under `part`."""
     frames: set[tuple[str, int]] = set()
     for path in paths:
-        try:
-            content = json.loads(files.text(path, "the set list"))
+        content = read_json(files.text(path, "the set list"), path)
+        with expecting(path, f"[sequence, frame number, picture] under {part!r}"):
             frames |= {(str(sequence), int(number)) for sequence, number, *_ in content[part]}
-        except json.JSONDecodeError as error:
-            raise InputError(f"{path}: not JSON ({error}): fetch it again") from error
-        except (KeyError, TypeError, ValueError) as error:
-            raise InputError(
-                f"{path}: expected [sequence, frame number, picture] under {part!r} ({error!r}): fetch it again"
-            ) from error
     return frames

@@ -11,7 +11,7 @@ from collections import Counter, OrderedDict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from absl import logging
@@ -19,13 +19,16 @@ from absl import logging
 from logvggt_jax.data.dataset import Reader, check_indices, check_sequence, check_split
 from logvggt_jax.data.errors import EmptySequence, MissingFiles, UnequalSizes
 from logvggt_jax.data.formats.calibration import check_intrinsics
-from logvggt_jax.data.formats.source_files import SourceFiles
+from logvggt_jax.data.formats.image import read_depth
+from logvggt_jax.data.formats.source_files import SourceFiles, refused
 from logvggt_jax.data.readers.listing_index import ListingIndex, code_digest
+from logvggt_jax.errors import InputError
 from logvggt_jax.frames import Frames
 
 NO_POSES = np.full((4, 4), np.nan)
 # Listings kept in memory; a set of twenty thousand sequences would fill it with all of them.
 _RECENT = 64
+INDOORS = (0.05, 50.0)  # metres, `plausible_depth` of rooms, halls and tables
 _GAPS = (30, 10, 5, 2, 1)
 
 
@@ -35,22 +38,24 @@ class FrameRecord:
 
     name: str  # unique in its sequence
     image: Path  # colour picture
-    depth: Path  # depth in the set's own encoding
+    depth: Path  # depth in the set's own encoding; the picture itself for a frame without depth
     intrinsics: np.ndarray  # [3, 3] float64, pixels as the set's reader needs them (its `_read_frame` decides)
     extrinsics: np.ndarray  # [4, 4] float64, world-to-camera, rigid; NaN in sets without poses
-    companion: Path | None = None  # a third file that the frame needs, such as a mask of valid depth or its calibration
+    companion: Path | None = None  # a third file that the frame needs, such as a mask of valid depth
+    calibration: Path | None = None  # the file that the intrinsics are from, for messages; None: constants of the set
     depth_scale: float = 1.0  # factor on the stored depth, where frames differ
     quarter_turns: int = 0  # counter-clockwise quarter turns from the stored picture to the one handed out
 
 
 _FIELDS = tuple(field.name for field in fields(FrameRecord))
-_PATHS = ("image", "depth", "companion")
+_PATHS = ("image", "depth", "companion", "calibration")
 
 
 class Dropped(NamedTuple):
     """A frame that does not count, and why: `no pose`, for example."""
 
     reason: str
+    file: Path | None = None  # that says so, where one is to be named
 
 
 def frame(
@@ -60,9 +65,19 @@ def frame(
     if extrinsics is None:
         return Dropped("no pose")
     if not np.isfinite(intrinsics).all():
-        return Dropped("no intrinsics")
+        return Dropped("no intrinsics", others.get("calibration"))
     others = {"name": image.stem, **others}
     return FrameRecord(image=image, depth=depth, intrinsics=intrinsics, extrinsics=extrinsics, **others)
+
+
+def read_depth_of(record: FrameRecord, image: np.ndarray, units: float) -> np.ndarray:
+    """Depth [h, w] float32 of a frame whose file is 16-bit with so many `units` a metre.
+
+    A picture in depth's place stands for no depth: it is 0 throughout, of the size of `image` [H, W, 3].
+    """
+    if record.depth == record.image:
+        return np.zeros(image.shape[:2], np.float32)
+    return read_depth(record.depth).astype(np.float32) / np.float32(units)
 
 
 @dataclass(frozen=True)
@@ -79,7 +94,14 @@ class FolderDataset(Reader):
     A reader says in `_find_sequences` which sequences a split has, in `_frames` which frames a sequence has, and in
     `_read_frame` how one frame is decoded. Both listings are kept in an index (see `listing_index`), for which they
     read folders and text files through `SourceFiles`.
+
+    Attributes:
+      plausible_depth: metres between which the median of a frame's depth lies, in metric sets; for checks of a copy.
+      centred: whether principal points lie near the picture's centre; for checks of a copy.
     """
+
+    plausible_depth: ClassVar[tuple[float, float]] = (0.01, 1000.0)
+    centred: ClassVar[bool] = True
 
     def __init__(self, root: str | Path, split: str = "all") -> None:
         """Lists the sequences of a `split` in the set's folder `root`; frames are listed when a sequence is first used.
@@ -89,7 +111,11 @@ class FolderDataset(Reader):
         """
         check_split(split, self)
         self.root, self.split = Path(root), split
-        if not self.root.is_dir():
+        try:
+            is_folder = self.root.is_dir()
+        except OSError as error:
+            raise refused(self.root, error) from error
+        if not is_folder:
             raise MissingFiles(f"{self.root}: no such folder; pass the folder that holds {self.expects}")
         self._index = ListingIndex(self.identity, self.root, code_digest(type(self)))
         self._recent: OrderedDict[str, Listing] = OrderedDict()
@@ -141,6 +167,10 @@ class FolderDataset(Reader):
         """Names of these frames, in time order."""
         return [record.name for record in self._listing(sequence).frames]
 
+    def record(self, sequence: str, index: int) -> FrameRecord:
+        """The files of a frame, and what is known of it before they are opened."""
+        return self._listing(sequence).frames[index]
+
     def dropped_frames(self, sequence: str) -> dict[str, int]:
         """Frames of the folder that do not count, by reason."""
         return dict(self._listing(sequence).dropped)
@@ -162,7 +192,8 @@ class FolderDataset(Reader):
         """Frames `indices`, in the order asked for.
 
         Raises InputError naming the file: a missing, truncated or damaged picture, a wrong type,
-        sizes that do not belong together, intrinsics that cannot belong to the picture.
+        sizes that do not belong together, intrinsics that cannot belong to the picture (naming the file that they are
+        from), no permission.
         """
         records = self._listing(sequence).frames
         chosen = [records[i] for i in check_indices(indices, len(records), f"{self.title}, {sequence}")]
@@ -170,7 +201,12 @@ class FolderDataset(Reader):
         depths: list[np.ndarray] = []
         intrinsics: list[np.ndarray] = []
         for record in chosen:
-            image, depth, matrix = self._read_frame(record)
+            try:
+                image, depth, matrix = self._read_frame(record)
+            except InputError:
+                raise
+            except OSError as error:
+                raise refused(error.filename or record.image, error) from error
             if record.quarter_turns:
                 image, depth = np.rot90(image, record.quarter_turns), np.rot90(depth, record.quarter_turns)
             if depth.shape != image.shape[:2]:
@@ -183,13 +219,13 @@ class FolderDataset(Reader):
                     f"{record.image}: size {image.shape[:2]} differs from {images[0].shape[:2]} of "
                     f"{chosen[0].image.name}: frames of one sequence must have one size; fetch both again"
                 )
-            check_intrinsics(matrix, image.shape[:2], record.image)
+            check_intrinsics(matrix, image.shape[:2], record.image, record.calibration)
             images.append(image)
-            depths.append(depth)
+            depths.append(_valid(depth))
             intrinsics.append(matrix)
         return Frames(
             images=np.stack(images),
-            depth=np.stack(depths).astype(np.float32, copy=False),
+            depth=np.stack(depths),
             intrinsics=np.stack(intrinsics).astype(np.float32),
             extrinsics=np.stack([record.extrinsics for record in chosen]).astype(np.float32),
             metric=self.metric,
@@ -205,8 +241,9 @@ class FolderDataset(Reader):
 
     @abc.abstractmethod
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Picture [H, W, 3] uint8 RGB, z-depth [H, W] float (0 = invalid), intrinsics [3, 3] float64.
+        """Picture [H, W, 3] uint8 RGB, z-depth [H, W] float, intrinsics [3, 3] float64.
 
+        Depth is invalid where it is 0, negative or not finite.
         Before `record.quarter_turns` for picture and depth; the intrinsics are those after it.
         """
 
@@ -234,21 +271,43 @@ class FolderDataset(Reader):
         listing = None if payload is None else _unpacked(payload, self.root)
         if listing is None:
             files = SourceFiles()
-            found = list(self._frames(sequence, self._places[sequence], files))
+            found = [_countable(each) for each in self._frames(sequence, self._places[sequence], files)]
             listing = Listing(
                 frames=[each for each in found if isinstance(each, FrameRecord)],
                 dropped=Counter(each.reason for each in found if isinstance(each, Dropped)),
             )
             if not listing.frames:
+                culprit = next((each.file for each in found if isinstance(each, Dropped) and each.file), None)
                 raise EmptySequence(
                     f"{self._places[sequence]}: no frame of {self.title} counts here "
-                    f"(dropped: {dict(listing.dropped) or 'none'}): fetch the sequence again or remove its folder"
+                    f"(dropped: {dict(listing.dropped) or 'none'}{f'; see {culprit}' if culprit else ''}): "
+                    "fetch the sequence again or remove its folder"
                 )
             self._index.put(key, _packed(listing, self.root), len(listing.frames), files)
         self._recent[sequence] = listing
         if len(self._recent) > _RECENT:
             self._recent.popitem(last=False)
         return listing
+
+
+def _countable(found: FrameRecord | Dropped) -> FrameRecord | Dropped:
+    """Drops a frame whose numbers, finite in its files, are not in float32: it is lost like one that has none."""
+    if isinstance(found, Dropped):
+        return found
+    for values, reason in ((found.extrinsics, "no pose"), (found.intrinsics, "no intrinsics")):
+        with np.errstate(over="ignore"):
+            delivered = values.astype(np.float32)
+        # NaN throughout is meant: sets without poses, and calibrations that are read with the picture.
+        if not np.isfinite(delivered).all() and not np.isnan(delivered).all():
+            return Dropped(reason, found.calibration if reason == "no intrinsics" else None)
+    return found
+
+
+def _valid(depth: np.ndarray) -> np.ndarray:
+    """Depth as float32, 0 where it is negative or not finite in that type."""
+    with np.errstate(over="ignore"):
+        depth = depth.astype(np.float32, copy=False)
+    return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0.0))
 
 
 def _packed(listing: Listing, root: Path) -> bytes:

@@ -33,7 +33,7 @@ from logvggt_jax.data.formats.calibration import OPENGL_AXES, world_to_camera
 from logvggt_jax.data.formats.hdf5 import read_hdf5
 from logvggt_jax.data.formats.numbered_files import numbered_frames
 from logvggt_jax.data.formats.source_files import SourceFiles
-from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame
+from logvggt_jax.data.readers.folder_dataset import INDOORS, Dropped, FolderDataset, FrameRecord, frame
 from logvggt_jax.errors import InputError
 
 _CAMERA_TABLE = "metadata_camera_parameters.csv"
@@ -45,6 +45,7 @@ _MAX_SKEW = 0.5  # pixels
 _PERCENTILE, _GREY, _GAMMA = 90, 0.8, 2.2
 _LUMA = np.array([0.3, 0.59, 0.11], np.float32)
 _DARK = 1e-4
+_MAX_SCALE = 1e6  # asset units a metre, or the reverse
 
 
 class HyperSim(FolderDataset):
@@ -62,6 +63,8 @@ class HyperSim(FolderDataset):
     title = "HyperSim"
     expects = f"ai_VVV_NNN with _detail and images, and {_CAMERA_TABLE} from the set's repository"
     metric = True
+    plausible_depth = INDOORS
+    centred = False  # shifted lenses
     splits = ("train", "val", "test", "all")
     about = About(
         source="download script of the repository apple/ml-hypersim, a zip file a scene (parts of scenes: "
@@ -112,21 +115,21 @@ class HyperSim(FolderDataset):
             stored = world_to_camera(pose @ OPENGL_AXES, where, stored="camera_to_world")
             extrinsics = None if stored is None else turn @ stored
             name = f"frame.{number:04d}"
-            yield frame(image, distance, camera.intrinsics, extrinsics, name=name, companion=entities)
+            others = {"name": name, "companion": entities, "calibration": self.root / _CAMERA_TABLE}
+            yield frame(image, distance, camera.intrinsics, extrinsics, **others)
 
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        colour = read_hdf5(record.image, "dataset", shape=(None, None, 3)).astype(np.float32)
+        with np.errstate(over="ignore", invalid="ignore"):  # damaged colour is told apart by the tone map
+            colour = read_hdf5(record.image, "dataset", shape=(None, None, 3)).astype(np.float32)
         size = colour.shape[:2]
-        distance = read_hdf5(record.depth, "dataset", shape=size).astype(np.float64)
+        with np.errstate(invalid="ignore"):
+            distance = read_hdf5(record.depth, "dataset", shape=size).astype(np.float64)
         assert record.companion is not None
         shown = read_hdf5(record.companion, "dataset", shape=size) != -1
         intrinsics = _pixels_from_plane(size) @ record.intrinsics
         v, u = np.indices(size)
         rays = np.stack([u, v, np.ones(size)], -1) @ np.linalg.inv(intrinsics).T  # z = 1
-        # NaN fails the comparison.
-        valid = (distance > 0) & np.isfinite(distance)
-        depth = np.where(valid, distance, 0.0) / np.linalg.norm(rays, axis=-1)
-        return _tone_mapped(colour, shown), depth, intrinsics
+        return _tone_mapped(colour, shown), distance / np.linalg.norm(rays, axis=-1), intrinsics
 
     def _on_disk(self, files: SourceFiles) -> Iterator[tuple[str, Path, _Camera]]:
         """Name, scene folder and camera of the split's sequences, skewed ones as well."""
@@ -200,7 +203,7 @@ def _metres_per_unit(files: SourceFiles, path: Path) -> float:
         scale = float(stored)
     except ValueError:
         scale = np.nan
-    if not (np.isfinite(scale) and scale > 0):
+    if not 1 / _MAX_SCALE <= scale <= _MAX_SCALE:
         raise InputError(f"{path}: expected a row meters_per_asset_unit with a length, got {stored}: fetch it again")
     return scale
 

@@ -22,17 +22,15 @@ import numpy as np
 
 from logvggt_jax.data.dataset import EVALUATION, LICENCE_NOT_READ, About
 from logvggt_jax.data.errors import missing_files
-from logvggt_jax.data.formats.calibration import numbers
 from logvggt_jax.data.formats.image import read_depth, read_rgb
+from logvggt_jax.data.formats.kitti_calibration import read_projection
 from logvggt_jax.data.formats.numbered_files import numbered_files, numbered_frames
 from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.data.readers.folder_dataset import NO_POSES, Dropped, FolderDataset, FrameRecord, frame
-from logvggt_jax.errors import InputError
 
 _DRIVE = re.compile(r"\d{4}_\d{2}_\d{2}_drive_\d{4}_\w+")
 _GATHERED = re.compile(r"image_gathered(_\d+)?")
 _PICTURE = "{:010d}.png"
-_PROJECTION = "P_rect_02:"
 _UNITS_PER_METRE = 256.0
 
 
@@ -71,7 +69,9 @@ class KITTI(FolderDataset):
 
     def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
         drive = sequence.split("/")[0]
-        intrinsics = _intrinsics(self.root / _date(drive) / "calib_cam_to_cam.txt", files)
+        calibration = self.root / _date(drive) / "calib_cam_to_cam.txt"
+        expected = f"the date's calibration; unpack {_date(drive)}_calib.zip"
+        intrinsics = read_projection(files, calibration, "P_rect_02", expected)[:, :3]
         if sequence == drive:
             image_folder = self._raw_pictures(drive)
             depths = numbered_files(files, folder / "proj_depth" / "groundtruth" / "image_02", _PICTURE)
@@ -89,7 +89,7 @@ class KITTI(FolderDataset):
             images, depths = ({number: pair[kind] for number, pair in pairs.items()} for kind in (0, 1))
         for number, image in images.items():
             if number in depths:
-                yield frame(image, depths[number], intrinsics, NO_POSES)
+                yield frame(image, depths[number], intrinsics, NO_POSES, calibration=calibration)
             else:
                 yield Dropped("no depth")
 
@@ -119,12 +119,3 @@ def _date(drive: str) -> str:
 
 def _depth_folder(image_folder: str) -> str:
     return image_folder.replace("image_gathered", "groundtruth_depth_gathered")
-
-
-def _intrinsics(path: Path, files: SourceFiles) -> np.ndarray:
-    """[3, 3] of the left colour camera from the date's calibration."""
-    text = files.text(path, f"the date's calibration; unpack {path.parent.name}_calib.zip")
-    for line in text.splitlines():
-        if line.startswith(_PROJECTION):
-            return numbers(line.removeprefix(_PROJECTION), f"{path}, P_rect_02", count=12).reshape(3, 4)[:, :3]
-    raise InputError(f"{path}: no line {_PROJECTION}: fetch the date's calibration again")

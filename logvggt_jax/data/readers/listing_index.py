@@ -1,8 +1,8 @@
 """Listings of data sets kept on disk: the second start does not walk a million files again.
 
 A listing remembers the code that made it and the state of every folder and file that it was made from. While those
-are unchanged it is taken from the index, else made anew. The index is a cache: where it cannot be written, data sets
-work without it.
+are unchanged it is taken from the index, else made anew; an open data set asks once for each listing, not at each
+read. The index is a cache: where it cannot be written, data sets work without it.
 """
 
 import hashlib
@@ -40,6 +40,7 @@ class ListingIndex:
         digest = hashlib.sha256(what.encode()).hexdigest()[:16]
         self.path = user_cache_folder("listings") / f"{identity['name']}-{digest}.sqlite"
         self._code = code
+        self._checked: set[str] = set()  # keys of listings whose sources were looked at
 
     def count(self, key: str) -> int | None:
         """The number kept with a listing, None where there is no current listing."""
@@ -59,6 +60,7 @@ class ListingIndex:
             with closing(self._connect()) as connection, connection:
                 connection.execute(_TABLE)
                 connection.execute("INSERT OR REPLACE INTO listings VALUES (?, ?, ?, ?, ?)", row)
+            self._checked.add(key)
         except (OSError, sqlite3.Error) as error:
             logging.log_first_n(logging.WARNING, "listings are not kept (%s: %s)", 1, self.path, error)
 
@@ -75,8 +77,12 @@ class ListingIndex:
             logging.warning("%s is damaged (%s) and made anew", self.path, error)
             self.path.unlink(missing_ok=True)
             return None
-        if row is None or any(file_state(Path(path)) != state for path, state in json.loads(row[1]).items()):
+        if row is None:
             return None
+        if key not in self._checked:
+            if any(file_state(Path(path)) != state for path, state in json.loads(row[1]).items()):
+                return None
+            self._checked.add(key)
         return row[0]
 
     def _connect(self) -> sqlite3.Connection:

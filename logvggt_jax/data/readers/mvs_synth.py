@@ -6,7 +6,6 @@ in pixels. Depth is z in units of about 0.1 m, infinite in the sky. Of the three
 intrinsics stored with GTAV_540 do not fit its pictures.
 """
 
-import json
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -17,13 +16,14 @@ from logvggt_jax.data.dataset import TRAINING, About
 from logvggt_jax.data.formats.calibration import pinhole, world_to_camera
 from logvggt_jax.data.formats.exr import read_exr
 from logvggt_jax.data.formats.image import read_rgb
+from logvggt_jax.data.formats.json_values import expecting, read_json
 from logvggt_jax.data.formats.numbered_files import numbered_frames
 from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame
 from logvggt_jax.errors import InputError
 
 # Makes the world right-handed; which axis is flipped changes no relative pose.
-_MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
+_MIRROR = np.array([1.0, -1.0, 1.0, 1.0])  # of the columns
 _SEQUENCE = re.compile(r"\d{4}")
 _NUMBERS = ("f_x", "f_y", "c_x", "c_y")
 
@@ -57,25 +57,19 @@ class MVSSynth(FolderDataset):
         kinds = (("images", "{:04d}.png"), ("depths", "{:04d}.exr"), ("poses", "{:04d}.json"))
         paths = numbered_frames(files, *((folder / kind, template) for kind, template in kinds))
         for image, depth, pose in paths.values():
-            yield frame(image, depth, *_camera(files.text(pose, "the frame's camera"), pose))
+            camera = _camera(files.text(pose, "the frame's camera"), pose)
+            yield frame(image, depth, *camera, calibration=pose)
 
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        depth = read_exr(record.depth)
-        depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0.0))
-        return read_rgb(record.image), depth, record.intrinsics
+        return read_rgb(record.image), read_exr(record.depth), record.intrinsics
 
 
 def _camera(text: str, path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     """Intrinsics [3, 3] and extrinsics [4, 4] (None where not finite) of a pose file, in a right-handed world."""
-    try:
-        stored = json.loads(text)
+    stored = read_json(text, path)
+    with expecting(path, f"JSON with 'extrinsic' and {', '.join(_NUMBERS)}"):
         pose = np.array(stored["extrinsic"], np.float64)
         intrinsics = pinhole(*(float(stored[key]) for key in _NUMBERS))
-    except (ValueError, TypeError, KeyError) as error:
-        raise InputError(
-            f"{path}: expected JSON with 'extrinsic' and {', '.join(_NUMBERS)}, got {type(error).__name__} "
-            f"({error}): fetch it again"
-        ) from error
     if pose.shape != (4, 4):
         raise InputError(f"{path}: expected an extrinsic of 4 x 4 numbers, got {pose.shape}: fetch it again")
     if np.isfinite(pose).all() and np.linalg.det(pose) > 0:
@@ -83,4 +77,4 @@ def _camera(text: str, path: Path) -> tuple[np.ndarray, np.ndarray | None]:
             f"{path}: expected a left-handed world (determinant -1), got determinant "
             f"{np.linalg.det(pose):+.3g}: replace it with the data set's original file"
         )
-    return intrinsics, world_to_camera(pose @ _MIRROR, path, stored="world_to_camera")
+    return intrinsics, world_to_camera(pose * _MIRROR, path, stored="world_to_camera")

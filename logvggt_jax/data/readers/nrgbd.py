@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 
 from logvggt_jax.data.dataset import EVALUATION, About
-from logvggt_jax.data.formats.calibration import OPENGL_AXES, numbers, pinhole, scaled, world_to_camera
+from logvggt_jax.data.formats.calibration import OPENGL_AXES, in_pixels, numbers, pinhole, relative, world_to_camera
 from logvggt_jax.data.formats.image import read_depth, read_rgb
 from logvggt_jax.data.formats.numbered_files import numbered_frames, without_gaps
 from logvggt_jax.data.formats.pose_lists import read_pose_list
 from logvggt_jax.data.formats.source_files import SourceFiles
-from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame
+from logvggt_jax.data.readers.folder_dataset import INDOORS, Dropped, FolderDataset, FrameRecord, frame
 
 _CENTRE, _SIZE = (320.0, 240.0), (480, 640)
 _MAX_DEPTH = 10.0  # metres, valid itself
@@ -35,6 +35,7 @@ class NRGBD(FolderDataset):
     title = "Neural RGB-D"
     expects = "<scene>/{images,depth,focal.txt,poses.txt}"
     metric = True
+    plausible_depth = INDOORS
     splits = ("all",)
     about = About(
         source="repository dazinovic/neural-rgbd-surface-reconstruction",
@@ -55,14 +56,14 @@ class NRGBD(FolderDataset):
         poses = read_pose_list(files, pose_list, count=len(paths), numbers_per_line=4)
         path = folder / "focal.txt"
         (focal,) = numbers(files.text(path, "the focal length"), path, count=1)
-        intrinsics = pinhole(focal, focal, *_CENTRE)
+        intrinsics = relative(pinhole(focal, focal, *_CENTRE), _SIZE)
         for (image, depth), pose in zip(paths, poses, strict=True):
             opencv = pose * OPENGL_AXES.diagonal()
             extrinsics = world_to_camera(opencv, f"{pose_list}, pose of {image.name}", stored="camera_to_world")
-            yield frame(image, depth, intrinsics, extrinsics)
+            yield frame(image, depth, intrinsics, extrinsics, calibration=path)
 
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         image = read_rgb(record.image)
         depth = read_depth(record.depth).astype(np.float32) / np.float32(1000.0)
         depth[depth > _MAX_DEPTH] = 0.0
-        return image, depth, scaled(record.intrinsics, image.shape[1] / _SIZE[1], image.shape[0] / _SIZE[0])
+        return image, depth, in_pixels(record.intrinsics, image.shape[:2], record.image, record.calibration)

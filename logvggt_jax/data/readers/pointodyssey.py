@@ -66,7 +66,7 @@ class PointOdyssey(FolderDataset):
         for number, (image, depth) in paths.items():
             where = f"{folder / 'anno.npz'}, extrinsics of frame {number}"
             pose = world_to_camera(extrinsics[number], where, stored="world_to_camera")
-            yield frame(image, depth, intrinsics[number], pose)
+            yield frame(image, depth, intrinsics[number], pose, calibration=folder / "anno.npz")
 
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         raw = read_depth(record.depth)
@@ -83,13 +83,14 @@ def _cameras(files: SourceFiles, folder: Path) -> tuple[np.ndarray, np.ndarray]:
             f"{path}: no such file; "
             + ("annotations.npz is of an older release with other cameras: fetch v1.2" if older else "fetch it again")
         )
+    files.regular(path, "the sequence's cameras")
     if not zipfile.is_zipfile(path):
         raise InputError(f"{path}: truncated or damaged npz file (no zip directory): fetch it again")
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             names = archive.files
             found = {name: archive[name] for name in ("intrinsics", "extrinsics") if name in names}
-    except (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error) as error:
+    except (OSError, EOFError, ValueError, LookupError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
         raise InputError(f"{path}: truncated or damaged npz file ({error}): fetch it again") from error
     if len(found) < 2 or _LATER_ARRAY not in names:
         raise InputError(

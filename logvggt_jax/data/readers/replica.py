@@ -6,23 +6,24 @@ centres are at integers. A line of `traj.txt` is one frame's camera-to-world mat
 OpenCV axes. Depth is uint16, `scale` a metre, 0 where invalid. Other renderings of Replica are not read.
 """
 
-import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 
 from logvggt_jax.data.dataset import TRAINING, About
-from logvggt_jax.data.formats.calibration import pinhole, scaled, world_to_camera
+from logvggt_jax.data.formats.calibration import pinhole, relative, scaled, world_to_camera
 from logvggt_jax.data.formats.image import read_depth, read_rgb
+from logvggt_jax.data.formats.json_values import expecting, read_json
 from logvggt_jax.data.formats.numbered_files import numbered_frames, without_gaps
 from logvggt_jax.data.formats.pose_lists import read_pose_list
 from logvggt_jax.data.formats.source_files import SourceFiles
-from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame
+from logvggt_jax.data.readers.folder_dataset import INDOORS, Dropped, FolderDataset, FrameRecord, frame
 from logvggt_jax.errors import InputError
 
 # The rendering's own, for downloads that lack the file.
 _CAMERA = {"w": 1200.0, "h": 680.0, "fx": 600.0, "fy": 600.0, "cx": 599.5, "cy": 339.5, "scale": 6553.5}
+_MAX = 1e6  # pixels, and units of depth a metre
 
 
 class Replica(FolderDataset):
@@ -36,6 +37,7 @@ class Replica(FolderDataset):
     title = "Replica"
     expects = "cam_params.json and <scene>/{traj.txt,results} (the rendering that NICE-SLAM distributes)"
     metric = True
+    plausible_depth = INDOORS
     splits = ("all",)
     about = About(
         source="the rendering that the download script of the repository cvg/nice-slam fetches; the official meshes "
@@ -51,17 +53,18 @@ class Replica(FolderDataset):
         return {name: each for name, each in folders.items() if any(files.exists(each / sign) for sign in signs)}
 
     def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
-        camera = _camera(self.root / "cam_params.json", files)
+        calibration = self.root / "cam_params.json"
+        camera = _camera(calibration, files)
         results, trajectory = folder / "results", folder / "traj.txt"
         paths = without_gaps(numbered_frames(files, (results, "frame{:06d}.jpg"), (results, "depth{:06d}.png")))
         poses = read_pose_list(files, trajectory, count=len(paths))
         # At 1 x 1 the intrinsics fit pictures of any size.
-        intrinsics = scaled(
-            pinhole(camera["fx"], camera["fy"], camera["cx"], camera["cy"]), 1 / camera["w"], 1 / camera["h"]
-        )
+        matrix = pinhole(camera["fx"], camera["fy"], camera["cx"], camera["cy"])
+        intrinsics = relative(matrix, (int(camera["h"]), int(camera["w"])))
         for line, ((image, depth), pose) in enumerate(zip(paths, poses, strict=True), 1):
             extrinsics = world_to_camera(pose, f"{trajectory}, line {line}", stored="camera_to_world")
-            yield frame(image, depth, intrinsics, extrinsics, depth_scale=1 / camera["scale"])
+            others = {"depth_scale": 1 / camera["scale"], "calibration": calibration}
+            yield frame(image, depth, intrinsics, extrinsics, **others)
 
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         image = read_rgb(record.image)
@@ -72,13 +75,9 @@ class Replica(FolderDataset):
 def _camera(path: Path, files: SourceFiles) -> Mapping[str, float]:
     if not files.exists(path):
         return _CAMERA
-    try:
-        camera = json.loads(files.text(path, "the camera"))["camera"]
-        values = {key: float(camera[key]) for key in _CAMERA}
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            f'{path}: expected {{"camera": {{{", ".join(_CAMERA)}}}}} with numbers ({error!r}): fetch the file again'
-        ) from error
-    if not all(np.isfinite(values[key]) and values[key] > 0 for key in ("w", "h", "scale")):
-        raise InputError(f"{path}: w, h and scale must be positive, got {values}: fetch the file again")
+    content = read_json(files.text(path, "the camera"), path)
+    with expecting(path, f'{{"camera": {{{", ".join(_CAMERA)}}}}} with numbers'):
+        values = {key: float(content["camera"][key]) for key in _CAMERA}
+    if not all(1 <= values[key] <= _MAX for key in ("w", "h", "scale")):
+        raise InputError(f"{path}: w, h and scale must be from 1 to {_MAX:g}, got {values}: fetch the file again")
     return values

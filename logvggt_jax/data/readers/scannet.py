@@ -2,9 +2,9 @@
 
 Layout, as exported by the SensReader of the official repository: `<root>/<part>/<scene>/` with
 `color/<n>.jpg`, `depth/<n>.png`, `pose/<n>.txt` and `intrinsic/intrinsic_depth.txt`. `<part>` is `scans_train`,
-`scans_test` or `scannetv2`, or is left out; scenes are named `scene0000_00`. Numbers are not padded. Depth is uint16 in
-millimetres, 0 where invalid. Poses are camera-to-world in metres, OpenCV axes; a lost frame's entries are `-inf`.
-Intrinsics are 4x4.
+`scans_test` or `scannetv2`, or is left out; scenes are named `scene0000_00`. Numbers are not padded (`0.jpg`), or are,
+as other exporters write them (`000000.jpg`). Depth is uint16 in millimetres, 0 where invalid. Poses are camera-to-world
+in metres, OpenCV axes; a lost frame's entries are `-inf`. Intrinsics are 4x4.
 
 Also read, where a scene has no `color`, is the form that published evaluations prepare (MonST3R's script):
 `color_90/frame_0000.jpg`, `depth_90/frame_0000.png` and `pose_90.txt` with 16 numbers a line, and likewise for other
@@ -26,7 +26,7 @@ from logvggt_jax.data.formats.image import read_depth, read_rgb
 from logvggt_jax.data.formats.numbered_files import numbered_frames, without_gaps
 from logvggt_jax.data.formats.pose_lists import read_pose_list
 from logvggt_jax.data.formats.source_files import SourceFiles
-from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame
+from logvggt_jax.data.readers.folder_dataset import INDOORS, Dropped, FolderDataset, FrameRecord, frame
 from logvggt_jax.errors import InputError
 
 _SCENE = re.compile(r"scene\d{4}_\d{2}")
@@ -50,6 +50,7 @@ class ScanNet(FolderDataset):
     title = "ScanNet"
     expects = "scans_train, scans_test or scannetv2 with scene0000_00/{color,depth,pose,intrinsic} (export the .sens)"
     metric = True
+    plausible_depth = INDOORS
     splits = ("train", "val", "test", "all")
     about = About(
         source="terms-of-use form by e-mail (repository ScanNet/ScanNet); export each .sens with its SensReader; for "
@@ -90,7 +91,8 @@ class ScanNet(FolderDataset):
         path = scene / "intrinsic" / "intrinsic_depth.txt"
         intrinsics = numbers(files.text(path, "the depth camera's intrinsics"), path, count=16).reshape(4, 4)[:3, :3]
         for image, depth, pose, where in frames:
-            yield frame(image, depth, intrinsics, world_to_camera(pose, where, stored="camera_to_world"))
+            extrinsics = world_to_camera(pose, where, stored="camera_to_world")
+            yield frame(image, depth, intrinsics, extrinsics, calibration=path)
 
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         image, raw = read_rgb(record.image), read_depth(record.depth)

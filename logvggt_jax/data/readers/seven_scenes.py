@@ -14,10 +14,10 @@ import numpy as np
 
 from logvggt_jax.data.dataset import EVALUATION, LICENCE_NOT_READ, About, check_indices
 from logvggt_jax.data.errors import MissingFiles, missing_files
-from logvggt_jax.data.formats.calibration import numbers, pinhole, scaled, world_to_camera
+from logvggt_jax.data.formats.calibration import in_pixels, numbers, pinhole, relative, scaled, world_to_camera
 from logvggt_jax.data.formats.image import read_depth, read_rgb
 from logvggt_jax.data.formats.source_files import SourceFiles
-from logvggt_jax.data.readers.folder_dataset import NO_POSES, Dropped, FolderDataset, FrameRecord, frame
+from logvggt_jax.data.readers.folder_dataset import INDOORS, NO_POSES, Dropped, FolderDataset, FrameRecord, frame
 from logvggt_jax.data.readers.sfm_poses import read_sfm_poses
 from logvggt_jax.errors import InputError
 from logvggt_jax.geometry import compose, unproject
@@ -47,6 +47,7 @@ class SevenScenes(FolderDataset):
     title = "7-Scenes"
     expects = "<scene>/seq-XX or seq-XX with frame-XXXXXX.color.png (unpack the sequences' zip files)"
     metric = True
+    plausible_depth = INDOORS
     splits = ("train", "test", "all")
     about = About(
         source="the set's site: a zip file a scene, zip files of sequences within",
@@ -109,7 +110,7 @@ class SevenScenes(FolderDataset):
 
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         image, depth = read_rgb(record.image), _metres(read_depth(record.depth))
-        matrix = _at_size(record.intrinsics, image.shape[:2])
+        matrix = in_pixels(relative(record.intrinsics, _SIZE), image.shape[:2], record.image)
         if not record.depth.name.endswith(".proj.png"):
             depth = _carry_to_colour(depth, matrix, image.shape[:2])
         return image, depth, matrix

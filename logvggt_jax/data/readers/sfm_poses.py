@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.errors import InputError
 from logvggt_jax.geometry import quaternion_to_matrix
 
@@ -20,7 +21,7 @@ def read_sfm_poses(path: Path) -> dict[str, np.ndarray]:
     Raises InputError naming file and line for a line of another form, or numbers that are no pose.
     """
     poses: dict[str, np.ndarray] = {}
-    for number, line in enumerate(path.read_text().splitlines(), start=1):
+    for number, line in enumerate(SourceFiles().text(path, "structure-from-motion poses").splitlines(), start=1):
         if not line.strip():
             continue
         name, *values = line.split()

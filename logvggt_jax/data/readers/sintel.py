@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from logvggt_jax.data.dataset import EVALUATION, LICENCE_NOT_READ, About
-from logvggt_jax.data.errors import BrokenPicture, missing_file
+from logvggt_jax.data.errors import BrokenPicture
 from logvggt_jax.data.formats.calibration import world_to_camera
 from logvggt_jax.data.formats.image import read_rgb
 from logvggt_jax.data.formats.numbered_files import numbered_frames
-from logvggt_jax.data.formats.source_files import SourceFiles
+from logvggt_jax.data.formats.source_files import SourceFiles, read_regular
 from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame
 from logvggt_jax.errors import InputError
 
@@ -59,11 +59,12 @@ class Sintel(FolderDataset):
         )
         for image, depth, camera in paths.values():
             intrinsics, pose = _camera(files.content(camera, "the frame's camera"), camera)
-            yield frame(image, depth, intrinsics, world_to_camera(pose, camera, stored="world_to_camera"))
+            extrinsics = world_to_camera(pose, camera, stored="world_to_camera")
+            yield frame(image, depth, intrinsics, extrinsics, calibration=camera)
 
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         depth = _depth(record.depth)
-        depth = np.where((depth > 0) & (depth <= _SKY), depth, np.float32(0.0))  # NaN fails both comparisons
+        depth = np.where(depth <= _SKY, depth, np.float32(0.0))
         return read_rgb(record.image), depth, record.intrinsics
 
 
@@ -78,9 +79,7 @@ def _camera(content: bytes, path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 def _depth(path: Path) -> np.ndarray:
     """z-depth [H, W] float32 of a `.dpt` file, as stored."""
-    if not path.is_file():
-        raise missing_file(path)
-    content = path.read_bytes()
+    content = read_regular(path)
     _check_tag(content, path, BrokenPicture)
     width, height = (int(size) for size in np.frombuffer(content[4:12].ljust(8, b"\0"), "<i4"))
     expected = 12 + 4 * width * height

@@ -69,16 +69,16 @@ class Spring(FolderDataset):
             row = number - 1
             where = f"{poses}, row {number}"
             extrinsics = world_to_camera(matrices[row].reshape(4, 4), where, stored="world_to_camera")
-            yield frame(image, disparity, pinhole(*pinholes[row]), extrinsics)
+            yield frame(image, disparity, pinhole(*pinholes[row]), extrinsics, calibration=calibration)
 
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         image = read_rgb(record.image)
         height, width = image.shape[:2]
         disparity = read_hdf5(record.depth, "disparity", shape=(2 * height, 2 * width))[::2, ::2].astype(np.float32)
-        # NaN fails the comparison. What is next to nothing is the sky too: its depth is beyond float32.
+        # What is next to nothing is the sky too: its depth is beyond float32.
         with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
             depth = np.float32(record.intrinsics[0, 0] * _BASELINE) / disparity
-        return image, np.where((disparity > 0) & np.isfinite(depth), depth, np.float32(0.0)), record.intrinsics
+        return image, depth, record.intrinsics
 
 
 def _rows(files: SourceFiles, path: Path, columns: int, expected: str) -> np.ndarray:

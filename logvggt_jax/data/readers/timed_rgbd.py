@@ -12,19 +12,27 @@ from typing import ClassVar
 
 import numpy as np
 
-from logvggt_jax.data.errors import BadPose, MissingFiles, UnequalCounts, missing_files
-from logvggt_jax.data.formats.calibration import numbers, scaled, world_to_camera
-from logvggt_jax.data.formats.image import read_depth, read_rgb
+from logvggt_jax.data.errors import MissingFiles, UnequalCounts, missing_files
+from logvggt_jax.data.formats.calibration import in_pixels, numbers, pose_from_quaternion, relative
+from logvggt_jax.data.formats.image import read_rgb
 from logvggt_jax.data.formats.source_files import SourceFiles
-from logvggt_jax.data.readers.folder_dataset import NO_POSES, Dropped, FolderDataset, FrameRecord, frame
+from logvggt_jax.data.readers.folder_dataset import (
+    INDOORS,
+    NO_POSES,
+    Dropped,
+    FolderDataset,
+    FrameRecord,
+    frame,
+    read_depth_of,
+)
 from logvggt_jax.errors import InputError
-from logvggt_jax.geometry import quaternion_to_matrix
 
 TOLERANCE = 0.02  # seconds
 _SIZE = (480, 640)  # that the calibrations belong to
-_UNITS_PER_METRE = 5000.0
+UNITS_PER_METRE = 5000.0
+_MAX_TIME = 1e12  # seconds; much larger ones have no milliseconds in float64
 _PREPARED = re.compile(r"rgb_(\d+)")
-_TIMED_FILE = re.compile(r"(\d+(?:\.\d+)?)\.png")
+_TIMED_FILE = re.compile(r"(\d+(?:\.\d+)?)\.(?:png|jpg|jpeg)")
 
 
 def associate(first: np.ndarray, second: np.ndarray, tolerance: float = TOLERANCE) -> np.ndarray:
@@ -60,6 +68,7 @@ class TimedRGBD(FolderDataset):
     """
 
     metric = True
+    plausible_depth = INDOORS
     splits = ("all",)
     folder_pattern: ClassVar[re.Pattern[str]]
     container: ClassVar[str | None]  # folder below `root` that may hold the sequences
@@ -90,9 +99,9 @@ class TimedRGBD(FolderDataset):
         if match := _PREPARED.fullmatch(folder.name):
             yield from self._prepared_frames(folder.parent, match[1], files)
             return
-        times, images = _listed_files(folder / "rgb.txt", files)
-        depth_times, depths = _listed_files(folder / "depth.txt", files)
-        trajectory = _Trajectory(folder / "groundtruth.txt", files)
+        times, images = listed_files(folder / "rgb.txt", files)
+        depth_times, depths = listed_files(folder / "depth.txt", files)
+        trajectory = Trajectory(folder / "groundtruth.txt", files)
         depth_of, pose_of = associate(times, depth_times), associate(times, trajectory.times)
         for image, depth_index, pose_index in zip(images, depth_of, pose_of, strict=True):
             if depth_index < 0:
@@ -102,18 +111,18 @@ class TimedRGBD(FolderDataset):
                 yield frame(image, depths[depth_index], self._intrinsics(folder), extrinsics)
 
     def _prepared_frames(self, folder: Path, count: str, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
-        times, images = _named_files(folder / f"rgb_{count}", files)
+        times, images = named_files(folder / f"rgb_{count}", files)
         depth_folder = folder / f"depth_{count}"
         if self.prepared_for == "poses" and not files.exists(depth_folder):
-            depths = images  # a picture in depth's place stands for no depth, see _read_frame
+            depths = images  # a picture in depth's place stands for no depth
         else:
-            _, depths = _named_files(depth_folder, files)
+            _, depths = named_files(depth_folder, files)
         if len(depths) != len(images):
             raise UnequalCounts(
                 f"{depth_folder}: expected {len(images)} files, as in {folder}/rgb_{count}, got {len(depths)}: "
                 "prepare both again"
             )
-        trajectory = _Trajectory(folder / f"groundtruth_{count}.txt", files)
+        trajectory = Trajectory(folder / f"groundtruth_{count}.txt", files)
         pose_of = associate(times, trajectory.times)
         if (pose_of < 0).any() and self.prepared_for == "poses":
             raise InputError(
@@ -126,21 +135,19 @@ class TimedRGBD(FolderDataset):
 
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         image = read_rgb(record.image)
-        if record.depth == record.image:
-            depth = np.zeros(image.shape[:2], np.float32)
-        else:
-            depth = read_depth(record.depth).astype(np.float32) / np.float32(_UNITS_PER_METRE)
-        return image, depth, scaled(record.intrinsics, image.shape[1] / _SIZE[1], image.shape[0] / _SIZE[0])
+        intrinsics = in_pixels(relative(record.intrinsics, _SIZE), image.shape[:2], record.image)
+        return image, read_depth_of(record, image, UNITS_PER_METRE), intrinsics
 
 
-class _Trajectory:
+class Trajectory:
     """Poses in TUM's format, in order of time."""
 
     def __init__(self, path: Path, files: SourceFiles) -> None:
         lines, rows = [], []
-        for line, text in _lines(files.text(path, "the trajectory, lines 'time tx ty tz qx qy qz qw'")):
+        for line, text in content_lines(files.text(path, "the trajectory, lines 'time tx ty tz qx qy qz qw'")):
             lines.append(line)
             rows.append(numbers(text, f"{path}, line {line}", count=8))
+            _check_time(rows[-1][0], f"{path}, line {line}")
         if not rows:
             raise InputError(f"{path}: expected lines 'time tx ty tz qx qy qz qw', got none: fetch the file again")
         values = np.array(rows)
@@ -153,25 +160,22 @@ class _Trajectory:
         """World-to-camera [4, 4] of pose `index`; None where it is not finite. BadPose for no unit quaternion."""
         position, quaternion = self._poses[index, :3], self._poses[index, 3:]
         where = f"{self.path}, line {self._lines[index]}"
-        if not np.isfinite(self._poses[index]).all():
-            return None
-        if abs(np.linalg.norm(quaternion) - 1) > 0.01:
-            raise BadPose(f"{where}: expected a unit quaternion qx qy qz qw, got {quaternion}: fetch the file again")
-        pose = np.concatenate([quaternion_to_matrix(quaternion), position[:, None]], axis=1)
-        return world_to_camera(pose, where, stored="camera_to_world")
+        return pose_from_quaternion(quaternion, position, where, stored="camera_to_world")
 
 
-def _listed_files(path: Path, files: SourceFiles) -> tuple[np.ndarray, list[Path]]:
+def listed_files(path: Path, files: SourceFiles) -> tuple[np.ndarray, list[Path]]:
     """Times [n] and files of a list `time file`, in order of time; every file is there."""
     entries: dict[Path, float] = {}
-    for line, text in _lines(files.text(path, "lines 'time file'")):
+    for line, text in content_lines(files.text(path, "lines 'time file'")):
         words = text.split()
         if len(words) != 2:
             raise InputError(f"{path}, line {line}: expected 'time file', got {text!r}: fetch the file again")
         file = path.parent / words[1]
         if file in entries:
             raise InputError(f"{path}, line {line}: {words[1]} is listed twice: fetch the file again")
-        entries[file] = float(numbers(words[0], f"{path}, line {line}")[0])
+        (time,) = numbers(words[0], f"{path}, line {line}", count=1)
+        _check_time(time, f"{path}, line {line}")
+        entries[file] = float(time)
     if not entries:
         raise InputError(f"{path}: expected lines 'time file', got none: fetch the file again")
     present = {
@@ -185,7 +189,7 @@ def _listed_files(path: Path, files: SourceFiles) -> tuple[np.ndarray, list[Path
     return np.array([entries[file] for file in ordered]), ordered
 
 
-def _named_files(folder: Path, files: SourceFiles) -> tuple[np.ndarray, list[Path]]:
+def named_files(folder: Path, files: SourceFiles) -> tuple[np.ndarray, list[Path]]:
     """Times [n] and files of a folder whose files are named by their time, in order of time."""
     matches = map(_TIMED_FILE.fullmatch, files.names(folder, "pictures named by their time, 1305031102.1753.png"))
     entries = sorted((float(match[1]), folder / match[0]) for match in matches if match)
@@ -194,7 +198,12 @@ def _named_files(folder: Path, files: SourceFiles) -> tuple[np.ndarray, list[Pat
     return np.array([time for time, _ in entries]), [file for _, file in entries]
 
 
-def _lines(text: str) -> Iterator[tuple[int, str]]:
+def _check_time(time: float, where: str) -> None:
+    if not abs(time) < _MAX_TIME:  # NaN neither
+        raise InputError(f"{where}: expected a time in seconds first, got {time:g}: fetch the file again")
+
+
+def content_lines(text: str) -> Iterator[tuple[int, str]]:
     """Number and content of the lines that hold something besides a comment."""
     for line, content in enumerate(text.splitlines(), 1):
         if content := content.split("#")[0].strip():

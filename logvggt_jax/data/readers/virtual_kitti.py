@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from logvggt_jax.data.dataset import EVALUATION, TRAINING, About
-from logvggt_jax.data.formats.calibration import numbers, pinhole, world_to_camera
+from logvggt_jax.data.formats.calibration import numbers, pinhole, whole_number, world_to_camera
 from logvggt_jax.data.formats.image import read_depth, read_rgb
 from logvggt_jax.data.formats.numbered_files import numbered_frames
 from logvggt_jax.data.formats.source_files import SourceFiles
@@ -79,7 +79,7 @@ class VirtualKITTI(FolderDataset):
                     )
             where = f"{poses}, frame {number} of {camera}"
             extrinsics = world_to_camera(matrices[number].reshape(4, 4), where, stored="world_to_camera")
-            yield frame(image, depth, pinhole(*pinholes[number]), extrinsics)
+            yield frame(image, depth, pinhole(*pinholes[number]), extrinsics, calibration=calibration)
 
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         raw = read_depth(record.depth)
@@ -96,6 +96,7 @@ def _rows(files: SourceFiles, path: Path, camera: int, *, columns: int) -> dict[
     for line_number, line in enumerate(lines, 2):
         if line.strip():
             values = numbers(line, f"{path}, line {line_number}", count=2 + columns)
-            if values[1] == camera:
-                rows[int(values[0])] = values[2:]
+            number, of_camera = (whole_number(value, f"{path}, line {line_number}") for value in values[:2])
+            if of_camera == camera:
+                rows[number] = values[2:]
     return rows

@@ -7,7 +7,6 @@ category the lists `nvs_list.json` and `camera_eval_list.json`. (The set's READM
 `scene_<id>`.) Depth is z in millimetres, 0 invalid. `masks` show the object and are not needed.
 """
 
-import json
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -16,12 +15,13 @@ import numpy as np
 
 from logvggt_jax.data.dataset import TRAINING, About
 from logvggt_jax.data.errors import missing_files
-from logvggt_jax.data.formats.calibration import in_pixels, numbers, relative, world_to_camera
+from logvggt_jax.data.formats.calibration import in_pixels, numbers, relative, whole_number, world_to_camera
 from logvggt_jax.data.formats.image import read_depth, read_rgb
+from logvggt_jax.data.formats.json_values import expecting, read_json
 from logvggt_jax.data.formats.numbered_files import numbered_frames
 from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.data.formats.split_lists import sequences_present
-from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame
+from logvggt_jax.data.readers.folder_dataset import INDOORS, Dropped, FolderDataset, FrameRecord, frame
 from logvggt_jax.errors import InputError
 
 _SCENE = re.compile(r"scene_\d+")
@@ -44,6 +44,7 @@ class WildRGBD(FolderDataset):
     title = "WildRGB-D"
     expects = "<category>/scenes/scene_XXX/rgb (unpack the categories' zip files)"
     metric = True
+    plausible_depth = INDOORS
     splits = ("train", "test", "all")
     about = About(
         source="zip files by category (repository wildrgbd/wildrgbd)",
@@ -76,12 +77,12 @@ class WildRGBD(FolderDataset):
         if absent:
             raise missing_files(dict.fromkeys(absent, "but the frame has a pose; fetch it or remove that"))
         for number, (image, depth) in paths.items():
-            yield frame(image, depth, intrinsics, poses.get(number))
+            yield frame(image, depth, intrinsics, poses.get(number), calibration=folder / "metadata")
 
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         image = read_rgb(record.image)
         depth = read_depth(record.depth).astype(np.float32) / np.float32(1000)
-        return image, depth, in_pixels(record.intrinsics, image.shape[:2], record.image)
+        return image, depth, in_pixels(record.intrinsics, image.shape[:2], record.image, record.calibration)
 
 
 def _number(scene: str) -> tuple[str, int]:
@@ -106,22 +107,17 @@ def _training_scenes(category: Path, files: SourceFiles) -> set[str]:
 def _intrinsics(files: SourceFiles, path: Path) -> np.ndarray:
     """Intrinsics [3, 3] of a picture of one pixel."""
     content = _json(files.text(path, "the scene's calibration; unpack its zip file again"), path)
-    try:
+    with expecting(path, "w, h and the nine numbers K"):
         width, height = int(content["w"]), int(content["h"])
         # Column by column.
         matrix = np.array(content["K"], np.float64).reshape(3, 3).T
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: expected w, h and the nine numbers K: {error!r}; fetch it again") from error
     if not (width > 0 and height > 0):
         raise InputError(f"{path}: expected a width and height above 0, got {width} x {height}: fetch it again")
     return relative(matrix, (height, width))
 
 
 def _json(text: str, path: Path) -> dict:
-    try:
-        content = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path}: not JSON ({error}): fetch it again") from error
+    content = read_json(text, path)
     if not isinstance(content, dict):
         raise InputError(f"{path}: expected a JSON object, got {type(content).__name__}: fetch it again")
     return content
@@ -136,9 +132,8 @@ def _poses(files: SourceFiles, path: Path) -> dict[int, np.ndarray | None]:
             continue
         where = f"{path}, line {line}"
         values = numbers(row, where, count=17)
-        if not values[0].is_integer():
-            raise InputError(f"{where}: expected a frame number first, got {values[0]:g}: fetch the file again")
-        poses[int(values[0])] = world_to_camera(values[1:].reshape(4, 4), where, stored="camera_to_world")
+        number = whole_number(values[0], f"{where}: frame number")
+        poses[number] = world_to_camera(values[1:].reshape(4, 4), where, stored="camera_to_world")
     if not poses:
         raise InputError(f"{path}: no poses; fetch it again")
     return poses

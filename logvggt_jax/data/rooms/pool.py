@@ -5,7 +5,7 @@ import hashlib
 import json
 import multiprocessing
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from logvggt_jax.data.dataset import check_indices, check_sequence
-from logvggt_jax.data.rooms.rooms import Rooms
+from logvggt_jax.data.dataset import Dataset, check_indices, check_sequence
 from logvggt_jax.errors import InputError, OutputExists
 from logvggt_jax.files import atomic_folder
 from logvggt_jax.frames import Frames
@@ -31,7 +30,7 @@ class RoomPool:
     sends the folder's path only. Pickling a pool without a folder copies it.
     """
 
-    def __init__(self, rooms: Rooms, arrays: dict[str, np.ndarray], folder: Path | None) -> None:
+    def __init__(self, rooms: Dataset, arrays: dict[str, np.ndarray], folder: Path | None) -> None:
         self.rooms, self.folder = rooms, folder
         self.sequences = rooms.sequences
         self._rows = {name: row for row, name in enumerate(rooms.sequences)}
@@ -46,7 +45,7 @@ class RoomPool:
             self._arrays = _open_arrays(self.folder, self.rooms)
 
     @property
-    def identity(self) -> dict[str, Any]:
+    def identity(self) -> Mapping[str, Any]:
         """That of the rooms."""
         return self.rooms.identity
 
@@ -58,9 +57,13 @@ class RoomPool:
         """(H, W): the same for all rooms."""
         return self.rooms.image_size(sequence)
 
-    def frame_names(self, sequence: str) -> list[str]:
+    def frame_names(self, sequence: str) -> Sequence[str]:
         """Names as `Rooms` gives them."""
         return self.rooms.frame_names(sequence)
+
+    def sfm_extrinsics(self, sequence: str, indices: Sequence[int]) -> np.ndarray | None:
+        """None: rooms have exact poses only."""
+        return self.rooms.sfm_extrinsics(sequence, indices)
 
     def read(self, sequence: str, indices: Sequence[int]) -> Frames:
         """Copies of frames `indices`."""
@@ -72,7 +75,7 @@ class RoomPool:
 
 
 def render_pool(
-    rooms: Rooms,
+    rooms: Dataset,
     *,
     cache_dir: str | Path | None = None,
     workers: int | None = None,
@@ -121,18 +124,18 @@ def render_pool(
     return RoomPool(rooms, _open_arrays(folder, rooms), folder)
 
 
-def _contents(rooms: Rooms) -> dict[str, Any]:
+def _contents(rooms: Dataset) -> dict[str, Any]:
     """What decides all frames of a pool, as JSON values."""
     return {**rooms.identity, "sequences": [rooms.sequences[0], rooms.sequences[-1], len(rooms.sequences)]}
 
 
-def _digest(rooms: Rooms) -> str:
+def _digest(rooms: Dataset) -> str:
     return hashlib.sha256(json.dumps(_contents(rooms), sort_keys=True).encode()).hexdigest()[:16]
 
 
-def _shapes(rooms: Rooms) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
+def _shapes(rooms: Dataset) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
     lead = (len(rooms.sequences), rooms.num_frames(rooms.sequences[0]))
-    image = (rooms.height, rooms.width)
+    image = rooms.image_size(rooms.sequences[0])
     return {
         "images": ((*lead, *image, 3), np.dtype(np.uint8)),
         "depth": ((*lead, *image), np.dtype(np.float32)),
@@ -141,7 +144,7 @@ def _shapes(rooms: Rooms) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
     }
 
 
-def _open_arrays(folder: Path, rooms: Rooms) -> dict[str, np.ndarray]:
+def _open_arrays(folder: Path, rooms: Dataset) -> dict[str, np.ndarray]:
     arrays = {}
     for name, (shape, dtype) in _shapes(rooms).items():
         try:
@@ -157,7 +160,7 @@ def _open_arrays(folder: Path, rooms: Rooms) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _render_into(arrays: dict[str, np.ndarray], rooms: Rooms, workers: int | None, progress: bool) -> None:
+def _render_into(arrays: dict[str, np.ndarray], rooms: Dataset, workers: int | None, progress: bool) -> None:
     pixels = arrays["depth"].size
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, disable=not progress) as bar:
@@ -178,7 +181,7 @@ def _worker_count(pixels: int, workers: int | None) -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _rendered(rooms: Rooms, workers: int) -> Iterator[Frames]:
+def _rendered(rooms: Dataset, workers: int) -> Iterator[Frames]:
     if workers == 1:
         for sequence in rooms.sequences:
             yield _read_all(rooms, sequence)
@@ -193,5 +196,5 @@ def _rendered(rooms: Rooms, workers: int) -> Iterator[Frames]:
             raise
 
 
-def _read_all(rooms: Rooms, sequence: str) -> Frames:
+def _read_all(rooms: Dataset, sequence: str) -> Frames:
     return rooms.read(sequence, range(rooms.num_frames(sequence)))

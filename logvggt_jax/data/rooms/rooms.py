@@ -3,12 +3,23 @@
 import dataclasses
 import functools
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from logvggt_jax.data.dataset import EVALUATION, TRAINING, About, Reader, check_indices, check_sequence, check_split
+from logvggt_jax.data.dataset import (
+    EVALUATION,
+    TRAINING,
+    About,
+    Dataset,
+    Reader,
+    check_indices,
+    check_sequence,
+    check_split,
+)
 from logvggt_jax.data.rooms.layout import STYLES, Room, random_room
+from logvggt_jax.data.rooms.pool import render_pool
 from logvggt_jax.data.rooms.ray_caster import render
 from logvggt_jax.errors import InputError
 from logvggt_jax.frames import Frames
@@ -107,6 +118,29 @@ class Rooms(Reader):
             "period": self.period,
             "facing_north": self.facing_north,
         }
+
+    @classmethod
+    def size_options(cls, image_size: tuple[int, int]) -> dict[str, int]:
+        """`height` and `width`: rooms are rendered at the size that is asked for."""
+        return {"height": image_size[0], "width": image_size[1]}
+
+    def for_training(self, *, cache_dir: str | Path | None, progress: bool) -> Dataset:
+        """All frames rendered once, since rendering costs more than training."""
+        return render_pool(self, cache_dir=cache_dir, progress=progress)
+
+    def training_split(self) -> "Rooms":
+        """All training rooms of these options."""
+        return Rooms(
+            "train",
+            height=self.height,
+            width=self.width,
+            num_frames=self._num_frames,
+            style=self.style,
+            seed=self.seed,
+            speed=self.speed,
+            period=self.period,
+            facing_north=self.facing_north,
+        )
 
     def num_frames(self, sequence: str) -> int:
         """Frames of `sequence`: the same for all rooms."""

@@ -18,7 +18,7 @@ from logvggt_jax.evaluation.methods.method import Checkpoint, Method
 from logvggt_jax.evaluation.methods.variants import VARIANTS, variant_methods
 from logvggt_jax.evaluation.progress import progress_display
 from logvggt_jax.evaluation.records import plain, record_key
-from logvggt_jax.files import write_text
+from logvggt_jax.files import open_regular, write_text
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.streaming import PredictionError, Predictor
 
@@ -164,7 +164,8 @@ def _rates(row: Method, pictures: np.ndarray, length: int, rounds: int) -> list[
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        found = json.loads(path.read_text())
-    except (OSError, ValueError):  # not there, or damaged: measured anew
+        with open_regular(path) as stream:
+            found = json.loads(stream.read())
+    except (OSError, ValueError, RecursionError):  # not there, or damaged: measured anew
         return {}
     return found if isinstance(found, dict) else {}

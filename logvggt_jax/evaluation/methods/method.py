@@ -15,7 +15,7 @@ from logvggt_jax.evaluation.records import record_key
 from logvggt_jax.evaluation.scratch import scratch_array
 from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.model.parameters import in_compute_type
-from logvggt_jax.streaming import Predictor, open_predictor
+from logvggt_jax.streaming import METHODS, Predictor, open_predictor
 from logvggt_jax.weights.checkpoints import digests, load_model
 
 
@@ -81,16 +81,21 @@ def predicted(predictor: Predictor, images: np.ndarray) -> ClipPrediction:
 
 
 def model_row(
-    method: str, checkpoint: Checkpoint, settings: Any = None, *, name: str = "LoG-VGGT", knows: str = "its training"
+    method: str, checkpoint: Checkpoint, settings: Any = None, *, name: str | None = None, knows: str | None = None
 ) -> Method:
-    """A row of the model, run by the `method` of that name of `logvggt_jax.streaming`.
+    """A row of the model, run by the `method` of that name of `logvggt_jax.streaming.METHODS`.
 
-    `settings` are the method's own dataclass, None for its defaults; `name` is the row's label.
+    `settings` are the method's own dataclass, None for its defaults; `name` is the row's label and `knows` what the
+    table says of it, by default the method's title, and its summary with the settings.
     """
+    found = METHODS[method]
 
     def start() -> Predictor:
         return open_predictor(method, checkpoint.model, checkpoint.variables, settings)
 
     described = None if settings is None else dataclasses.asdict(settings)
+    if knows is None:
+        chosen = ", ".join(f"{key}={value}" for key, value in (described or {}).items())
+        knows = f"its training; {found.summary}{f' ({chosen})' if chosen else ''}"
     identity = [method, described, checkpoint.model.config.to_dict(), checkpoint.digest]
-    return Method(name, knows, lambda images: predicted(start(), images), identity, start)
+    return Method(name or found.title, knows, lambda images: predicted(start(), images), identity, start)

@@ -90,7 +90,8 @@ class ProtocolSettings:
     max_points: int | None = 1_000_000  # of `PointsMeasure`
     icp_threshold: float | None = 0.1  # of `PointsMeasure`
     seed: int = 0  # of drawn frames and points
-    rooms: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # options of procedural rooms
+    # Further arguments of data sets' readers, by the set's name.
+    options: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_longer_edge(self.longer_edge, "ProtocolSettings.longer_edge", least=28)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from logvggt_jax.errors import MissingPackage
+from logvggt_jax.errors import MissingPackage, install_line
 from logvggt_jax.files import atomic_file
 from logvggt_jax.geometry import camera_centres, invert
 from logvggt_jax.metrics import NotMeasurable
@@ -186,7 +186,7 @@ def _figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, li
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise MissingPackage(f'plots need matplotlib ({error}): pip install "logvggt-jax[eval]"') from error
+        raise MissingPackage(f"plots need matplotlib ({error}): {install_line('eval')}") from error
     figure = Figure(figsize=size, layout="constrained")
     FigureCanvasAgg(figure)
     return figure, list(np.ravel(figure.subplots(rows, columns, squeeze=False)))

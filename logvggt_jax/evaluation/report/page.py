@@ -6,6 +6,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
+from logvggt_jax.errors import printable
 from logvggt_jax.evaluation.report.tables import Table
 
 _STYLE = """
@@ -60,5 +61,5 @@ def _cell(text: str) -> str:
 
 def _figure(path: Path) -> str:
     data = base64.b64encode(path.read_bytes()).decode()
-    name = html.escape(path.stem)
+    name = html.escape(printable(path.stem))
     return f'<figure><img alt="{name}" src="data:image/png;base64,{data}"><figcaption>{name}</figcaption></figure>'

@@ -2,16 +2,19 @@
 
 import csv
 import io
+import os
 import re
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
+from logvggt_jax.errors import disk_errors, printable
 from logvggt_jax.evaluation.report.page import html_page
 from logvggt_jax.evaluation.report.paper_tables import paper_tables
 from logvggt_jax.evaluation.report.tables import MARK, Table, benchmark_tables, coverage_table
@@ -19,6 +22,7 @@ from logvggt_jax.files import write_text
 
 # Of output that goes to a file: the widest of the paper's tables is not cut.
 _FILE_WIDTH = 240
+AGAIN = "To get these numbers again:"
 
 DEFINITIONS = {
     "depth": "Abs Rel: mean of |d - d*| / d* over the valid pixels of a clip; δ<1.25: fraction of them with "
@@ -45,17 +49,18 @@ def print_report(results: Mapping[str, Any], console: Console | None = None) -> 
     console = console or Console()
     if not console.is_terminal:
         console.width = max(console.width, _FILE_WIDTH)
+    # Titles and names are text and no markup, in which [/x] would be an error.
     for shown in tables(results):
-        table = RichTable(title=shown.title, title_justify="left")
+        table = RichTable(title=Text(shown.title), title_justify="left")
         for position, heading in enumerate(shown.header):
-            table.add_column(heading, justify="left" if position == 0 else "right", no_wrap=position == 0)
+            table.add_column(Text(heading), justify="left" if position == 0 else "right", no_wrap=position == 0)
         for row in shown.rows:
             table.add_row(*(Text(cell.replace("**", ""), style="bold" if "**" in cell else "") for cell in row))
         console.print(table)
         for note in shown.notes:
-            console.print(note, markup=False, highlight=False, soft_wrap=True)
-    for line in notes(results):
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
+            console.print(Text(note), soft_wrap=True)
+    for line in [*notes(results), f"{AGAIN} {printable(results['command'])}"]:
+        console.print(Text(line), soft_wrap=True)
 
 
 def write_report(results: Mapping[str, Any], output: Path) -> None:
@@ -63,26 +68,36 @@ def write_report(results: Mapping[str, Any], output: Path) -> None:
     made = tables(results)
     _draw_ate_against_views(results, output)
     write_text(output / "report.md", _markdown(results, made))
-    (output / "tables").mkdir(exist_ok=True)
-    for old in (output / "tables").glob("[0-9][0-9]-*.csv"):
-        old.unlink()
+    with disk_errors(output / "tables"):
+        (output / "tables").mkdir(exist_ok=True)
+        for old in (output / "tables").glob("[0-9][0-9]-*.csv"):
+            old.unlink()
     for number, table in enumerate(made, start=1):
         write_text(output / "tables" / f"{number:02d}-{_slug(table.title)}.csv", _csv(table))
     pictures = [output / name for name in [*_ate_figures(results), *results["figures"]]]
-    write_text(
-        output / "report.html", html_page(results["title"], made, notes(results), [p for p in pictures if p.is_file()])
-    )
+    lines = [*notes(results), f"{AGAIN} {printable(results['command'])}"]
+    page = html_page(printable(results["title"]), made, lines, [path for path in pictures if path.is_file()])
+    write_text(output / "report.html", page)
 
 
 def tables(results: Mapping[str, Any]) -> list[Table]:
-    """All tables: for the paper's benchmarks their coverage and the paper's own tables first."""
-    if all("-clips-" in benchmark["name"] for benchmark in results["benchmarks"]):
-        return benchmark_tables(results)
-    return [coverage_table(results), *paper_tables(results), *benchmark_tables(results)]
+    """All tables, their text `printable`; for the paper's benchmarks their coverage and the paper's own come first."""
+    made = benchmark_tables(results)
+    if not all("-clips-" in benchmark["name"] for benchmark in results["benchmarks"]):
+        made = [coverage_table(results), *paper_tables(results), *made]
+    return [
+        Table(
+            printable(table.title),
+            [printable(cell) for cell in table.header],
+            [[printable(cell) for cell in row] for row in table.rows],
+            tuple(printable(note) for note in table.notes),
+        )
+        for table in made
+    ]
 
 
 def notes(results: Mapping[str, Any]) -> list[str]:
-    """What a reader has to know to read the tables and to get them again."""
+    """What a reader has to know to read the tables, a `printable` line each."""
     lines: list[str] = []
     for benchmark in results["benchmarks"]:
         if not benchmark["missing"]:
@@ -101,8 +116,7 @@ def notes(results: Mapping[str, Any]) -> list[str]:
         lines.append(f"Computed on {environment['device']}, commit {environment['commit']}, with {versions}.")
     if results["checkpoint"]:
         lines.append(f"Checkpoint: {results['checkpoint']} (digest of its parameters' digests).")
-    lines.append(f"To get these numbers again: {results['command']}")
-    return lines
+    return [printable(line) for line in lines]
 
 
 def _points_settings(benchmark: Mapping[str, Any]) -> str:
@@ -131,21 +145,35 @@ def _counted(what: str, kinds: list[str], entries: list[dict[str, Any]]) -> list
 
 
 def _markdown(results: Mapping[str, Any], made: list[Table]) -> str:
-    lines = [f"# {results['title']}", ""]
+    lines = [f"# {_markdown_text(printable(results['title']))}", ""]
     for table in made:
-        lines += [f"## {table.title}", "", _markdown_row(table.header)]
-        lines += [_markdown_row(["---", *["---:"] * (len(table.header) - 1)])]
+        lines += [f"## {_markdown_text(table.title)}", "", _markdown_row(table.header)]
+        lines += ["| " + " | ".join(["---", *["---:"] * (len(table.header) - 1)]) + " |"]
         lines += [_markdown_row(row) for row in table.rows] + [""]
-        lines += [f"{note}\n" for note in table.notes]
-    lines += ["## Notes", ""] + [f"- {line}" for line in notes(results)]
+        lines += [f"{_markdown_text(note)}\n" for note in table.notes]
+    lines += ["## Notes", ""] + [f"- {_markdown_text(line)}" for line in notes(results)]
+    # A block of code: to be copied, and so not escaped.
+    lines += ["", AGAIN, "", f"    {printable(results['command'])}"]
     figures = [*_ate_figures(results), *results["figures"]]
     if figures:
-        lines += ["", "## Figures", ""] + [f"![{Path(name).stem}]({name})" for name in figures]
+        lines += ["", "## Figures", ""]
+        lines += [f"![{_markdown_text(printable(Path(name).stem))}]({quote(os.fsencode(name))})" for name in figures]
     return "\n".join(lines) + "\n"
 
 
 def _markdown_row(cells: list[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
+    return "| " + " | ".join(map(_markdown_cell, cells)) + " |"
+
+
+def _markdown_cell(text: str) -> str:
+    """A cell with its own marks of the best value, and no others."""
+    parts = re.split(r"\*\*(.+?)\*\*", text)
+    return "".join(f"**{_markdown_text(part)}**" if at % 2 else _markdown_text(part) for at, part in enumerate(parts))
+
+
+def _markdown_text(text: str) -> str:
+    """Text that reads in Markdown as it stands: names of sequences hold whatever files are called."""
+    return re.sub(r"([\\`*\[\]<>|&])", r"\\\1", text)
 
 
 def _csv(table: Table) -> str:

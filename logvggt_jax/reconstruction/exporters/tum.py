@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from logvggt_jax.errors import InputError, disk_errors
-from logvggt_jax.files import write_text
+from logvggt_jax.errors import InputError
+from logvggt_jax.files import open_regular, write_text
 from logvggt_jax.geometry import as_matrix, camera_centres, invert, matrix_to_quaternion, quaternion_to_matrix
 from logvggt_jax.reconstruction.point_cloud import PointFilter
 from logvggt_jax.reconstruction.result import Reconstruction
+
+# Numbers whose squares are infinite in float32 are no lengths, and what is shorter than this has lost its direction.
+_LARGEST, _SHORTEST_QUATERNION = 1e18, 1e-6
 
 
 def export_tum(
@@ -49,12 +53,14 @@ def read_trajectory(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     """Time stamps [N] and world-to-camera extrinsics [N, 4, 4], float64, of a TUM trajectory file.
 
     Raises:
-      ValueError: a line does not hold 8 numbers; names file and line.
+      InputError: a line does not hold 8 finite numbers, or its quaternion is no rotation; names file and line. Or no
+        line holds a pose.
     """
     rows = []
-    with disk_errors(path):
-        text = Path(path).read_text()
-    for number, line in enumerate(text.splitlines(), start=1):
+    with open_regular(path) as stream:
+        # Bytes that are not UTF-8 become letters that no number has.
+        lines = stream.read().decode(errors="backslashreplace").splitlines()
+    for number, line in enumerate(lines, start=1):
         fields = line.split("#", 1)[0].split()
         if not fields:
             continue
@@ -62,9 +68,16 @@ def read_trajectory(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
             row = [float(field) for field in fields]
         except ValueError:
             row = []
-        if len(row) != 8:
-            raise InputError(f"{path}:{number}: expected 8 numbers (timestamp tx ty tz qx qy qz qw), got {line!r}")
+        # Not a number compares as no smaller.
+        if len(row) != 8 or not math.isfinite(row[0]) or not all(abs(value) < _LARGEST for value in row[1:]):
+            raise InputError(
+                f"{path}:{number}: expected 8 numbers (timestamp tx ty tz qx qy qz qw), finite ones, got {line!r:.120}"
+            )
+        if math.hypot(*row[4:]) < _SHORTEST_QUATERNION:
+            raise InputError(f"{path}:{number}: the quaternion qx qy qz qw is zero, no rotation, in {line!r:.120}")
         rows.append(row)
-    values = np.array(rows, np.float64).reshape(-1, 8)
+    if not rows:
+        raise InputError(f"{path} holds no pose: expected lines of timestamp tx ty tz qx qy qz qw")
+    values = np.array(rows, np.float64)
     poses = np.concatenate([quaternion_to_matrix(values[:, 4:]), values[:, 1:4, None]], axis=2)
     return values[:, 0], invert(as_matrix(poses))

@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from logvggt_jax.errors import InputError, MissingInput
+from logvggt_jax.errors import InputError, MissingInput, disk_errors
 from logvggt_jax.reconstruction.sources.image_folder import FolderSource
 from logvggt_jax.reconstruction.sources.listing import names_pictures
 from logvggt_jax.reconstruction.sources.pictures import IMAGE_SUFFIXES
 from logvggt_jax.reconstruction.sources.source import SkippedFrame, Source, SourceFrame, SourceOptions
-from logvggt_jax.reconstruction.sources.video import VideoSource
+from logvggt_jax.reconstruction.sources.video import VideoSource, is_live
 
 __all__ = ["FolderSource", "SkippedFrame", "Source", "SourceFrame", "SourceOptions", "VideoSource", "open_source"]
 
@@ -19,7 +19,8 @@ def open_source(path: str | Path, **options: Any) -> Source:
     """A folder of images or a video as a `Source`.
 
     Args:
-      path: folder, glob (`photos/*.jpg`) or list of image files (a text file with a path a line), or video file.
+      path: folder, glob (`photos/*.jpg`) or list of image files (a text file with a path a line); video file, number of
+        a camera (`0`), or address of a network stream (`rtsp://…`).
       options: those of `SourceOptions`: which frames are taken.
 
     Raises:
@@ -27,11 +28,21 @@ def open_source(path: str | Path, **options: Any) -> Source:
       InputError: the file is no video, or an option is out of range.
     """
     chosen = SourceOptions(**options)
-    path = Path(path).expanduser()
-    if names_pictures(path):
-        return FolderSource(path, chosen)
-    if not path.exists():
-        raise MissingInput(f"{path} does not exist: expected a folder of images or a video file")
+    if is_live(path):
+        return VideoSource(path, chosen)
+    try:
+        path = Path(path).expanduser()
+        if names_pictures(path):
+            return FolderSource(path, chosen)
+        with disk_errors(path):
+            path.stat()
+    except MissingInput as error:
+        if path.exists():
+            raise
+        raise MissingInput(f"{path} does not exist: expected a folder of images or a video file") from error
+    except (RuntimeError, ValueError) as error:
+        # No such user, or a null character.
+        raise error if isinstance(error, InputError) else InputError(f"{path!r} is no path: {error}") from error
     if path.suffix.lower() in IMAGE_SUFFIXES:
         raise InputError(f"{path} is a single image: give the folder that holds the sequence, a glob, or a video")
     return VideoSource(path, chosen)

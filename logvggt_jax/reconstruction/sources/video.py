@@ -1,101 +1,254 @@
-"""Frames of a video file."""
+"""Frames of a video file, of a camera, or of a network stream."""
 
 from __future__ import annotations
 
+import re
+import secrets
+import stat
 import warnings
 from collections.abc import Callable, Iterator
 from functools import partial
-from itertools import islice
 from pathlib import Path
+from typing import BinaryIO
 
-import cv2
 import numpy as np
 
-from logvggt_jax.errors import InputError
-from logvggt_jax.reconstruction.sources.source import Source, SourceFrame, SourceOptions, fingerprint
+from logvggt_jax.errors import InputError, disk_errors
+from logvggt_jax.reconstruction.sources.decoding import Damage, Picture, VideoDecoder, VideoHeader
+from logvggt_jax.reconstruction.sources.opencv_decoder import OpenCVDecoder
+from logvggt_jax.reconstruction.sources.sampling import FrameClock, FrameSelection, expected_frames
+from logvggt_jax.reconstruction.sources.source import (
+    SkippedFrame,
+    Source,
+    SourceFrame,
+    SourceOptions,
+    fingerprint,
+)
+
+_STREAM = re.compile(r"(rtsps?|rtmps?|https?|udp|tcp|rtp|srt|mms):/{1,2}(?=[^/])", re.IGNORECASE)
+# Seconds until a network stream that says nothing is given up.
+_TIMEOUT = 10.0
+# Brands of files that are built like an mp4 but hold pictures.
+_PICTURES = (b"heic", b"heix", b"hevc", b"mif1", b"msf1", b"avif", b"avis")
+# So many frames may be left out, whatever share of the video they are.
+_ALWAYS_ALLOWED = 2
+
+
+def is_live(path: str | Path) -> bool:
+    """Whether this names a camera (`0`) or a network stream (`rtsp://…`), not a file."""
+    text = str(path)
+    digits = text.isdecimal() and text.isascii()
+    return (digits or _STREAM.match(text) is not None) and not Path(text).exists()
 
 
 class VideoSource(Source):
-    """Frames of a video file that OpenCV can decode, decoded as needed.
+    """Frames of a video, decoded as needed: by PyAV where it is installed, else by OpenCV.
 
-    The number of frames is known only after decoding (headers lie), so there is no `len`.
+    Frames are named after their position in the video, and have the file's own time stamps, in seconds from its first
+    frame. They are upright, whole pictures of 8 bits: rotation and mirroring are applied, interlaced ones are
+    deinterlaced. Frames that cannot be decoded keep their position, are left out, and are listed in `skipped`.
+
+    How many frames there are is known only after decoding (headers lie), so there is no `len`. Files are opened, and
+    their first frame is decoded, at once; cameras and streams when the first loader is asked for.
 
     Args:
-      path: the video file.
+      path: the video file, the number of a camera, or the address of a stream.
       options: which frames are taken.
 
     Raises:
-      ValueError: the file cannot be opened as a video; while iterating, no frame can be decoded.
+      InputError: the file cannot be opened as a video, or nothing of it can be decoded; while iterating, the size of
+        the pictures changes, too many frames cannot be decoded, or no frame lies where the options ask for it.
     """
 
-    def __init__(self, path: Path, options: SourceOptions) -> None:
-        super().__init__(path, options)
-        self._stride, self._max_frames = options.stride, options.max_frames
-        capture = self._open()
-        self._announced = max(0, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)))
-        rate = float(capture.get(cv2.CAP_PROP_FPS))
-        # Without a frame rate time stamps count frames, as they do for folders.
-        self._rate = rate if np.isfinite(rate) and rate > 0 else 1.0
-        capture.release()
+    def __init__(self, path: str | Path, options: SourceOptions) -> None:
+        super().__init__(Path(path), options)
+        self._live = is_live(path)
+        self._name = re.sub(r"(?<=://)[^/@]*:[^/@]*@", "", _address(path))
+        self._header: VideoHeader | None = None
+        if not self._live:
+            _check_file(self.path)
+            self._decoder = _decoder(self.path, self._name)
+            self._header = self._decoder.header()
+            self._check_range(self._header)
+            self.notes += self._header.notes
+        elif str(path).isdecimal():
+            self._name = f"camera {path}"
+            self._decoder = OpenCVDecoder(int(str(path)), self._name)
+        else:
+            self._decoder = _decoder(_address(path), self._name, _TIMEOUT)
 
     @property
     def expected_frames(self) -> int | None:
         """Number of frames by the file's header, for progress bars; None if it names none."""
-        if not self._announced:
-            return self._max_frames
-        sampled = -(-self._announced // self._stride)
-        return sampled if self._max_frames is None else min(sampled, self._max_frames)
+        header = self._header
+        if header is None:
+            return self.options.max_frames
+        return expected_frames(self.options, header.frames, header.rate)
 
     @property
     def image_size(self) -> tuple[int, int] | None:
-        """(H, W) of the frames."""
-        return None
+        """(H, W) of the frames as they are shown; None for cameras and streams."""
+        return None if self._header is None else self._header.size
 
     def fingerprint(self, count: int) -> str:
-        """Digest of options and file."""
-        return fingerprint(self.options, [self.path])
+        """Digest of options and file, and the library, as no two give the same pixels.
+
+        A new one each time for cameras and streams, which cannot be resumed.
+        """
+        if self._live:
+            return secrets.token_hex(16)
+        with disk_errors(self.path):
+            return f"{fingerprint(self.options, [self.path])} {type(self._decoder).__name__}"
 
     def loaders(self, first: int = 0) -> Iterator[Callable[[], SourceFrame | None]]:
-        """See `Source.loaders`; the iteration itself decodes, which a video allows one by one only."""
-        return islice(self._loaders(), first, None)
+        """See `Source.loaders`.
 
-    def _loaders(self) -> Iterator[Callable[[], SourceFrame | None]]:
-        capture = self._open()
-        position = taken = 0
-        try:
-            while self._max_frames is None or taken < self._max_frames:
-                if not capture.grab():
-                    self._check_end(position)
-                    return
-                if position % self._stride == 0:
-                    decoded, image = capture.retrieve()
-                    if not decoded:
-                        raise InputError(f"{self.path}: frame {position} cannot be decoded; re-encode the video")
-                    yield partial(self._frame, position, image)
+        The iteration itself decodes, which a video allows one frame after the other only; loaders convert. There is
+        none for a frame that cannot be decoded.
+        """
+        self.skipped.clear()
+        header = self._header
+        clock, selection = FrameClock(header.rate if header else None), FrameSelection(self.options)
+        size = header.size if header else None
+        taken, guessed, position, seconds = 0, 0, -1, 0.0
+        for position, picture in enumerate(self._decoder.pictures()):
+            name, seconds = f"frame-{position:06d}", clock.time(picture.seconds)
+            if selection.is_over(seconds):
+                break
+            wanted = selection.wants(position, seconds)
+            if isinstance(picture, Damage):
+                if wanted:
+                    self._skip(name, picture.reason, taken)
+            else:
+                size = size or picture.size
+                if selection.has_begun(seconds) and picture.size != size:
+                    self._refuse_size(position, picture.size, size)
+                guessed += picture.damaged
+                if wanted:
+                    selection.take(seconds)
                     taken += 1
-                position += 1
-        finally:
-            capture.release()
-
-    def _frame(self, position: int, image: np.ndarray) -> SourceFrame:
-        rgb = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-        return SourceFrame(f"frame-{position:06d}", position / self._rate, rgb)
-
-    def _open(self) -> cv2.VideoCapture:
-        capture = cv2.VideoCapture(str(self.path))
-        if not capture.isOpened():
+                    if taken > first:
+                        yield partial(self._frame, name, seconds, picture)
+                    if taken == self.options.max_frames:
+                        break
+        else:
+            self._check_end(position + 1, seconds)
+        if guessed:
+            self._add_note(f"{self._name}: frames with damaged parts, which the decoder filled by guesses: {guessed}")
+        if not taken:
             raise InputError(
-                f"{self.path} cannot be opened as a video: expected a file that OpenCV decodes (mp4, avi, mkv, "
-                "webm, …) or a folder of images; re-encode it, for example to H.264 mp4"
+                f"{self._name} gave no frame between {self.options.start or 0:g} s and "
+                f"{'its end' if self.options.end is None else f'{self.options.end:g} s'}"
             )
-        return capture
 
-    def _check_end(self, decoded: int) -> None:
-        if decoded == 0:
-            raise InputError(f"{self.path} holds no frame that can be decoded; re-encode the video")
-        # Headers are often off by a frame or two; more is missing when a file is damaged or cut short.
-        if decoded < 0.99 * self._announced - 2:
-            warnings.warn(
-                f"{self.path} ends early: {decoded} frames decoded, its header announces {self._announced}",
-                stacklevel=3,
+    def _frame(self, name: str, seconds: float, picture: Picture) -> SourceFrame:
+        image = picture.convert()
+        if image.dtype != np.uint8 or image.shape != (*picture.size, 3):
+            raise InputError(
+                f"{self._name}: {name} is {image.dtype} {image.shape} after decoding, expected 8 bits and three "
+                "colours; re-encode the video"
             )
+        return SourceFrame(name, seconds, image)
+
+    def _skip(self, name: str, reason: str, taken: int) -> None:
+        self.skipped.append(SkippedFrame(name, reason))
+        count = len(self.skipped)
+        if self.options.strict:
+            raise InputError(f"{self._name}: {name} cannot be decoded ({reason}); re-encode the video")
+        total = self.expected_frames or taken + count
+        if count > max(_ALWAYS_ALLOWED, self.options.most_broken * total):
+            raise InputError(
+                f"{self._name}: {count} of {total} frames cannot be decoded, up to {name} ({reason}), more than "
+                f"{self.options.most_broken:.0%}; copy the video anew or re-encode it"
+            )
+
+    def _refuse_size(self, position: int, size: tuple[int, int], first: tuple[int, int]) -> None:
+        raise InputError(
+            f"{self._name}: frame {position} is {size[1]} x {size[0]} pixels but the video begins with {first[1]} x "
+            f"{first[0]}: all frames need one size; cut it there, or scale all of it with ffmpeg -i INPUT -vf "
+            f"scale={first[1]}:{first[0]} OUTPUT.mp4"
+        )
+
+    def _check_range(self, header: VideoHeader) -> None:
+        start = self.options.start or 0.0
+        if header.seconds is not None and start >= header.seconds:
+            raise InputError(f"{self._name} lasts {header.seconds:.3g} s, but start is {start:g} s: choose less")
+
+    def _check_end(self, frames: int, seconds: float) -> None:
+        """Warns of a file that ends before its header says. Headers are often off by a frame or two."""
+        header = self._header
+        if header is None or not frames:
+            return
+        step = 1.0 / header.rate if header.rate else 0.0
+        # An edited file announces frames that it does not show; its duration does not count them.
+        lacks_time = header.seconds is not None and seconds + step < 0.99 * header.seconds - 2 * step
+        if header.announced is None:
+            short = lacks_time
+            told = f"{seconds + step:.4g} s decoded, its header announces {header.seconds or 0:.4g} s"
+        else:
+            short = frames < 0.99 * header.announced - 2 and (lacks_time or header.seconds is None)
+            told = f"{frames} frames decoded, its header announces {header.announced}"
+        if short:
+            warnings.warn(f"{self._name} ends early: {told}", stacklevel=3)
+
+    def _add_note(self, note: str) -> None:
+        if note not in self.notes:
+            self.notes.append(note)
+
+
+def _decoder(source: str | Path, name: str, timeout: float | None = None) -> VideoDecoder:
+    """PyAV's decoder where it is installed, else OpenCV's."""
+    # FFmpeg takes `a:b.mp4` for a protocol, not so an absolute path.
+    url = source if isinstance(source, str) else str(source.absolute())
+    try:
+        import av  # noqa: F401
+    except ImportError:
+        return OpenCVDecoder(url, name, timeout)
+    from logvggt_jax.reconstruction.sources.pyav_decoder import PyAVDecoder
+
+    return PyAVDecoder(url, name, timeout)
+
+
+def _check_file(path: Path) -> None:
+    """Refuses what no library could read as a video, or would wait for without end."""
+    with disk_errors(path):
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise InputError(f"{path} is neither a file nor a folder: give a video file, or the number of a camera")
+        if status.st_size == 0:
+            raise InputError(f"{path} is empty (0 bytes): copy or record the video anew")
+        with path.open("rb") as file:
+            if file.read(30)[8:].startswith(b"WEBPVP8X") and file.read(4) == b"ANIM":
+                raise InputError(f"{path} is an animated WebP, which cannot be decoded: convert it to mp4 or GIF")
+            _check_index(path, file, status.st_size)
+
+
+def _check_index(path: Path, file: BinaryIO, size: int) -> None:
+    """Refuses an mp4 or mov file that lacks the box `moov`, without which none of it can be decoded."""
+    file.seek(0)
+    head = file.read(12)
+    if head[4:8] != b"ftyp" or head[8:] in _PICTURES:
+        return
+    offset = 0
+    while offset + 8 <= size:
+        file.seek(offset)
+        head = file.read(16)
+        length = int.from_bytes(head[:4], "big")
+        if length == 1:
+            length = int.from_bytes(head[8:], "big")
+        if length == 0:
+            length = size - offset
+        if length < 8:
+            break
+        offset += length
+        if head[4:8] == b"moov" and offset <= size:
+            return
+    raise InputError(
+        f"{path} lacks its index (moov), or part of it: the recording or the copy was broken off; copy it anew, or "
+        "restore it with untrunc and a whole video of the same camera"
+    )
+
+
+def _address(path: str | Path) -> str:
+    """The path as text; of a stream's address, of which `Path` keeps one slash only, with both."""
+    return _STREAM.sub(r"\1://", str(path), count=1) if is_live(path) else str(path)

@@ -147,7 +147,7 @@ def test_sets_without_poses_have_no_consistency_and_frames_without_depth_are_cou
     depth.mkdir(parents=True)
     images.mkdir(parents=True)
     for index in range(3):
-        cv2.imwrite(str(images / f"{index:010d}.png"), np.full((*SIZE, 3), 90, np.uint8))
+        cv2.imwrite(str(images / f"{index:010d}.png"), room_views(1)[0].picture)
         cv2.imwrite(str(depth / f"{index:010d}.png"), np.full(SIZE, 256 * 5 * (index > 0), np.uint16))
     (tmp_path / date / "calib_cam_to_cam.txt").write_text("P_rect_02: 50 0 32 0 0 50 24 0 0 0 1 0\n")
     report = check_copy("kitti", tmp_path, picture=tmp_path / "check.png")

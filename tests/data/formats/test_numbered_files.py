@@ -8,6 +8,7 @@ import pytest
 from logvggt_jax.data.errors import MissingFiles
 from logvggt_jax.data.formats.numbered_files import numbered_files, numbered_frames, without_gaps
 from logvggt_jax.data.formats.source_files import SourceFiles
+from logvggt_jax.errors import InputError
 
 
 def write(folder: Path, *names: str) -> Path:
@@ -18,11 +19,22 @@ def write(folder: Path, *names: str) -> Path:
 
 
 def test_order_is_numeric_and_strays_are_passed_over(tmp_path: Path):
-    write(
-        tmp_path, "img10.png", "img9.png", "img100.png", "img07.png", "img5.png.bak", "img.png", "ximg3.png", "img٣.png"
-    )
+    write(tmp_path, "img10.png", "img9.png", "img100.png", "img5.png.bak", "img.png", "ximg3.png", "img٣.png")
     found = numbered_files(SourceFiles(), tmp_path, "img{}.png")
     assert list(found.items()) == [(n, tmp_path / f"img{n}.png") for n in (9, 10, 100)]
+
+
+def test_a_template_without_padding_takes_padded_names_and_two_of_one_number_are_named(tmp_path: Path):
+    write(tmp_path, "000010.png", "000009.png", "11.png")
+    found = numbered_files(SourceFiles(), tmp_path, "{}.png")
+    assert [(number, path.name) for number, path in found.items()] == [
+        (9, "000009.png"),
+        (10, "000010.png"),
+        (11, "11.png"),
+    ]
+    write(tmp_path, "9.png")
+    with pytest.raises(InputError, match=r"/9\.png and 000009\.png have the same number"):
+        numbered_files(SourceFiles(), tmp_path, "{}.png")
 
 
 def test_padding_is_part_of_the_name(tmp_path: Path):

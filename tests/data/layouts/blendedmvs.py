@@ -69,7 +69,7 @@ LAYOUT = Layout(
             )
         ),
         (
-            r"00000001\.jpg: intrinsics fx=0\.5",
+            r"00000001_cam\.txt: intrinsics fx=0\.5 .* as 00000001\.jpg is",
             written(FILES[2], camera_text(np.eye(4), np.diag([0.5, 0.5, 1]))),
         ),
         *(

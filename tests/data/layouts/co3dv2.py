@@ -152,7 +152,7 @@ LAYOUT = Layout(
             lambda root: write_image(root / FILES[0], np.zeros((*PORTRAIT, 3), np.uint8)),
         ),
         (
-            r"frame000009\.jpg: intrinsics fx=0\.024",
+            r"frame_annotations\.jgz: intrinsics fx=0\.024 .* as frame000009\.jpg is",
             lambda root: edit(root / ANNOTATIONS, lambda each: each["viewpoint"].update(focal_length=[1e-3, 1e-3])),
         ),
     ),

@@ -72,7 +72,7 @@ LAYOUT = Layout(
             written(FILES[2], '{"extrinsic": [[1]], "f_x": 1, "f_y": 1, "c_x": 1, "c_y": 1}'),
         ),
         (
-            r"0001\.png: intrinsics .* cannot belong to a picture of 64 x 48",
+            r"0001\.json: intrinsics .* cannot belong to a picture of 64 x 48, as 0001\.png is",
             lambda root: write_pose(root / FILES[2], SWAP, c_x=960.0, c_y=540.0),
         ),
     ),

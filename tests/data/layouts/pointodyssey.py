@@ -96,7 +96,7 @@ LAYOUT = Layout(
             lambda root: write_cameras(root / SCENE, extrinsics=np.array([{}, {}, {}], dtype=object)),
         ),
         (
-            r"rgb_00000\.jpg: intrinsics fx=-55",
+            r"anno\.npz: intrinsics fx=-55 .* as rgb_00000\.jpg is",
             lambda root: write_cameras(root / SCENE, intrinsics=np.stack([np.diag([-55.0, 55, 1])] * 4)),
         ),
     ),

@@ -54,8 +54,8 @@ LAYOUT = Layout(
         ),
         (r"cam_params\.json.*expected", written("cam_params.json", "[1]")),
         (r"cam_params\.json.*expected.*'h'", written("cam_params.json", '{"camera": {"w": 64}}')),
-        (r"cam_params\.json.*must be positive", lambda root: write_camera(root, scale=0)),
+        (r"cam_params\.json.*must be from 1 to", lambda root: write_camera(root, scale=0)),
         (r"cam_params\.json.*expected.*wide", lambda root: write_camera(root, fx="wide")),
-        (r"frame000000\.jpg: intrinsics.*cannot belong", lambda root: write_camera(root, cx=500.0)),
+        (r"cam_params\.json: intrinsics.*cannot belong", lambda root: write_camera(root, cx=500.0)),
     ),
 )

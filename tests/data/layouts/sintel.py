@@ -60,7 +60,7 @@ LAYOUT = Layout(
         (r"frame_0002\.dpt.*tag 202021\.25", changed(FILES[1], lambda data: data[:4][::-1] + data[4:])),
         (r"frame_0002\.cam: expected 172 bytes, got 164", changed(CAMERA_FILE, lambda data: data[:-8])),
         (r"frame_0002\.cam.*tag 202021\.25", changed(CAMERA_FILE, lambda data: b"PIEX" + data[4:])),
-        (r"frame_0002\.png: intrinsics", lambda root: write_camera(root / CAMERA_FILE, np.eye(4), INTRINSICS.T)),
+        (r"frame_0002\.cam: intrinsics", lambda root: write_camera(root / CAMERA_FILE, np.eye(4), INTRINSICS.T)),
         ("training/final: no such folder", lambda root: (root / "training/final").rename(root / "training/albedo")),
     ),
 )

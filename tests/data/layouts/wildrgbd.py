@@ -55,7 +55,7 @@ LAYOUT = Layout(
             )
             for text, complaint in (
                 ("1 0 0 0", "expected 17 numbers, got 4"),
-                ("1.5 1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1", "frame number"),
+                ("1.5 1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1", "frame number: expected a whole number, got 1\\.5"),
                 ("1 1 0 0 0 0 -1 0 0 0 0 1 0 0 0 0 1", "rigid"),
             )
         ),
@@ -70,7 +70,7 @@ LAYOUT = Layout(
             )
         ),
         # Row by row, and a focal length of a million pixels.
-        (r"00000\.png: intrinsics", lambda root: write_metadata(root / SCENE, INTRINSICS.T)),
-        (r"00000\.png: intrinsics fx=1e\+06", lambda root: write_metadata(root / SCENE, pinhole(SIZE, 1e6))),
+        (r"metadata: intrinsics", lambda root: write_metadata(root / SCENE, INTRINSICS.T)),
+        (r"metadata: intrinsics fx=1e\+06", lambda root: write_metadata(root / SCENE, pinhole(SIZE, 1e6))),
     ),
 )

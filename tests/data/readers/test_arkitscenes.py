@@ -1,5 +1,6 @@
 """ARKitScenes: the room comes back whichever way up the tablet was held; times, splits and damage."""
 
+import shutil
 from pathlib import Path
 
 import cv2
@@ -47,6 +48,22 @@ def test_the_room_comes_back_as_stored(tmp_path: Path, degrees: float):
     frames = dataset.read(NAME, range(4))
     check_views(frames, views, picture_error=0, depth_error=1e-6)
     assert dataset.frame_names(NAME) == [f"41048190_{time:.3f}" for time in PICTURE_TIMES]
+
+
+def test_the_form_for_object_detection_comes_back_where_the_raw_one_is_absent(tmp_path: Path):
+    views = written(tmp_path)
+    video = tmp_path / VIDEO
+    frames_folder = tmp_path / f"3dod/{NAME}" / f"{video.name}_frames"
+    shutil.copytree(video, frames_folder)
+    for suffix in ("", "_intrinsics"):
+        (frames_folder / f"vga_wide{suffix}").rename(frames_folder / f"lowres_wide{suffix}")
+    assert ARKitScenes(tmp_path, "train").sequences == (NAME,)
+    shutil.rmtree(video)
+    dataset = ARKitScenes(tmp_path, "train", upright=False)
+    assert dataset.sequences == (f"3dod/{NAME}",)
+    check_views(dataset.read(f"3dod/{NAME}", range(4)), views, picture_error=0, depth_error=1e-6)
+    with pytest.raises(FileNotFoundError):
+        ARKitScenes(tmp_path, "val")
 
 
 H, W = SIZE

@@ -74,10 +74,13 @@ def test_frames_come_back_with_their_units_in_the_order_asked_for(layout: Layout
     errors = {"picture_error": layout.picture_error, "depth_error": layout.depth_error}
     check_views(in_metres, expected, **errors, poses=layout.poses != "none")
     np.testing.assert_array_equal(dataset.extrinsics(name)[order], frames.extrinsics)
+    # A copy on the disk is trained on as it is; which of it was trained on is not known.
+    assert dataset.for_training(cache_dir=None, progress=False) is dataset and dataset.training_split() is None
+    assert dataset.size_options((28, 42)) == {} and dataset.sfm_extrinsics(name, [0]) is None
 
 
 # Metres as written here, but each sequence of the set has a scale of its own.
-UNSCALED = {layout_of(name).sequence for name in ("co3dv2", "blendedmvs")}
+UNSCALED = {layout_of(name).sequence for name in ("co3dv2", "blendedmvs", "colmap")}
 
 
 @sets_with_poses

@@ -14,6 +14,7 @@ from layouts.layout import VIEWS
 from layouts.replica import write, write_camera, write_scene
 
 from logvggt_jax.data.formats.source_files import SourceFiles
+from logvggt_jax.data.readers import folder_dataset
 from logvggt_jax.data.readers.listing_index import ListingIndex, code_digest
 from logvggt_jax.data.readers.replica import Replica
 
@@ -80,6 +81,28 @@ def test_the_second_start_reads_nothing_and_gives_the_same(root: Path, reads: Co
     assert not reads
     for name in ("images", "depth", "intrinsics", "extrinsics"):
         assert (getattr(frames, name) == getattr(expected, name)).all()
+
+
+def test_an_open_set_looks_at_its_files_once(root: Path, monkeypatch: pytest.MonkeyPatch):
+    """However often a listing leaves memory and is read again, and with one question to the file system a file."""
+    names(root)
+    monkeypatch.setattr(folder_dataset, "_RECENT", 0)
+    asked: Counter[Path] = Counter()
+    original = Path.stat
+
+    def counted(path: Path, **options: bool) -> os.stat_result:
+        asked[path] += 1
+        return original(path, **options)
+
+    replica = Replica(root)
+    monkeypatch.setattr(Path, "stat", counted)
+    assert replica.num_frames("room0") == 3 and replica.frame_names("room0") == ALL
+    sources = {path: count for path, count in asked.items() if path.is_relative_to(root)}
+    assert sources and set(sources.values()) == {1}
+    for _ in range(3):
+        replica.read("room0", [0, 2])
+    again = {path: count for path, count in asked.items() if path in sources}
+    assert again == sources
 
 
 def test_files_added_and_removed_are_seen(root: Path):

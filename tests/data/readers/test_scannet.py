@@ -35,6 +35,15 @@ def test_colour_is_averaged_over_the_pixels_that_a_depth_pixel_covers(root: Path
     assert np.abs(image.astype(int) - 100).max() <= 5
 
 
+def test_padded_numbers_are_read_also_beside_unpadded_ones(root: Path):
+    for folder in ("color", "depth"):  # poses stay as they are
+        for path in (root / SCENE / folder).iterdir():
+            path.rename(path.with_name(f"{int(path.stem):06d}{path.suffix}"))
+    scans = ScanNet(root)
+    assert scans.frame_names("scene0000_00") == ["000008", "000009", "000010", "000011"]
+    check_views(scans.read("scene0000_00", range(4)), VIEWS, **ERRORS)
+
+
 @pytest.mark.parametrize("part", ["scannetv2", "."])
 def test_other_folders_of_scenes_are_read(tmp_path: Path, part: str):
     write_scene(tmp_path / part / "scene0011_01")

@@ -11,12 +11,12 @@ import pytest
 from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.evaluation.costs.parts import (
     Part,
-    abstract_variables,
     flops_by_part,
     live_device_bytes,
     sequence_parts,
     time_part,
 )
+from logvggt_jax.model.logvggt import variable_shapes
 from logvggt_jax.operations import count_flops, matmul_flops_per_second
 
 ROOT = Path(__file__).parents[2]
@@ -50,7 +50,7 @@ def test_a_frame_of_a_thousand_costs_what_one_of_a_hundred_does(tiny: ModelConfi
 def test_parts_add_up_to_the_whole_model(small_config: ModelConfig, options: dict) -> None:
     model = with_refinement(small_config, **options)
     images = jax.ShapeDtypeStruct((1, 13, 28, 42, 3), jnp.uint8)
-    whole = count_flops(model.apply, abstract_variables(model), images)
+    whole = count_flops(model.apply, variable_shapes(model.config), images)
     parts = flops_by_part(model, 13, (28, 42))
     assert sum(parts.values()) == pytest.approx(whole, rel=0.01)
     assert (parts["GCCR"] > 0) == model.config.refinement.enabled
@@ -59,7 +59,7 @@ def test_parts_add_up_to_the_whole_model(small_config: ModelConfig, options: dic
 def test_gccr_is_below_a_hundredth_of_vggt_1b() -> None:
     """On shapes alone: a thousand frames of 392 x 518, GCCR against the backbone, the largest part."""
     model = LogVGGT(ModelConfig(dtype="bfloat16", attention="xla"))
-    variables = abstract_variables(model)
+    variables = variable_shapes(model.config)
     parts = [part for part in sequence_parts(model, 1000, (392, 518)) if part.name in ("backbone", "GCCR")]
     counts = dict.fromkeys(("backbone", "GCCR"), 0.0)
     for part in parts:

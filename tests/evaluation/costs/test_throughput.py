@@ -12,16 +12,15 @@ from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.evaluation.costs import throughput
 from logvggt_jax.evaluation.costs.parts import PARTS
 from logvggt_jax.evaluation.costs.throughput import TimingConfig, measured_timings, random_pictures, time_stream
-from logvggt_jax.evaluation.methods.method import Checkpoint
-from logvggt_jax.evaluation.methods.rows import ReferenceConfig, model_rows
-from logvggt_jax.streaming import StreamSession
+from logvggt_jax.evaluation.methods.method import Checkpoint, model_row
+from logvggt_jax.streaming import OfflineSettings, StreamSession
 
 
 def test_every_row_is_timed_once_and_kept(
     small_config: ModelConfig, small_variables: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     checkpoint = Checkpoint(LogVGGT(small_config), small_variables, "digest")
-    references = model_rows(checkpoint, ("offline",), ReferenceConfig(max_frames=5))
+    references = [model_row("offline", checkpoint, OfflineSettings(max_frames=5))]
     config = TimingConfig(lengths=(7, 5), rounds=2)
 
     def measure(checkpoint: Checkpoint = checkpoint, *, longer_edge: int = 42, fresh: bool = False) -> dict[str, Any]:

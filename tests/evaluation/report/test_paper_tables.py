@@ -84,7 +84,7 @@ def test_our_rows_stand_in_every_group_in_the_papers_units() -> None:
 
 def test_our_times_stand_beside_the_papers() -> None:
     setting = {"device": "a device", "dtype": "float32", "image_size": [56, 70], "windows": [4, 2], "rounds": 3}
-    rates = {"100": [20.0, 22.0, 21.0], "1000": "full attention over 1000 frames exceeds references.max_frames=200"}
+    rates = {"100": [20.0, 22.0, 21.0], "1000": "full attention over 1000 frames exceeds max_frames=200"}
     timings = {
         **setting,
         "lengths": [50, 100, 1000],

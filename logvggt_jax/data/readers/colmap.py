@@ -1,0 +1,133 @@
+"""Recordings of one's own whose cameras COLMAP has found.
+
+Layout: the root is such a recording, or holds folders that are. A recording holds
+
+- `sparse/0/` (as the mapper writes it) or `sparse/` (as the undistorter does) with `cameras` and `images`, `.bin` or
+  `.txt`; of several models the one in `sparse/0` is read;
+- `images/`, the pictures that the model names;
+- for depth, if any, `depth/<picture's name without suffix>.png`, 16-bit, thousandths of the model's unit of length; or
+  `stereo/depth_maps/<picture's name>.geometric.bin` as COLMAP's `patch_match_stereo` writes them; 0 where invalid.
+
+Poses are world-to-camera, OpenCV axes, in a unit of the model's own.
+"""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from logvggt_jax.data.dataset import EVALUATION, TRAINING, About
+from logvggt_jax.data.errors import missing_files
+from logvggt_jax.data.formats.calibration import in_pixels, relative
+from logvggt_jax.data.formats.colmap_model import ColmapCamera, read_cameras, read_depth_map, read_images
+from logvggt_jax.data.formats.image import read_rgb
+from logvggt_jax.data.formats.source_files import SourceFiles
+from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame, read_depth_of
+from logvggt_jax.errors import InputError
+
+_PICTURE_SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
+_DEPTH_UNITS = 1000.0
+
+
+class Colmap(FolderDataset):
+    """Reader of COLMAP's models; sequences are named as their folders, frames as their pictures.
+
+    Frames are in the natural order of their names (`img2` before `img10`). Pictures that COLMAP has not registered (`no
+    pose`) do not count, nor do those without depth where the recording has any (`no depth`); without any, the frames'
+    depth is 0 throughout, no pixel valid. Cameras are `PINHOLE` or `SIMPLE_PINHOLE`, or `SIMPLE_RADIAL`, `RADIAL` or
+    `OPENCV` without distortion; others are refused. Pictures may be resized copies: the intrinsics follow their size.
+    """
+
+    name = "colmap"
+    title = "own recordings with COLMAP's cameras"
+    expects = "sparse/0 with cameras and images (.bin or .txt), and images; for depth stereo/depth_maps or depth"
+    metric = False
+    splits = ("all",)
+    about = About(
+        source="photograph it and run COLMAP; undistort with `colmap image_undistorter` and pass its output folder",
+        licence="your own",
+        size="your own",
+        roles=(TRAINING, EVALUATION),
+    )
+
+    def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
+        if files.exists(self.root / "sparse"):
+            # A root such as "." has no name of its own.
+            return {self.root.resolve().name: self.root}
+        folders = files.folders(self.root, self.expects)
+        return {name: folder for name, folder in folders.items() if files.exists(folder / "sparse")}
+
+    def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
+        sparse, pictures = folder / "sparse", folder / "images"
+        model = sparse / "0" if files.exists(sparse / "0") else sparse
+        camera_file, cameras = read_cameras(files, model)
+        image_file, images = read_images(files, model)
+        images = sorted(images, key=lambda image: _natural_order(image.name))
+        paths = [_inside(pictures, image.name, image_file) for image in images]
+        names = {each: set(files.names(each, self.expects)) for each in {pictures, *(path.parent for path in paths)}}
+        absent = [path for path in paths if path.name not in names[path.parent]]
+        if absent:
+            raise missing_files(dict.fromkeys(absent, f"but {image_file} names it; copy it there"))
+        intrinsics = {
+            number: _intrinsics(cameras, number, camera_file, image_file) for number in {i.camera for i in images}
+        }
+        there = {each / name for each, held in names.items() for name in held}
+        yield from (Dropped("no pose") for path in there - set(paths) if path.suffix.lower() in _PICTURE_SUFFIXES)
+        depths = _depth_files(files, folder, [image.name for image in images])
+        for image, path in zip(images, paths, strict=True):
+            depth = depths.get(image.name) if depths else path  # a picture in depth's place stands for no depth
+            if depth is None:
+                yield Dropped("no depth")
+                continue
+            others = {"name": image.name, "calibration": camera_file}
+            yield frame(path, depth, intrinsics[image.camera], image.extrinsics, **others)
+
+    def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        image = read_rgb(record.image)
+        is_map = record.depth.suffix == ".bin"
+        depth = read_depth_map(record.depth) if is_map else read_depth_of(record, image, _DEPTH_UNITS)
+        return image, depth, in_pixels(record.intrinsics, image.shape[:2], record.image, record.calibration)
+
+
+def _natural_order(name: str) -> list[tuple[int, int, str]]:
+    parts = re.split(r"(\d+)", name)
+    return [(1, int(part), part) if part.isdecimal() else (0, 0, part) for part in parts]
+
+
+def _inside(folder: Path, name: str, model_file: Path) -> Path:
+    """The file of a picture; InputError naming `model_file` for a name that leads out of the folder."""
+    relative_name = PurePosixPath(name)
+    if relative_name.is_absolute() or ".." in relative_name.parts or not relative_name.name:
+        raise InputError(f"{model_file}: {name!r} is no picture's name below {folder}: export the model again")
+    return folder / relative_name
+
+
+def _intrinsics(cameras: Mapping[int, ColmapCamera], number: int, path: Path, image_file: Path) -> np.ndarray:
+    """Intrinsics [3, 3] of a picture of one pixel."""
+    if number not in cameras:
+        raise InputError(f"{path}: no camera {number}, which {image_file} names: export the model again")
+    camera = cameras[number]
+    matrix = camera.intrinsics()
+    if matrix is None:
+        raise InputError(
+            f"{path}: camera {number} is {camera.model} with distortion, frames need a pinhole: run `colmap "
+            f"image_undistorter --image_path <images> --input_path {path.parent} --output_path <new folder>` and pass "
+            "the new folder"
+        )
+    return relative(matrix, camera.size)
+
+
+def _depth_files(files: SourceFiles, folder: Path, names: Sequence[str]) -> dict[str, Path]:
+    """Files of depth by the picture's name, for the pictures that have one; all of one kind."""
+    maps, own = folder / "stereo" / "depth_maps", folder / "depth"
+    for candidates in (
+        {name: own / PurePosixPath(name).with_suffix(".png") for name in names},
+        {name: maps / f"{name}.geometric.bin" for name in names},
+    ):
+        folders = {path.parent for path in candidates.values()}
+        held = {each: set(files.names(each, "depth")) for each in folders if files.exists(each)}
+        found = {name: path for name, path in candidates.items() if path.name in held.get(path.parent, ())}
+        if found:
+            return found
+    return {}

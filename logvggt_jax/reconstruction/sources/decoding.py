@@ -1,0 +1,67 @@
+"""What a library that decodes videos is asked for: a header, and pictures in the order in which they are shown."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+
+@dataclasses.dataclass(frozen=True)
+class VideoHeader:
+    """What is known of a video before all of it is decoded.
+
+    Attributes:
+      size: (H, W) of the pictures as they are shown, after rotation.
+      rate: frames a second on average; None where the file does not say.
+      frames: number of frames as far as it can be told; None where it cannot.
+      announced: number of frames that the file itself states; None where it does not.
+      seconds: duration of the video stream that the file states; None where it does not.
+      notes: what the user should know, one line each.
+    """
+
+    size: tuple[int, int]
+    rate: float | None
+    frames: int | None
+    announced: int | None
+    seconds: float | None
+    notes: tuple[str, ...] = ()
+
+
+class Picture(NamedTuple):
+    """A decoded frame.
+
+    Attributes:
+      seconds: presentation time stamp; None where there is none.
+      size: (H, W) as it is shown, after rotation.
+      convert: gives the picture as [H, W, 3] uint8 RGB, in any thread.
+      damaged: the decoder had to guess parts of it.
+    """
+
+    seconds: float | None
+    size: tuple[int, int]
+    convert: Callable[[], np.ndarray]
+    damaged: bool = False
+
+
+class Damage(NamedTuple):
+    """A frame that cannot be decoded, in the place where it would be shown; `seconds` as in `Picture`."""
+
+    seconds: float | None
+    reason: str
+
+
+class VideoDecoder(Protocol):
+    """A video file, camera or stream that can be decoded from its beginning, again and again."""
+
+    def header(self) -> VideoHeader:
+        """What is known of the video; decodes no more than its first frame.
+
+        Raises:
+          InputError: it cannot be opened, holds no video, or nothing of it can be decoded.
+        """
+
+    def pictures(self) -> Iterator[Picture | Damage]:
+        """The frames in the order in which they are shown. Raises InputError as `header` does."""

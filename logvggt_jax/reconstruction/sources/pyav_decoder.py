@@ -1,0 +1,279 @@
+"""Decoding of videos by FFmpeg's libraries through PyAV."""
+
+from __future__ import annotations
+
+import heapq
+import re
+from collections import deque
+from collections.abc import Iterator
+from fractions import Fraction
+from functools import partial
+
+import av
+import av.error
+import av.logging
+import numpy as np
+
+from logvggt_jax.errors import InputError
+from logvggt_jax.reconstruction.sources.decoding import Damage, Picture, VideoHeader
+from logvggt_jax.reconstruction.sources.deinterlacing import Deinterlacer, is_interlaced
+from logvggt_jax.reconstruction.sources.orientation import display_matrix, shown_size, turn
+
+# Text and single images, which FFmpeg would show as videos of one frame.
+_NO_VIDEOS = ("image2", "tty", "bin", "xbin", "adf", "idf")
+# Formats that state their duration; FFmpeg guesses that of others.
+_STATE_DURATION = ("mov", "matroska", "avi", "flv", "asf")
+_HDR_TRANSFERS = {16: "PQ", 18: "HLG"}
+# Errors in a row after which a file that cannot be read on counts as ended.
+_MOST_READ_ERRORS = 16
+# Some formats mark no key frames: after so many packets the first that decodes begins the video.
+_LONGEST_LEAD = 300
+# Pixels above which frames are decoded side by side.
+_LARGE = 1920 * 1088
+# Packets whose frame has not come out; no codec holds back so many.
+_MOST_WAITING = 512
+
+
+class PyAVDecoder:
+    """See `VideoDecoder`.
+
+    Args:
+      url: what FFmpeg opens.
+      name: what messages call it.
+      timeout: seconds to wait for a network stream; None for files.
+    """
+
+    def __init__(self, url: str, name: str, timeout: float | None = None) -> None:
+        self._url, self._name, self._timeout = url, name, timeout
+        # Packets before the first key frame.
+        self._lead = 0
+
+    def header(self) -> VideoHeader:
+        """See `VideoDecoder.header`."""
+        with self._open() as container:
+            stream = self._stream(container)
+            frame = next((frame for _, frame in self._decode(container, stream) if frame is not None), None)
+            if frame is None:
+                codec = stream.codec_context.codec.long_name
+                raise InputError(f"{self._name} holds no frame that can be decoded ({codec}); re-encode the video")
+            rate, seconds = stream.average_rate or stream.guessed_rate, _duration(container, stream)
+            return VideoHeader(
+                size=shown_size(frame, display_matrix(frame, stream)),
+                rate=float(rate) if rate else None,
+                frames=_likely_frames(stream.frames, seconds, rate),
+                announced=stream.frames or None,
+                seconds=seconds if container.format.name.startswith(_STATE_DURATION) else None,
+                notes=tuple(self._notes(frame, stream)),
+            )
+
+    def pictures(self) -> Iterator[Picture | Damage]:
+        """See `VideoDecoder.pictures`."""
+        with self._open() as container:
+            stream = self._stream(container)
+            deinterlacer = Deinterlacer(stream, self._name)
+            for damage, frame in self._decode(container, stream):
+                if frame is not None:
+                    ready = deinterlacer.push(frame)
+                else:
+                    # What was pushed before is shown before.
+                    ready = deinterlacer.drain()
+                for decoded, whole in ready:
+                    yield self._picture(decoded, whole, stream)
+                if damage is not None:
+                    yield damage
+            for decoded, whole in deinterlacer.drain():
+                yield self._picture(decoded, whole, stream)
+
+    def _picture(self, decoded: av.VideoFrame, whole: av.VideoFrame, stream: av.video.stream.VideoStream) -> Picture:
+        matrix = display_matrix(decoded, stream)
+        # Filters pass on neither.
+        whole.colorspace, whole.color_range = decoded.colorspace, decoded.color_range
+        return Picture(
+            seconds=None if decoded.pts is None else float(decoded.pts * stream.time_base),
+            size=shown_size(decoded, matrix),
+            convert=partial(self._convert, whole, matrix),
+            damaged=decoded.is_corrupt,
+        )
+
+    def _convert(self, frame: av.VideoFrame, matrix: np.ndarray | None) -> np.ndarray:
+        try:
+            rgb = frame.reformat(
+                format="rgb24",
+                src_color_range=frame.color_range,
+                dst_color_range="JPEG",
+                interpolation="BICUBIC",
+                threads=1,
+            ).to_ndarray()
+        except av.FFmpegError as error:
+            raise InputError(
+                f"{self._name}: pictures in the pixel format {frame.format.name} cannot be converted "
+                f"({error.strerror}); re-encode it, for example to H.264 mp4"
+            ) from error
+        return rgb if matrix is None else turn(rgb, matrix)
+
+    def _open(self) -> av.container.InputContainer:
+        options = {"rtsp_transport": "tcp"} if self._url.startswith("rtsp") else {}
+        try:
+            return av.open(self._url, options=options, metadata_errors="replace", timeout=self._timeout)
+        except av.FFmpegError as error:
+            if self._timeout is not None:
+                late = isinstance(error, av.error.ExitError | av.error.TimeoutError)
+                reason = f"no answer within {self._timeout:g} s" if late else error.strerror
+                raise InputError(
+                    f"{self._name} cannot be opened ({reason}): check address, network and password"
+                ) from error
+            raise InputError(
+                f"{self._name} cannot be opened as a video ({error.strerror}): expected mp4, mov, avi, mkv, webm, ts "
+                "or another format that FFmpeg reads, or a folder of images"
+            ) from error
+
+    def _stream(self, container: av.container.InputContainer) -> av.video.stream.VideoStream:
+        """The video stream to decode."""
+        if container.format.name in _NO_VIDEOS or container.format.name.endswith("_pipe"):
+            kind = "text" if container.format.name in _NO_VIDEOS[1:] else "a single image"
+            raise InputError(f"{self._name} is {kind}, not a video: give a video or the folder that holds the images")
+        # Cover pictures of sound files are streams too.
+        pictures = av.stream.Disposition.attached_pic | av.stream.Disposition.timed_thumbnails
+        streams = [stream for stream in container.streams.video if not stream.disposition & pictures]
+        if not streams:
+            kinds = sorted({stream.type for stream in container.streams} - {"video"})
+            raise InputError(
+                f"{self._name} holds no video stream, only {' and '.join(kinds) or 'nothing'}: give the file that "
+                "holds the pictures"
+            )
+        best = container.streams.best("video")
+        stream = best if best in streams else streams[0]
+        if stream.codec_context is None:
+            raise InputError(
+                f"{self._name}: its codec {_codec(container, stream.index)} cannot be decoded by the FFmpeg that PyAV "
+                "brings; re-encode it, for example to H.264 mp4"
+            )
+        # Threads within a frame lose nothing when a packet is damaged. With threads over frames, which large pictures
+        # need, the library drops what follows a damaged packet among the last few of the file.
+        if stream.width * stream.height > _LARGE:
+            stream.thread_type = "AUTO"
+        return stream
+
+    def _decode(
+        self, container: av.container.InputContainer, stream: av.video.stream.VideoStream
+    ) -> Iterator[tuple[Damage | None, av.VideoFrame | None]]:
+        """Frames in the order in which they are shown, with what is missing between them."""
+        waiting: list[int] = []
+        failures: deque[str] = deque()
+        self._lead = 0
+        started = False
+        for packet in self._packets(container, stream):
+            if isinstance(packet, str):
+                failures.append(packet)
+                continue
+            # Frames before the first key frame refer to some that are not there: decoders show them grey.
+            started = started or packet.is_keyframe or self._lead == _LONGEST_LEAD or not packet.size
+            if not started:
+                self._lead += 1
+                continue
+            if packet.size and packet.pts is not None and not packet.is_discard:
+                heapq.heappush(waiting, packet.pts)
+                if len(waiting) > _MOST_WAITING:
+                    heapq.heappop(waiting)
+            try:
+                frames = packet.decode()
+            except av.error.EOFError:
+                frames = []
+            except av.FFmpegError as error:
+                frames = []
+                if packet.size and packet.pts is None:
+                    yield Damage(None, str(error.strerror)), None
+                else:
+                    failures.append(str(error.strerror))
+            for frame in frames:
+                if frame.pts is not None:
+                    yield from ((damage, None) for damage in _missing(waiting, failures, frame.pts, stream.time_base))
+                yield None, frame
+        if stream.width * stream.height > _LARGE:
+            failures.extend("cannot be decoded" for _ in waiting[len(failures) :])
+        for reason in failures:
+            stamp = heapq.heappop(waiting) if waiting else None
+            yield Damage(None if stamp is None else float(stamp * stream.time_base), reason), None
+
+    def _packets(
+        self, container: av.container.InputContainer, stream: av.video.stream.VideoStream
+    ) -> Iterator[av.Packet | str]:
+        """Packets, an empty one at the end; a reason where reading fails."""
+        errors = 0
+        while errors < _MOST_READ_ERRORS:
+            try:
+                for packet in container.demux(stream):
+                    yield packet
+                    errors = 0
+                return
+            except av.FFmpegError as error:
+                errors += 1
+                if errors == 1:
+                    yield f"cannot be read: {error.strerror}"
+                if self._timeout is not None:
+                    break
+        # The decoder still holds frames.
+        empty = av.Packet()
+        empty.stream = stream
+        yield empty
+
+    def _notes(self, frame: av.VideoFrame, stream: av.video.stream.VideoStream) -> Iterator[str]:
+        """What the user should know, as far as it shows in the first frame."""
+        if self._lead:
+            yield f"{self._name} begins in the middle: {self._lead} frames before its first key frame are left out"
+        if is_interlaced(frame, stream):
+            yield f"{self._name} is interlaced: its frames are deinterlaced (bwdif), and finest lines lose some detail"
+        if transfer := _HDR_TRANSFERS.get(frame.color_trc):
+            yield (
+                f"{self._name} is HDR ({transfer}): its frames are reduced to 8 bits without tone mapping, which makes "
+                "them look pale; tone-map it beforehand if the result suffers"
+            )
+        ratio = stream.sample_aspect_ratio
+        if ratio and ratio != 1:
+            yield (
+                f"{self._name}: its pixels are not square ({ratio.numerator}:{ratio.denominator}) and are used as they "
+                "are stored; stretch it beforehand with ffmpeg -i INPUT -vf scale=iw*sar:ih,setsar=1 OUTPUT"
+            )
+
+
+def _missing(waiting: list[int], failures: deque[str], shown: int, time_base: Fraction) -> Iterator[Damage]:
+    """The frames before the one with time stamp `shown` that failed; takes all up to it from `waiting`."""
+    while waiting and waiting[0] <= shown:
+        stamp = heapq.heappop(waiting)
+        if stamp < shown and failures:
+            yield Damage(float(stamp * time_base), failures.popleft())
+
+
+def _likely_frames(stated: int, seconds: float | None, rate: Fraction | None) -> int | None:
+    """Number of frames that are shown; an edited file states those as well that it does not show."""
+    by_time = max(1, round(seconds * rate)) if seconds and rate else None
+    edited = stated and by_time is not None and by_time < 0.99 * stated - 2
+    return by_time if edited or not stated else stated
+
+
+def _duration(container: av.container.InputContainer, stream: av.video.stream.VideoStream) -> float | None:
+    """Seconds from the first frame to the end of the last."""
+    if stream.duration:
+        return float(stream.duration * stream.time_base)
+    start = float((stream.start_time or 0) * stream.time_base)
+    if tag := re.fullmatch(r"(\d+):(\d+):(\d+\.?\d*)", stream.metadata.get("DURATION", "")):
+        # Matroska's, counted from the beginning of the file.
+        hours, minutes, seconds = map(float, tag.groups())
+        return max(0.0, 3600 * hours + 60 * minutes + seconds - start) or None
+    if not container.duration or len(container.streams) > 1:
+        return None
+    total = container.duration / av.time_base
+    return total - start if "matroska" in container.format.name else total
+
+
+def _codec(container: av.container.InputContainer, index: int) -> str:
+    """The codec of a stream for which there is no decoder, as FFmpeg names it."""
+    level = av.logging.get_level()
+    # The library tells it in its log only.
+    av.logging.set_level(av.logging.INFO)
+    try:
+        log = container.dumps_format()
+    finally:
+        av.logging.set_level(level)
+    found = re.search(rf"Stream #0:{index}\b[^\n]*Video: ([^,\n]+)", log)
+    return found[1] if found else "(unknown)"

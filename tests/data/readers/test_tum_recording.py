@@ -1,0 +1,90 @@
+"""Own recordings in TUM's form: with or without lists and depth, one or many, resized."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from layouts.timed import STEP
+from layouts.tum_recording import CALIBRATION, LAYOUT, NAME, write
+from room_views import check_views, write_image
+
+from logvggt_jax.data.readers.tum_recording import TUMRecording
+from logvggt_jax.errors import InputError
+
+VIEWS = LAYOUT.views
+ERRORS = {"picture_error": 0.0, "depth_error": LAYOUT.depth_error}
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    write(tmp_path, VIEWS)
+    return tmp_path / NAME
+
+
+def test_folders_without_lists_are_read_by_the_times_in_their_names(recording: Path):
+    for kind in ("rgb", "depth"):
+        (recording / f"{kind}.txt").unlink()
+    frames = TUMRecording(recording.parent).read(NAME, range(5))
+    check_views(frames, VIEWS, **ERRORS)
+
+
+def test_jpeg_pictures_named_by_their_time_are_read(recording: Path):
+    (recording / "rgb.txt").unlink()
+    for path in (recording / "rgb").iterdir():
+        write_image(path.with_suffix(".jpg"), cv2.imread(str(path))[..., ::-1])
+        path.unlink()
+    check_views(TUMRecording(recording.parent).read(NAME, range(5)), VIEWS, **(ERRORS | {"picture_error": 3.0}))
+
+
+def test_the_root_itself_may_be_the_recording(recording: Path, monkeypatch: pytest.MonkeyPatch):
+    check_views(TUMRecording(recording).read(NAME, range(5)), VIEWS, **ERRORS)
+    monkeypatch.chdir(recording)
+    assert TUMRecording(Path()).sequences == (NAME,)
+
+
+def test_recordings_beside_each_other_may_share_a_calibration(recording: Path):
+    root = recording.parent
+    (recording / "calibration.txt").rename(root / "calibration.txt")
+    write(root / "other", VIEWS)
+    (root / "other" / NAME).rename(root / "sofa")
+    (root / "notes").mkdir()
+    dataset = TUMRecording(root)
+    assert dataset.sequences == (NAME, "sofa")
+    for name in dataset.sequences:
+        check_views(dataset.read(name, range(5)), VIEWS, **ERRORS)
+
+
+def test_without_depth_frames_count_and_have_none(recording: Path):
+    (recording / "depth.txt").unlink()
+    (recording / "depth").rename(recording / "unused")
+    frames = TUMRecording(recording.parent).read(NAME, range(5))
+    assert len(frames.images) == 5 and not frames.depth.any()
+
+
+def test_the_scale_of_depth_is_the_calibrations(recording: Path):
+    (recording / "calibration.txt").write_text(f"{CALIBRATION}depth_scale {1 / STEP / 2}  # half a step\n")
+    frames = TUMRecording(recording.parent).read(NAME, [0])
+    np.testing.assert_allclose(frames.depth[0], 2 * VIEWS[0].depth, atol=2 * LAYOUT.depth_error)
+
+
+def test_intrinsics_follow_resized_pictures_and_refuse_other_shapes(recording: Path):
+    path = recording / "calibration.txt"
+    path.write_text("width 128\nheight 96\nfx 110\nfy 110\ncx 62\ncy 49.5\n")
+    # c' = (c + 0.5) / 2 - 0.5.
+    expected = [[55, 0, 30.75], [0, 55, 24.5], [0, 0, 1]]
+    np.testing.assert_allclose(TUMRecording(recording.parent).read(NAME, [0]).intrinsics[0], expected, rtol=1e-6)
+    path.write_text("width 96\nheight 128\nfx 110\nfy 110\ncx 47\ncy 60\n")
+    with pytest.raises(InputError, match=r"does not have the shape of its calibration .*calibration\.txt"):
+        TUMRecording(recording.parent).read(NAME, [0])
+
+
+@pytest.mark.parametrize("time", ["nan", "inf", "1e300"])
+@pytest.mark.parametrize("table", ["rgb", "depth", "groundtruth"])
+def test_times_that_are_none_are_named(recording: Path, table: str, time: str):
+    path = recording / f"{table}.txt"
+    lines = path.read_text().splitlines()
+    lines[2] = " ".join([time, *lines[2].split()[1:]])
+    path.write_text("\n".join(lines))
+    with pytest.raises(InputError, match=rf"{table}\.txt, line 3: expected a time in seconds"):
+        TUMRecording(recording.parent).num_frames(NAME)

@@ -1,0 +1,850 @@
+"""Videos give upright, whole pictures with the file's own times, and what cannot be decoded is named."""
+
+from __future__ import annotations
+
+import http.server
+import os
+import socket
+import sys
+import threading
+from collections.abc import Iterator, Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from logvggt_jax.errors import InputError
+from logvggt_jax.reconstruction.sources import (
+    SourceFrame,
+    SourceOptions,
+    VideoSource,
+    open_source,
+    pyav_decoder,
+    video,
+)
+from logvggt_jax.reconstruction.sources.sampling import FrameClock, expected_frames
+
+HEIGHT, WIDTH = 48, 64
+COLOURS = np.array([[[230, 30, 30], [30, 200, 30]], [[30, 30, 230], [220, 220, 60]]], np.uint8)
+
+
+@pytest.fixture(params=["pyav", "opencv"])
+def library(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Each library that may decode: OpenCV does where PyAV is not installed."""
+    if request.param == "opencv":
+        monkeypatch.setitem(sys.modules, "av", None)
+    return request.param
+
+
+@pytest.fixture
+def opencv_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "av", None)
+
+
+def quarters(height: int = HEIGHT, width: int = WIDTH) -> np.ndarray:
+    """Red and green above blue and yellow."""
+    return np.repeat(np.repeat(COLOURS, height // 2, 0), width // 2, 1)
+
+
+def grey(index: int, height: int = HEIGHT, width: int = WIDTH) -> np.ndarray:
+    return np.full((height, width, 3), 40 + 8 * index, np.uint8)
+
+
+def busy(index: int) -> np.ndarray:
+    """A picture that takes some bytes to encode."""
+    noise = np.random.default_rng(index).integers(0, 256, (HEIGHT // 8, WIDTH // 8, 3), np.uint8)
+    return np.repeat(np.repeat(noise, 8, 0), 8, 1)
+
+
+def write(
+    path: Path,
+    images: Sequence[np.ndarray],
+    *,
+    codec: str = "libx264",
+    pixels: str = "yuv420p",
+    rate: int = 10,
+    stamps: Sequence[int] | None = None,
+    options: dict[str, str] | None = None,
+    turned: tuple[float, bool] | None = None,
+    context: dict[str, Any] | None = None,
+    source_pixels: dict[str, Any] | None = None,
+) -> Path:
+    """Encodes images; `stamps` are presentation times in units of 1 / rate, `turned` is (degrees, mirrored)."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=rate, options=options or {})
+        stream.height, stream.width = images[0].shape[:2]
+        stream.pix_fmt = pixels
+        for name, value in (context or {}).items():
+            setattr(stream.codec_context, name, value)
+        if turned is not None:
+            stream.set_display_rotation(turned[0], hflip=turned[1])
+        for index, image in enumerate(images):
+            frame = av.VideoFrame.from_ndarray(image, "rgb24").reformat(format=pixels, **(source_pixels or {}))
+            frame.pts, frame.time_base = index if stamps is None else stamps[index], Fraction(1, rate)
+            for name in {"color_trc"} & (context or {}).keys():
+                setattr(frame, name, context[name])
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    return path
+
+
+def packets(path: Path) -> list[tuple[int, int, int]]:
+    """(position in the file, size, presentation time) of the packets, as they are stored."""
+    with av.open(str(path)) as container:
+        return [(p.pos, p.size, p.pts) for p in container.demux(video=0) if p.size]
+
+
+def damage(path: Path, numbers: Sequence[int]) -> Path:
+    """Overwrites packets."""
+    content = bytearray(path.read_bytes())
+    for number in numbers:
+        position, size, _ = packets(path)[number]
+        content[position : position + size] = b"\xff" * size
+    path.write_bytes(content)
+    return path
+
+
+def times(frames: Sequence[SourceFrame]) -> list[float]:
+    return [frame.timestamp for frame in frames]
+
+
+def names(frames: Sequence[SourceFrame]) -> list[int]:
+    return [int(frame.name.removeprefix("frame-")) for frame in frames]
+
+
+def corners(image: np.ndarray) -> np.ndarray:
+    height, width = image.shape[:2]
+    return image[height // 4 :: height // 2, width // 4 :: width // 2].astype(int)
+
+
+# ---- order, names, times -------------------------------------------------------------------------------------------
+
+
+def test_frames_come_in_order_with_names_and_times(tmp_path: Path, library: str) -> None:
+    # With B-frames, which are stored in another order than shown.
+    path = write(tmp_path / "clip.mp4", [grey(i) for i in range(12)], options={"bf": "2"})
+    source = open_source(path)
+    assert isinstance(source, VideoSource)
+    assert source.expected_frames == 12
+    assert source.image_size == (HEIGHT, WIDTH)
+    assert not hasattr(source, "__len__")
+    frames = list(source)
+    assert [frame.name for frame in frames] == [f"frame-{i:06d}" for i in range(12)]
+    np.testing.assert_allclose(times(frames), np.arange(12) / 10, atol=1e-6)
+    assert np.abs([frame.image.mean() - 40 - 8 * i for i, frame in enumerate(frames)]).max() < 4
+    assert frames[0].image.dtype == np.uint8
+    # Every iteration begins anew.
+    assert len(list(source)) == 12
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "mkv"])
+def test_times_are_those_of_the_file(tmp_path: Path, library: str, suffix: str) -> None:
+    stamps = [0, 1, 2, 3, 9, 13, 30, 31]
+    path = write(tmp_path / f"paused.{suffix}", [grey(i) for i in range(8)], stamps=stamps)
+    frames = list(open_source(path))
+    np.testing.assert_allclose(times(frames), np.array(stamps) / 10, atol=1e-3)
+    np.testing.assert_allclose(times(list(open_source(path, stride=3))), np.array(stamps[::3]) / 10, atol=1e-3)
+
+
+def test_a_late_start_is_time_zero_and_no_early_end(tmp_path: Path, library: str) -> None:
+    path = write(tmp_path / "late.mkv", [grey(i) for i in range(12)], stamps=range(15, 27))
+    source = open_source(path)
+    np.testing.assert_allclose(times(list(source)), np.arange(12) / 10, atol=1e-3)
+    if library == "pyav":
+        assert source.expected_frames == 12
+
+
+def test_gif_keeps_its_own_durations(tmp_path: Path, library: str) -> None:
+    path = write(tmp_path / "a.gif", [grey(3 * i) for i in range(4)], codec="gif", pixels="rgb8", stamps=[0, 1, 5, 7])
+    np.testing.assert_allclose(times(list(open_source(path))), [0, 0.1, 0.5, 0.7], atol=1e-3)
+
+
+def test_a_stream_without_times_is_counted(tmp_path: Path) -> None:
+    path = write(tmp_path / "raw.h264", [grey(i) for i in range(5)])
+    seconds = times(list(open_source(path)))
+    assert len(seconds) == 5
+    np.testing.assert_allclose(np.diff(seconds), seconds[1])
+    assert seconds[1] > 0
+
+
+def test_joined_recordings_go_on_in_time(tmp_path: Path) -> None:
+    one = write(tmp_path / "one.ts", [grey(i) for i in range(8)])
+    path = tmp_path / "joined.ts"
+    path.write_bytes(one.read_bytes() * 2)
+    np.testing.assert_allclose(times(list(open_source(path))), np.arange(16) / 10, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("stamps", "expected"),
+    [
+        ([5.0, 5.1, 5.2], [0, 0.1, 0.2]),
+        ([None, None, None], [0, 0.1, 0.2]),
+        ([None, 7.0, 7.1], [0, 0.1, 0.2]),
+        ([0, 0.1, None, 0.35], [0, 0.1, 0.2, 0.35]),
+        # Twice the same, and a little out of order.
+        ([0, 0.1, 0.1, 0.3], [0, 0.1, 0.15, 0.3]),
+        ([0, 0.2, 0.1, 0.4], [0, 0.2, 0.25, 0.4]),
+        # The clock begins anew; one wrong time stamp among right ones.
+        ([9, 9.1, 9.2, 9.3, 9.4, 2, 2.1, 2.3], [0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8]),
+        ([9, 9.1, 9.2, 9.3, 9.4, 0, 9.6, 9.7], [0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7]),
+    ],
+)
+def test_times_increase_whatever_the_file_says(stamps: list[float | None], expected: list[float]) -> None:
+    clock = FrameClock(10.0)
+    seconds = [clock.time(stamp) for stamp in stamps]
+    np.testing.assert_allclose(seconds, expected, atol=1e-9)
+    assert (np.diff(seconds) > 0).all()
+
+
+# ---- which frames are taken ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "positions"),
+    [
+        ({"stride": 5, "max_frames": 2}, [0, 5]),
+        ({"fps": 5}, range(0, 30, 2)),
+        ({"fps": 100}, range(30)),
+        ({"fps": 4}, [0, 3, 5, 8, 10, 13, 15, 18, 20, 23, 25, 28]),
+        ({"start": 1.0}, range(10, 30)),
+        ({"end": 0.5}, range(5)),
+        ({"start": 0.35, "end": 1.2}, range(4, 12)),
+        ({"start": 1.0, "end": 2.5, "fps": 2}, [10, 15, 20]),
+        ({"stride": 3, "start": 1.0, "end": 2.0}, [12, 15, 18]),
+        ({"stride": 2, "fps": 3, "max_frames": 4}, [0, 4, 8, 10]),
+    ],
+)
+def test_frames_are_chosen_by_position_and_time(
+    tmp_path: Path, library: str, options: dict[str, Any], positions: Sequence[int]
+) -> None:
+    source = open_source(write(tmp_path / "clip.mp4", [grey(0)] * 30), **options)
+    frames = list(source)
+    assert names(frames) == list(positions)
+    np.testing.assert_allclose(times(frames), np.array(positions) / 10, atol=1e-6)
+    assert source.expected_frames == len(frames)
+
+
+def test_a_rate_is_held_where_the_distances_vary(tmp_path: Path, library: str) -> None:
+    stamps = [0, 1, 2, 3, 4, 5, 20, 40, 41, 42, 43, 44, 60]
+    path = write(tmp_path / "vfr.mkv", [grey(0)] * len(stamps), stamps=stamps, rate=30)
+    seconds = np.array(times(list(open_source(path, fps=10))))
+    np.testing.assert_allclose(seconds * 30, [0, 3, 20, 40, 42, 60], atol=0.05)
+
+
+def test_expected_numbers() -> None:
+    assert expected_frames(SourceOptions(), None, 30.0) is None
+    assert expected_frames(SourceOptions(max_frames=7), None, None) == 7
+    assert expected_frames(SourceOptions(stride=4), 10, None) == 3
+    assert expected_frames(SourceOptions(start=100.0), 30, 10.0) == 0
+
+
+@pytest.mark.parametrize("options", [{}, {"stride": 3}, {"fps": 3, "start": 0.4}])
+def test_a_tail_is_the_same_as_that_of_all(tmp_path: Path, library: str, options: dict[str, Any]) -> None:
+    path = write(tmp_path / "clip.mp4", [busy(i) for i in range(24)], options={"bf": "2", "g": "12"})
+    path = damage(path, [16])
+    source = open_source(path, **options)
+    complete = list(source)
+    skipped = list(source.skipped)
+    for first in (0, 1, 3, len(complete)):
+        tail = [load() for load in source.loaders(first)]
+        assert len(tail) == len(complete) - first
+        for frame, expected in zip(tail, complete[first:], strict=True):
+            assert frame[:2] == expected[:2]
+            np.testing.assert_array_equal(frame.image, expected.image)
+        assert source.skipped == skipped
+
+
+def test_another_library_gives_another_fingerprint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write(tmp_path / "clip.mp4", [grey(i) for i in range(4)])
+    first = open_source(path).fingerprint(2)
+    assert open_source(path, max_frames=3).fingerprint(2) == first
+    assert open_source(path, stride=2).fingerprint(2) != first
+    monkeypatch.setitem(sys.modules, "av", None)
+    assert open_source(path).fingerprint(2) != first
+
+
+def test_a_tail_converts_nothing_before_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = open_source(write(tmp_path / "clip.mp4", [grey(i) for i in range(8)]))
+    converted = []
+    original = source._frame
+    monkeypatch.setattr(source, "_frame", lambda name, *rest: converted.append(name) or original(name, *rest))
+    assert [load().name for load in source.loaders(6)] == converted == ["frame-000006", "frame-000007"]
+
+
+def test_no_frame_where_the_options_ask_for_it(tmp_path: Path, library: str) -> None:
+    path = write(tmp_path / "clip.mp4", [grey(i) for i in range(8)])
+    with pytest.raises(InputError, match=r"clip\.mp4 (lasts 0\.8 s, but start is 9 s|gave no frame between 9 s)"):
+        list(open_source(path, start=9))
+
+
+# ---- pictures ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("degrees", [0, 90, 180, 270])
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_pictures_are_upright(tmp_path: Path, library: str, degrees: int, mirrored: bool) -> None:
+    if mirrored and library == "opencv":
+        assert "mirroring" in open_source(write(tmp_path / "a.mp4", [quarters()] * 2)).notes[0]
+        return
+    path = write(tmp_path / "turned.mp4", [quarters()] * 2, turned=(degrees, mirrored))
+    expected = np.rot90(quarters(), degrees // 90)
+    if mirrored:
+        expected = expected[:, ::-1]
+    source = open_source(path)
+    image = next(iter(source)).image
+    assert source.image_size == image.shape[:2] == expected.shape[:2]
+    np.testing.assert_allclose(corners(image), corners(expected), atol=12)
+
+
+@pytest.mark.parametrize("degrees", [90, 180, 270])
+def test_pictures_are_upright_by_a_tag(tmp_path: Path, degrees: int) -> None:
+    path = write(tmp_path / "plain.mkv", [quarters()] * 2)
+    tagged = tmp_path / "tagged.mkv"
+    with av.open(str(path)) as container, av.open(str(tagged), "w") as output:
+        stream = output.add_stream_from_template(container.streams.video[0])
+        stream.metadata["rotate"] = str(degrees)
+        for packet in container.demux(video=0):
+            if packet.size:
+                packet.stream = stream
+                output.mux(packet)
+    image = next(iter(open_source(tagged))).image
+    np.testing.assert_allclose(corners(image), corners(np.rot90(quarters(), -degrees // 90)), atol=12)
+
+
+def interlaced(count: int) -> list[np.ndarray]:
+    """A bright bar that moves from field to field."""
+    images = []
+    for index in range(count):
+        image = np.full((HEIGHT, WIDTH, 3), 60, np.uint8)
+        for field in (0, 1):
+            left = 4 * (2 * index + field)
+            image[field::2, left : left + 16] = 200
+        images.append(image)
+    return images
+
+
+def combing(image: np.ndarray) -> float:
+    """How much neighbouring lines differ beyond those two apart."""
+    lines = image[..., 1].astype(float)
+    return float(np.abs(lines[1:-1] - (lines[:-2] + lines[2:]) / 2).mean() - np.abs(lines[:-2] - lines[2:]).mean() / 2)
+
+
+INTERLACED: dict[str, dict[str, Any]] = {
+    "h264.mp4": {"codec": "libx264", "options": {"flags": "+ildct+ilme", "x264-params": "tff=1"}},
+    "mpeg2.ts": {"codec": "mpeg2video", "options": {"flags": "+ildct+ilme", "b": "2000k"}},
+    "prores.mov": {"codec": "prores_ks", "pixels": "yuv422p10le", "options": {"flags": "+ildct"}},
+    "raw.mov": {"codec": "rawvideo", "pixels": "uyvy422"},
+    # Only their headers tell.
+    "mjpeg.mkv": {"codec": "mjpeg", "pixels": "yuvj422p"},
+    "png.mov": {"codec": "png", "pixels": "rgb24"},
+}
+
+
+@pytest.mark.parametrize("name", INTERLACED)
+def test_interlaced_pictures_are_made_whole(tmp_path: Path, name: str) -> None:
+    images = interlaced(6)
+    path = write(tmp_path / name, images, context={"field_order": 2}, **INTERLACED[name])
+    source = open_source(path)
+    assert any("deinterlaced" in note for note in source.notes)
+    frames = list(source)
+    np.testing.assert_allclose(times(frames), np.arange(6) / 10, atol=1e-3)
+    for frame, image in zip(frames, images, strict=True):
+        assert combing(image) > 10
+        assert combing(frame.image) < 0.3 * combing(image)
+        # It is the picture: the bar of the first or second field on the background.
+        np.testing.assert_allclose(frame.image.mean(), image.mean(), atol=6)
+    tail = [load() for load in source.loaders(4)]
+    np.testing.assert_array_equal(tail[0].image, frames[4].image)
+
+
+def test_frames_that_stay_the_same_are_taken_by_opencv(tmp_path: Path, opencv_only: None) -> None:
+    path = write(tmp_path / "still.avi", [grey(0)] * 5, codec="huffyuv", pixels="yuv422p")
+    assert len(list(open_source(path))) == 5
+
+
+def test_a_damaged_duration_is_no_duration(tmp_path: Path) -> None:
+    path = write(tmp_path / "clip.mkv", [grey(i) for i in range(5)])
+    path.write_bytes(path.read_bytes().replace(b"00:00:00.5", b"00:0?:0x.5"))
+    assert len(list(open_source(path))) == 5
+
+
+def test_opencv_refuses_interlaced_pictures(tmp_path: Path, opencv_only: None) -> None:
+    path = write(tmp_path / "tv.mp4", interlaced(4), context={"field_order": 2}, **INTERLACED["h264.mp4"])
+    with pytest.raises(InputError, match=r"tv\.mp4 is interlaced.*logvggt-jax\[video\].*ffmpeg -i"):
+        open_source(path)
+
+
+def test_an_interlaced_part_after_progressive_frames(tmp_path: Path, library: str) -> None:
+    one = write(tmp_path / "one.ts", [grey(i) for i in range(4)], options={"g": "4"})
+    two = write(
+        tmp_path / "two.ts", interlaced(4), context={"field_order": 2}, **INTERLACED["h264.mp4"], stamps=range(4, 8)
+    )
+    path = tmp_path / "both.ts"
+    path.write_bytes(one.read_bytes() + two.read_bytes())
+    source = open_source(path)
+    if library == "opencv":
+        with pytest.raises(InputError, match=r"both\.ts is interlaced"):
+            list(source)
+        return
+    frames = list(source)
+    assert len(frames) == 8
+    assert max(combing(frame.image) for frame in frames) < 0.3 * combing(interlaced(4)[1])
+
+
+@pytest.mark.parametrize("stride", [1, 3])
+def test_a_change_of_size_is_noticed(tmp_path: Path, stride: int) -> None:
+    one = write(tmp_path / "one.ts", [grey(i) for i in range(6)])
+    two = write(tmp_path / "two.ts", [grey(i, WIDTH, HEIGHT) for i in range(6)], stamps=range(6, 12))
+    path = tmp_path / "both.ts"
+    path.write_bytes(one.read_bytes() + two.read_bytes())
+    frames = iter(open_source(path, stride=stride))
+    for _ in range(0, 6, stride):
+        next(frames)
+    with pytest.raises(InputError, match=r"both\.ts: frame 6 is 48 x 64 pixels but the video begins with 64 x 48"):
+        next(frames)
+    assert len(list(open_source(path, end=0.55))) == 6
+
+
+def test_a_change_of_pixel_format_is_converted(tmp_path: Path) -> None:
+    one = write(tmp_path / "one.ts", [quarters()] * 4)
+    two = write(tmp_path / "two.ts", [quarters()] * 4, pixels="yuv444p", stamps=range(4, 8))
+    path = tmp_path / "both.ts"
+    path.write_bytes(one.read_bytes() + two.read_bytes())
+    frames = list(open_source(path))
+    assert len(frames) == 8
+    for frame in frames:
+        np.testing.assert_allclose(corners(frame.image), corners(quarters()), atol=12)
+
+
+COLOUR_FORMATS: dict[str, dict[str, Any]] = {
+    "bt601.mp4": {},
+    "full.mp4": {"pixels": "yuvj420p", "source_pixels": {"dst_color_range": 2}, "context": {"color_range": 2}},
+    "bt709.mp4": {"source_pixels": {"dst_colorspace": 1}, "context": {"colorspace": 1}},
+    "bt709full.mp4": {
+        "source_pixels": {"dst_colorspace": 1, "dst_color_range": 2},
+        "context": {"colorspace": 1, "color_range": 2},
+    },
+    "10bit.mp4": {"pixels": "yuv420p10le"},
+    "16bit.mkv": {"codec": "ffv1", "pixels": "yuv444p16le"},
+    "rgba.mkv": {"codec": "ffv1", "pixels": "bgra"},
+    "hevc10.mkv": {"codec": "libx265", "pixels": "yuv420p10le", "options": {"x265-params": "log-level=none"}},
+    "vp9.webm": {"codec": "libvpx-vp9"},
+    "mjpeg.avi": {"codec": "mjpeg", "pixels": "yuvj420p", "source_pixels": {"dst_color_range": 2}},
+    "mpeg4.avi": {"codec": "mpeg4"},
+}
+
+
+@pytest.mark.parametrize("name", COLOUR_FORMATS)
+def test_colours_are_right(tmp_path: Path, library: str, name: str) -> None:
+    image = next(iter(open_source(write(tmp_path / name, [quarters()] * 2, **COLOUR_FORMATS[name])))).image
+    np.testing.assert_allclose(corners(image), corners(quarters()), atol=12)
+
+
+@pytest.mark.parametrize(("transfer", "called"), [(16, "PQ"), (18, "HLG")])
+def test_hdr_is_told(tmp_path: Path, transfer: int, called: str) -> None:
+    path = write(
+        tmp_path / "hdr.mkv",
+        [quarters()] * 2,
+        codec="libx265",
+        pixels="yuv420p10le",
+        options={"x265-params": "log-level=none"},
+        context={"colorspace": 9, "color_trc": transfer, "color_primaries": 9},
+        source_pixels={"dst_colorspace": 9},
+    )
+    source = open_source(path)
+    assert [note for note in source.notes if f"HDR ({called})" in note and "without tone mapping" in note]
+    np.testing.assert_allclose(corners(next(iter(source)).image), corners(quarters()), atol=12)
+
+
+def test_pixels_that_are_not_square_are_told(tmp_path: Path) -> None:
+    path = write(tmp_path / "wide.mp4", [grey(0)] * 2, context={"sample_aspect_ratio": Fraction(4, 3)})
+    assert any("not square (4:3)" in note for note in open_source(path).notes)
+
+
+def test_loaders_may_be_called_in_any_order(tmp_path: Path, library: str) -> None:
+    source = open_source(write(tmp_path / "clip.mp4", [busy(i) for i in range(6)]))
+    loaders = list(source.loaders())
+    loaded = [load() for load in reversed(loaders)][::-1]
+    for frame, expected in zip(loaded, source, strict=True):
+        assert frame[:2] == expected[:2]
+        np.testing.assert_array_equal(frame.image, expected.image)
+
+
+# ---- damage --------------------------------------------------------------------------------------------------------
+
+
+def damaged(path: Path, numbers: Sequence[int], count: int = 24) -> tuple[Path, list[str]]:
+    """A video in which the packets of these numbers are overwritten, and the names of their frames."""
+    write(path, [busy(i) for i in range(count)], options={"bf": "2", "g": "12", "refs": "1"})
+    stamps = [stamp for _, _, stamp in packets(path)]
+    broken = sorted(sorted(stamps).index(stamps[number]) for number in numbers)
+    return damage(path, numbers), [f"frame-{position:06d}" for position in broken]
+
+
+def test_damaged_packets_are_skipped_and_named(tmp_path: Path, library: str) -> None:
+    path, broken = damaged(tmp_path / "noise.mp4", [7, 15])
+    source = open_source(path)
+    frames = list(source)
+    assert [frame.name for frame in source.skipped] == broken
+    assert all(frame.reason for frame in source.skipped)
+    assert sorted([*broken, *(frame.name for frame in frames)]) == [f"frame-{i:06d}" for i in range(24)]
+    np.testing.assert_allclose(times(frames), np.array(names(frames)) / 10, atol=1e-6)
+
+
+def test_damage_to_a_stream_without_times_is_named_where_it_is(tmp_path: Path) -> None:
+    path = write(tmp_path / "raw.h264", [busy(i) for i in range(12)], options={"bf": "0", "x264-params": "threads=1"})
+    content = bytearray(path.read_bytes())
+    position, size, stamp = packets(path)[5]
+    assert stamp is None
+    # The start code, by which packets are told apart, stays.
+    content[position + 5 : position + size] = b"\xff" * (size - 5)
+    path.write_bytes(content)
+    source = open_source(path)
+    assert names(list(source)) == [0, 1, 2, 3, 4, *range(6, 12)]
+    assert [frame.name for frame in source.skipped] == ["frame-000005"]
+
+
+@pytest.mark.parametrize("numbers", [[7, 15], [21], [22, 23]])
+def test_damage_to_large_videos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, numbers: list[int]) -> None:
+    # Decoded by several threads, which the library stops early if one of the last packets is damaged.
+    monkeypatch.setattr(pyav_decoder, "_LARGE", 0)
+    path, _ = damaged(tmp_path / "noise.mp4", numbers)
+    source = open_source(path, most_broken=1.0)
+    frames = list(source)
+    assert len(frames) + len(source.skipped) == 24
+    assert len(source.skipped) >= len(numbers)
+    np.testing.assert_allclose(times(frames), np.array(names(frames)) / 10, atol=1e-6)
+
+
+def test_the_first_damaged_frame_is_an_error_when_strict(tmp_path: Path, library: str) -> None:
+    path, broken = damaged(tmp_path / "noise.mp4", [7, 15])
+    frames = iter(open_source(path, strict=True))
+    with pytest.raises(InputError, match=rf"noise\.mp4: {broken[0]} cannot be decoded"):
+        list(frames)
+
+
+def test_too_much_damage_is_an_error(tmp_path: Path, library: str) -> None:
+    path, _ = damaged(tmp_path / "noise.mp4", [7, 10, 15])
+    with pytest.raises(InputError, match=r"noise\.mp4: 3 of 24 frames cannot be decoded.* more than 5%"):
+        list(open_source(path))
+    source = open_source(path, most_broken=0.2)
+    assert len(list(source)) == 21
+    assert len(source.skipped) == 3
+
+
+def test_nothing_that_can_be_decoded(tmp_path: Path, library: str) -> None:
+    path, _ = damaged(tmp_path / "noise.mp4", range(24))
+    with pytest.raises(InputError, match=r"noise\.mp4 holds no frame that"):
+        open_source(path)
+
+
+def test_a_video_cut_short_says_so(tmp_path: Path, library: str) -> None:
+    path = write(tmp_path / "whole.mp4", [busy(i) for i in range(24)])
+    # The index stands at the front.
+    moved = tmp_path / "cut.mp4"
+    with av.open(str(path)) as container, av.open(str(moved), "w", options={"movflags": "faststart"}) as output:
+        stream = output.add_stream_from_template(container.streams.video[0])
+        for packet in container.demux(video=0):
+            if packet.size:
+                packet.stream = stream
+                output.mux(packet)
+    position = packets(moved)[12][0]
+    moved.write_bytes(moved.read_bytes()[:position])
+    source = open_source(moved, most_broken=1.0)
+    with pytest.warns(UserWarning, match=r"ends early: 1\d frames decoded, its header announces 24"):
+        frames = list(source)
+    assert 10 <= len(frames) <= 13
+    # Who asks for the first frames only misses none.
+    assert len(list(open_source(moved, max_frames=5))) == 5
+
+
+def test_an_edited_video_is_whole(tmp_path: Path) -> None:
+    path = write(tmp_path / "edited.mp4", [grey(i) for i in range(24)], options={"g": "8", "bf": "0"})
+    content = bytearray(path.read_bytes())
+    # Its edit list shows the second half: duration and first time stamp, here in 1 / 1000 and 1 / 10240 s.
+    place = content.index(b"elst") + 12
+    with av.open(str(path)) as container:
+        second = round(1 / container.streams.video[0].time_base)
+    content[place : place + 8] = (1200).to_bytes(4, "big") + second.to_bytes(4, "big")
+    path.write_bytes(content)
+    source = open_source(path)
+    frames = list(source)
+    assert source.expected_frames == len(frames) == 12
+    assert abs(frames[0].image.mean() - 40 - 8 * 10) < 10
+
+
+def test_a_matroska_video_cut_short_says_so(tmp_path: Path) -> None:
+    path = write(tmp_path / "cut.mkv", [busy(i) for i in range(24)])
+    path.write_bytes(path.read_bytes()[: packets(path)[12][0]])
+    with pytest.warns(UserWarning, match=r"ends early: 1\.\d+ s decoded, its header announces 2\.4 s"):
+        assert len(list(open_source(path, most_broken=1.0))) >= 10
+
+
+def test_a_recording_that_begins_in_the_middle(tmp_path: Path) -> None:
+    path = write(tmp_path / "whole.ts", [busy(i) for i in range(24)], codec="mpeg2video", options={"g": "12"})
+    cut = tmp_path / "cut.ts"
+    content = path.read_bytes()
+    # The second frame refers to the first, which is missing; what stands in front of it describes the stream.
+    cut.write_bytes(content[: 3 * 188] + content[packets(path)[3][0] // 188 * 188 :])
+    source = open_source(cut)
+    assert any("begins in the middle" in note for note in source.notes)
+    frames = list(source)
+    assert len(frames) == 12
+    for frame, expected in zip(frames, list(open_source(path))[12:], strict=True):
+        np.testing.assert_array_equal(frame.image, expected.image)
+
+
+def test_the_library_prints_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    path, _ = damaged(tmp_path / "noise.mp4", [7, 15])
+    list(open_source(path))
+    assert capfd.readouterr() == ("", "")
+
+
+# ---- what is no video ----------------------------------------------------------------------------------------------
+
+
+def without_index(path: Path) -> None:
+    write(path, [grey(0)] * 3)
+    path.write_bytes(path.read_bytes().replace(b"moov", b"free"))
+
+
+def audio_only(path: Path) -> None:
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("aac", rate=44100)
+        for index in range(3):
+            frame = av.AudioFrame.from_ndarray(np.zeros((2, 1024), np.float32), "fltp", "stereo")
+            frame.rate, frame.pts = 44100, 1024 * index
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+
+
+def unknown_codec(path: Path) -> None:
+    write(path, [grey(0)] * 3)
+    path.write_bytes(path.read_bytes().replace(b"avc1", b"zzz1"))
+
+
+def picture(path: Path) -> None:
+    path.write_bytes(cv2.imencode(".png", quarters())[1].tobytes())
+
+
+REFUSED = {
+    "empty.mp4": (lambda path: path.touch(), "is empty"),
+    "text.mp4": (lambda path: path.write_text("no video\n" * 99), "cannot be opened as a video"),
+    "noise.mp4": (lambda path: path.write_bytes(np.random.default_rng(0).bytes(9999)), "cannot be opened as a video"),
+    "text.txt": (lambda path: path.write_text("no video\n" * 99), "is text"),
+    "index.mp4": (without_index, "lacks its index"),
+    "sound.m4a": (audio_only, "no video stream, only audio|cannot be opened as a video"),
+    "codec.mp4": (unknown_codec, "codec.*zzz1|cannot be opened as a video"),
+    "image.mp4": (picture, "is a single image"),
+    "fifo.mp4": (os.mkfifo, "neither a file nor a folder"),
+    "loop.mp4": (lambda path: path.symlink_to(path), "symbolic links"),
+    "locked.mp4": (lambda path: path.touch(0o000), "is empty|Permission denied"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_is_no_video_is_refused_in_one_line(tmp_path: Path, library: str, name: str) -> None:
+    make, message = REFUSED[name]
+    make(tmp_path / name)
+    with pytest.raises(InputError, match=message) as caught:
+        open_source(tmp_path / name)
+    assert str(tmp_path / name) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("path", ["nul\0.mp4", "~no_such_user_here/clip.mp4"])
+def test_what_is_no_path_is_refused(path: str) -> None:
+    with pytest.raises(InputError, match="is no path"):
+        open_source(path)
+
+
+@pytest.mark.parametrize("name", ["a:b.mp4", "100%d.mp4", "übung 漢字.mp4", "-i.mp4", "file:x.mp4", "q?x=1#y.mp4"])
+def test_names_are_taken_as_they_are(tmp_path: Path, library: str, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    write(tmp_path / "clip.mp4", [grey(i) for i in range(3)]).rename(tmp_path / name)
+    monkeypatch.chdir(tmp_path)
+    assert len(list(open_source(name))) == 3
+
+
+def test_a_name_that_is_no_unicode(tmp_path: Path, library: str) -> None:
+    path = tmp_path / os.fsdecode(b"caf\xe9.mp4")
+    write(tmp_path / "clip.mp4", [grey(i) for i in range(3)]).rename(path)
+    if library == "opencv":
+        with pytest.raises(InputError, match="rename it"):
+            open_source(path)
+    else:
+        source = open_source(path)
+        assert len(list(source)) == 3
+        assert source.fingerprint(3) == source.fingerprint(3)
+
+
+# ---- cameras and streams -------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def address(tmp_path: Path) -> Iterator[str]:
+    """Of a server for the files of `tmp_path`; of `cut.ts` it sends one half of what it announces."""
+
+    class Handler(http.server.SimpleHTTPRequestHandler):
+        def __init__(self, *arguments: Any) -> None:
+            super().__init__(*arguments, directory=str(tmp_path))
+
+        def do_GET(self) -> None:
+            if self.path != "/cut.ts":
+                return super().do_GET()
+            content = (tmp_path / "cut.ts").read_bytes()
+            self.send_response(200)
+            self.send_header("Content-Length", str(len(content)))
+            self.end_headers()
+            self.wfile.write(content[: len(content) // 2])
+            return None
+
+        def log_message(self, *arguments: object) -> None:
+            pass
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+        thread.join()
+
+
+def test_a_stream_is_opened_when_it_is_read(tmp_path: Path, library: str, address: str) -> None:
+    source = open_source(f"{address}/clip.mp4", stride=2)
+    assert isinstance(source, VideoSource)
+    assert source.expected_frames is None
+    assert source.image_size is None
+    assert source.fingerprint(3) != source.fingerprint(3)
+    # It exists only now.
+    write(tmp_path / "clip.mp4", [grey(i) for i in range(6)])
+    frames = list(source)
+    assert names(frames) == [0, 2, 4]
+    assert frames[0].image.shape == (HEIGHT, WIDTH, 3)
+
+
+def test_what_a_stream_gave_before_it_broke_off_is_taken(tmp_path: Path, library: str, address: str) -> None:
+    write(tmp_path / "cut.ts", [busy(i) for i in range(12)], options={"g": "4"})
+    # A path keeps one slash of an address.
+    source = open_source(Path(f"{address}/cut.ts"))
+    frames = list(source)
+    assert 3 <= len(frames) <= 8
+    if library == "pyav":
+        assert "cannot be read" in source.skipped[0].reason
+
+
+def test_a_stream_that_cannot_be_reached(library: str, address: str) -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        closed = free.getsockname()[1]
+    for url in (f"rtsp://me:secret@127.0.0.1:{closed}/live", f"{address}/nothing.mp4"):
+        source = open_source(url)
+        with pytest.raises(InputError, match=r"//127\.0\.0\.1:\d+/\S+ cannot be opened .*check address") as caught:
+            list(source)
+        assert "secret" not in str(caught.value)
+
+
+def test_a_stream_that_says_nothing_is_given_up(library: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(video, "_TIMEOUT", 0.5)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        source = open_source(f"http://127.0.0.1:{silent.getsockname()[1]}/live")
+        with pytest.raises(InputError, match=r"0\.5 s"):
+            list(source)
+
+
+def test_digits_name_a_camera_unless_they_are_a_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, library: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    source = open_source("93")
+    assert isinstance(source, VideoSource)
+    assert source.expected_frames is None
+    with pytest.raises(InputError, match="camera 93 cannot be opened"):
+        list(source)
+    (tmp_path / "93").mkdir()
+    cv2.imwrite(str(tmp_path / "93" / "a.png"), quarters())
+    assert len(list(open_source("93"))) == 1
+
+
+def test_a_camera_gives_frames_until_told_to_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Camera:
+        def __init__(self, *arguments: object) -> None:
+            assert arguments[0] == 0
+
+        def isOpened(self) -> bool:
+            return True
+
+        def grab(self) -> bool:
+            return True
+
+        def retrieve(self) -> tuple[bool, np.ndarray]:
+            return True, quarters()[..., ::-1]
+
+        def get(self, name: int) -> float:
+            return 0.0
+
+        def release(self) -> None:
+            pass
+
+    monkeypatch.setattr(cv2, "VideoCapture", Camera)
+    source = open_source("0", max_frames=5)
+    frames = list(source)
+    assert source.expected_frames == 5
+    assert names(frames) == list(range(5))
+    assert (np.diff(times(frames)) > 0).all()
+    np.testing.assert_array_equal(frames[0].image, quarters())
+
+
+# ---- reference files -----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="session")
+def cases_dir() -> Path:
+    """Small inputs of kinds that once failed."""
+    path = Path(os.environ.get("LOGVGGT_SHARED", Path(__file__).parents[3] / "shared")) / "data" / "cases"
+    if not path.exists():
+        pytest.skip(f"reference data not found in {path} (set LOGVGGT_SHARED)")
+    return path
+
+
+def test_the_case_of_interlacing(cases_dir: Path) -> None:
+    frames = list(open_source(cases_dir / "interlaced.mp4"))
+    assert len(frames) == 12
+    np.testing.assert_allclose([frame.image.mean() for frame in frames], 84, atol=3)
+
+
+def test_the_case_of_a_change_of_size(cases_dir: Path) -> None:
+    with pytest.raises(InputError, match="frame 12 is 240 x 320 pixels but the video begins with 320 x 240"):
+        list(open_source(cases_dir / "reschange2.ts"))
+
+
+def test_the_case_of_damage(cases_dir: Path, library: str) -> None:
+    source = open_source(cases_dir / "noisemid.mp4")
+    assert len(list(source)) == 22
+    assert [frame.name for frame in source.skipped] == ["frame-000005", "frame-000009"]
+
+
+def test_the_case_of_a_varying_rate(cases_dir: Path, library: str) -> None:
+    seconds = times(list(open_source(cases_dir / "vfr.mp4")))
+    expected = [*np.arange(9) / 12, *np.arange(3, 11) / 3, *(10 / 3 + np.arange(1, 5) / 12)]
+    np.testing.assert_allclose(seconds, expected, atol=1e-4)
+
+
+def test_the_case_of_a_late_start(cases_dir: Path, library: str) -> None:
+    seconds = times(list(open_source(cases_dir / "offset.mkv")))
+    np.testing.assert_allclose(seconds, np.arange(24) / 12, atol=1e-3)
+
+
+def test_real_video_opens_and_gives_frames(examples_dir: Path, library: str) -> None:
+    frames = list(open_source(examples_dir / "video" / "handheld_box.mp4", max_frames=3))
+    assert [frame.image.shape for frame in frames] == [(480, 640, 3)] * 3
+
+
+@pytest.mark.slow
+def test_real_video_is_counted_by_decoding(examples_dir: Path, library: str) -> None:
+    source = open_source(examples_dir / "video" / "handheld_box.mp4")
+    assert source.expected_frames == 456
+    assert sum(1 for _ in source.loaders()) == 455

@@ -1,0 +1,36 @@
+"""Validation fetches what it judges, and judges once what knows nothing."""
+
+from typing import Any
+
+import jax
+import pytest
+
+from logvggt_jax.training import validation as module
+from logvggt_jax.training.config import SourceConfig, ValidationConfig
+from logvggt_jax.training.sharding import data_mesh
+from logvggt_jax.training.validation import Validation
+
+ROOMS = (("height", 28), ("num_frames", 8), ("num_rooms", 2), ("width", 42))
+
+
+def test_baselines_are_judged_once_and_depth_and_cameras_alone_are_fetched(
+    pixel_model: Any, pixel_params: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[str] = []
+    for name in ("depth_metrics", "relative_pose_errors"):
+        original = getattr(module, name)
+
+        def counted(*given: Any, name: str = name, original: Any = original, **options: Any) -> Any:
+            calls.append(name)
+            return original(*given, **options)
+
+        monkeypatch.setattr(module, name, counted)
+    source = SourceConfig("rooms", None, "val", options=ROOMS)
+    config = ValidationConfig(source, every=1, num_clips=2, clip_length=3, stride=2, size=(28, 42))
+    validation = Validation(pixel_model, config, data_mesh(2))
+    assert len(calls) == 2 * 2
+    first, second = validation(pixel_params), validation(pixel_params)
+    assert len(calls) == 3 * 2 * 2 and first == second
+    assert first["validation/constant_abs_rel"] > 0 and first["validation/identity_rotation"] > 0
+    depth, extrinsics = jax.eval_shape(validation._predict, pixel_params, validation._images)
+    assert depth.shape == (2, 3, 28, 42) and extrinsics.shape == (2, 3, 3, 4)
