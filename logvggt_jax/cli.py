@@ -71,7 +71,7 @@ def _convert(options: argparse.Namespace) -> None:
     from logvggt_jax.weights.checkpoints import convert
 
     check_devices()
-    report = convert(options.source, options.output, point_head=options.point_head)
+    report = convert(options.source, options.output, point_head=options.point_head, overwrite=options.overwrite)
     for title, names in (("skipped", report.skipped), ("initialised", report.initialised)):
         for name in names:
             print(f"  {title}: {name}")
@@ -86,8 +86,8 @@ def _reconstruct(options: argparse.Namespace) -> int:
     from logvggt_jax.reconstruction.reconstruct import LONGER_EDGE, reconstruct
     from logvggt_jax.reconstruction.request import check_request, describe
     from logvggt_jax.reconstruction.sources import open_source
+    from logvggt_jax.weights import resolve
     from logvggt_jax.weights.checkpoints import from_pretrained, read_config, read_provenance
-    from logvggt_jax.weights.hub import resolve
 
     # Before the model: a misspelt path should not have to wait for gigabytes of weights.
     source = open_source(options.source, **{name: getattr(options, name) for name in SOURCE_OPTIONS})
@@ -183,7 +183,7 @@ def _info(options: argparse.Namespace) -> None:
     console = Console()
     console.print(model_summary(model.config, variables["params"]))
     console.print(provenance_lines(read_provenance(options.checkpoint)), highlight=False, soft_wrap=True)
-    console.print("every parameter equals the digest stored with it")
+    console.print("every parameter is finite and equals the digest stored with it")
 
 
 def _check_data(options: argparse.Namespace) -> int:
@@ -270,9 +270,14 @@ def _parser() -> argparse.ArgumentParser:
         "turn a public VGGT checkpoint into a LoG-VGGT model folder",
         "logvggt convert facebook/VGGT-1B --output models/vggt-1b",
     )
-    sub.add_argument("source", help="VGGT .safetensors or .pt file, its folder, or a hub repository")
+    sub.add_argument(
+        "source",
+        help="VGGT checkpoint: a file of PyTorch or safetensors, its folder, or a hub repository, hf:OWNER/NAME[/FILE] "
+        "or OWNER/NAME where no folder OWNER is here",
+    )
     sub.add_argument("--output", type=Path, required=True, metavar="DIR", help="model folder to make")
     sub.add_argument("--point-head", action="store_true", help="keep the point head")
+    sub.add_argument("--overwrite", action="store_true", help="replace an earlier model folder")
 
     sub = command(
         "reconstruct",
@@ -285,7 +290,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     sub.add_argument("source", help="folder of images (natural order; 7-Scenes: its colour images), or a video")
     sub.add_argument(
-        "--checkpoint", required=True, metavar="PATH_OR_REPO", help="model folder, VGGT file, or hub repository"
+        "--checkpoint",
+        required=True,
+        metavar="PATH_OR_REPO",
+        help="model folder, folder of a training run, VGGT checkpoint (a file, or its folder), or hub repository, "
+        "hf:OWNER/NAME[/FILE] or OWNER/NAME where no folder OWNER is here",
     )
     sub.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder to make")
     sub.add_argument(
@@ -403,7 +412,9 @@ def _parser() -> argparse.ArgumentParser:
         "sizes and parameters of a model folder, after a check of every stored digest",
         "logvggt info models/vggt-1b",
     )
-    sub.add_argument("checkpoint", type=Path, help="model folder made by `logvggt convert` or by training")
+    sub.add_argument(
+        "checkpoint", type=Path, help="model folder made by `logvggt convert`, or folder of a training run"
+    )
 
     sub = command(
         "doctor",

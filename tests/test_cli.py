@@ -169,6 +169,28 @@ def test_info_counts_parameters(
     assert "licence: not recorded" in text
 
 
+def test_info_takes_a_training_runs_folder_and_suggests_the_right_spelling(
+    checkpoint: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["info", str(checkpoint.parent)]) == 0
+    assert "every parameter is finite" in capsys.readouterr().out
+    assert_fails(capsys, ["info", str(checkpoint.with_name("modle"))], f"did you mean {checkpoint}?")
+    assert_fails(capsys, ["info", str(checkpoint / "config.json")], "is a file and no model folder")
+
+
+def test_convert_never_replaces_a_folder_unasked(
+    checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert_fails(capsys, ["convert", "absent.pt", "--output", str(checkpoint)], str(checkpoint), "--overwrite")
+    (tmp_path / "notes.txt").touch()
+    asked = ["convert", "absent.pt", "--output", str(tmp_path), "--overwrite"]
+    assert_fails(capsys, asked, "is not overwritten", str(tmp_path))
+    # Where it may be replaced, the source is looked at next.
+    assert_fails(
+        capsys, ["convert", "absent.pt", "--output", str(checkpoint), "--overwrite"], "absent.pt: no such file"
+    )
+
+
 @pytest.mark.filterwarnings("ignore:these weights were trained on windows")
 def test_bad_input_is_one_line_and_exit_code_2(
     checkpoint: Path, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -171,10 +171,11 @@ class PointSelection:
         points = [sample.points for sample in samples]
         return {
             "histogram": self._histogram,
-            "sample_size": np.array([self._sample_size]),
+            "expected": np.array([self._frames]),
             "frames": np.array(frames, np.int64),
             "candidates": np.array([sample.candidates for sample in samples], np.int64),
             "lengths": np.array([len(sample.bins) for sample in samples], np.int64),
+            "places": np.concatenate([sample.places for sample in samples] or [np.zeros(0, np.int32)]),
             "bins": np.concatenate([sample.bins for sample in samples] or [np.zeros(0, np.uint16)]),
             "indices": np.concatenate([each.indices for each in points] or [np.zeros(0, np.int64)]),
             "depth": np.concatenate([each.depth for each in points] or [np.zeros(0, np.float32)]),
@@ -183,14 +184,14 @@ class PointSelection:
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Takes up what `arrays` gave."""
-        self._histogram, self._sample_size = arrays["histogram"].copy(), int(arrays["sample_size"][0])
+        self._histogram, self._frames = arrays["histogram"].copy(), int(arrays["expected"][0])
         ends = np.cumsum(arrays["lengths"])
         for frame, stop, length, candidates in zip(
             arrays["frames"].tolist(), ends, arrays["lengths"], arrays["candidates"].tolist(), strict=True
         ):
             part = slice(stop - length, stop)
             points = FramePoints(*(arrays[name][part] for name in FramePoints._fields))
-            self._samples[frame] = _Sample(points, arrays["bins"][part], candidates)
+            self._samples[frame] = _Sample(points, arrays["places"][part], arrays["bins"][part], candidates)
 
     @functools.cached_property
     def threshold_bin(self) -> int:

@@ -42,7 +42,7 @@ from logvggt_jax.reconstruction.run import Run
 from logvggt_jax.reconstruction.sources import Source, open_source
 from logvggt_jax.reconstruction.work_folder import WorkFolder
 from logvggt_jax.streaming import open_predictor
-from logvggt_jax.weights.checkpoints import digests
+from logvggt_jax.weights.digests import digests
 
 
 def reconstruct(

@@ -10,12 +10,20 @@ from typing import Any, NamedTuple
 import jax
 import orbax.checkpoint as ocp
 
-from logvggt_jax.errors import InputError
+from logvggt_jax.errors import InputError, OutputExists
 from logvggt_jax.model.parameters import stack_layers, unstack_layers
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.processes import any_process
 from logvggt_jax.training.state import TrainState
-from logvggt_jax.weights.checkpoints import check_destination, digests, read_with_orbax, save_model, verify_digests
+from logvggt_jax.weights.checkpoints import (
+    check_destination,
+    read_provenance,
+    read_with_orbax,
+    save_model,
+    writing_with_orbax,
+)
+from logvggt_jax.weights.digests import digests, json_digest, verify_digests
+from logvggt_jax.weights.folder import is_model_folder
 from logvggt_jax.weights.provenance import Provenance
 
 # How fast, from where and with how many broken clips the data come; the data stream checks that they are the same.
@@ -33,8 +41,9 @@ class Position(NamedTuple):
 class RunCheckpoints:
     """The checkpoints `<workdir>/checkpoints/<step>` and the model folder `<workdir>/model`; a context manager.
 
-    A checkpoint holds parameters, the rest of the state, the data stream's state, and the configuration with a
-    digest of every leaf, since Orbax does not notice flipped bytes. It appears under its name only when complete.
+    A checkpoint holds parameters, the rest of the state, the data stream's state, and the configuration, with a
+    digest of every leaf and of the other two, since Orbax does not notice flipped bytes. It appears under its name only
+    when complete. A model folder that another run or a conversion wrote is never replaced: OutputExists.
     """
 
     def __init__(self, workdir: Path, config: TrainConfig) -> None:
@@ -43,6 +52,7 @@ class RunCheckpoints:
         self.model_folder = self.folder.parent / "model"
         # Now rather than after the steps before the first save.
         check_destination(self.model_folder)
+        self._check_own()
         # Saving is synchronous: the next step is given the state's buffers to overwrite.
         options = ocp.CheckpointManagerOptions(
             max_to_keep=config.keep_checkpoints, create=True, enable_async_checkpointing=False
@@ -75,7 +85,7 @@ class RunCheckpoints:
         # The others would wait for the first one in the checkpoint below.
         if any_process(failure is not None):
             raise failure or OSError(f"process 0 could not write {self.model_folder}; its output says why")
-        meta = {
+        meta: dict[str, Any] = {
             "step": step,
             "stage": position.stage,
             "layers": "stacked",
@@ -83,21 +93,37 @@ class RunCheckpoints:
             "digests": {"params": digests(params), "state": digests(rest)},
             "libraries": {name: importlib.metadata.version(name) for name in LIBRARIES},
         }
-        self._manager.save(
-            step,
-            args=ocp.args.Composite(
-                params=ocp.args.StandardSave(params),
-                state=ocp.args.StandardSave(rest),
-                data=ocp.args.JsonSave(position.data),
-                meta=ocp.args.JsonSave(meta),
-            ),
-            force=True,
-        )
+        meta["digest"] = json_digest([meta, position.data])
+        with writing_with_orbax(self.folder / str(step)):
+            self._manager.save(
+                step,
+                args=ocp.args.Composite(
+                    params=ocp.args.StandardSave(params),
+                    state=ocp.args.StandardSave(rest),
+                    data=ocp.args.JsonSave(position.data),
+                    meta=ocp.args.JsonSave(meta),
+                ),
+                force=True,
+            )
+
+    def _check_own(self) -> None:
+        """A model without checkpoints is this run's if it was killed before its first one was complete."""
+        if any(entry.name.isdecimal() for entry in self.folder.glob("*")) or not is_model_folder(self.model_folder):
+            return
+        source = read_provenance(self.model_folder).source or "source not recorded"
+        if not source.endswith(self._here()):
+            raise OutputExists(
+                f"{self.model_folder}: a model that this run did not write ({source}) would be replaced; start in "
+                "another --workdir or move it away"
+            )
+
+    def _here(self) -> str:
+        return f" in {self.folder.parent}"
 
     def _provenance(self) -> Provenance:
         longer_edge = max(max(size) for stage in self.config.stages for size in stage.sizes)
         start = self.config.initial_weights or "random parameters"
-        return Provenance("windows", longer_edge, source=f"trained from {start} in {self.folder.parent}")
+        return Provenance("windows", longer_edge, source=f"trained from {start}{self._here()}")
 
     def restore(self, like: TrainState, *, step: int | None = None) -> tuple[TrainState, Position]:
         """The state at `step` (None: the latest), with the shapes and placement of `like`.
@@ -113,7 +139,10 @@ class RunCheckpoints:
         where = f"checkpoint of step {chosen} in {self.folder / str(chosen)}"
         others = [other for other in steps if other != chosen]
         mend = f"resume from another with --resume_step (there are {others})" if others else "start a new --workdir"
-        meta = self._read(chosen, ocp.args.Composite(meta=ocp.args.JsonRestore()), where, mend)["meta"]
+        described = ocp.args.Composite(meta=ocp.args.JsonRestore(), data=ocp.args.JsonRestore())
+        stored = self._read(chosen, described, where, mend)
+        meta, data = stored["meta"], stored["data"]
+        _check_description(meta, data, where, mend)
         self._check_configuration(meta["config"], where)
         # Earlier versions kept every layer's parameters and moments by themselves.
         layer_by_layer = meta.get("layers") != "stacked"
@@ -125,7 +154,6 @@ class RunCheckpoints:
             ocp.args.Composite(
                 params=ocp.args.StandardRestore(_abstract(params)),
                 state=ocp.args.StandardRestore(_abstract(rest)),
-                data=ocp.args.JsonRestore(),
             ),
             where,
             mend,
@@ -139,7 +167,7 @@ class RunCheckpoints:
             if later > chosen:
                 self._manager.delete(later)
         state = TrainState(params=restored["params"], **restored["state"])
-        return stack_layers(state) if layer_by_layer else state, Position(meta["stage"], restored["data"])
+        return stack_layers(state) if layer_by_layer else state, Position(meta["stage"], data)
 
     def _read(self, step: int, args: Any, where: str, mend: str) -> Mapping[str, Any]:
         return read_with_orbax(lambda: self._manager.restore(step, args=args), where, mend)
@@ -157,6 +185,19 @@ class RunCheckpoints:
                     f"{where} was written with {name}={theirs!r}, the configuration says {mine!r}; "
                     "set it back or start a new --workdir"
                 )
+
+
+def _check_description(meta: Any, data: Any, where: str, mend: str) -> None:
+    """Compares position and settings with their digest; checkpoints of before there was one pass as they are."""
+    known = {"step", "stage", "layers", "config", "digests", "libraries", "digest"}
+    # An entry of another name may have been `digest` before a bit of it was flipped.
+    names = set(meta) if isinstance(meta, dict) else set()
+    if not known - {"layers", "digest"} <= names <= known:
+        raise InputError(f"{where} is damaged: it holds {sorted(names)}, expected {sorted(known)}; {mend}")
+    if "digest" in names:
+        found = json_digest([{name: value for name, value in meta.items() if name != "digest"}, data])
+        if found != meta["digest"]:
+            raise InputError(f"{where} is damaged: position and settings differ from their digest; {mend}")
 
 
 def _what_decides_clips(data: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,35 +1,53 @@
 """VGGT checkpoint files: which file a path means, and its tensors read one by one."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
 import safetensors
 
 from logvggt_jax.errors import InputError, MissingInput, disk_errors
-from logvggt_jax.weights.lazy import LazyTensors
+from logvggt_jax.weights.content import content_of
+from logvggt_jax.weights.lazy import LazyTensors, refused_type
+from logvggt_jax.weights.shards import INDEX_SUFFIX, is_shard, present_shards, read_index
+from logvggt_jax.weights.state_dicts import plain_names
 from logvggt_jax.weights.torch_zip import open_torch_zip
 
-SUFFIXES = (".safetensors", ".pt")
+# By which weights are found among other files; what a file holds is told by its content.
+SUFFIXES = (".safetensors", ".pt", ".pth", ".ckpt", ".bin")
 # Where there are several files; the first of them first, since safetensors cannot hold code.
-_USUAL_NAMES = ("model.safetensors", "model.pt")
+_USUAL_NAMES = (
+    "model.safetensors",
+    "model.safetensors.index.json",
+    "model.pt",
+    "pytorch_model.bin",
+    "pytorch_model.bin.index.json",
+)
+_FLOATS = {"F64", "F32", "F16", "BF16"}
+_INTEGERS = {"I64", "I32", "I16", "I8", "U64", "U32", "U16", "U8", "BOOL"}
 
 
 def find_weights(path: Path) -> Path:
-    """The checkpoint file that `path` (a file, or a folder that holds one) means.
+    """The checkpoint file, or the index of shards, that `path` (a file, or a folder that holds one) means.
 
-    Raises MissingInput where nothing is there, or the folder holds no checkpoint; InputError for a suffix that is not
-    one of `SUFFIXES`, or a folder with several checkpoints.
+    Raises MissingInput where nothing is there, or the folder holds no checkpoint; InputError for one shard of several,
+    or a folder with several checkpoints.
     """
     if path.is_dir():
         with disk_errors(path):
             names = [file.name for file in path.iterdir() if file.is_file()]
+        if not any(_is_weights(name) or is_shard(name) for name in names):
+            # Copies without a suffix, as the hub's cache has them.
+            names = [name for name in names if "." not in name and _readable(path / name)] or names
+            if len(names) == 1 and "." not in names[0]:
+                return path / names[0]
         return path / choose_weights(names, str(path), f"{path}/")
     if not path.is_file():
-        raise MissingInput(f"{path}: no such file or folder; give a checkpoint file or the folder that holds it")
-    if path.suffix not in SUFFIXES:
-        raise InputError(f"{path}: unknown suffix {path.suffix!r}; expected a .safetensors or .pt checkpoint")
+        what = "neither a file nor a folder" if path.exists() else "no such file or folder"
+        raise MissingInput(f"{path}: {what}; give a checkpoint file or the folder that holds it")
+    if is_shard(path.name):
+        raise InputError(f"{path}: one of several shards of a checkpoint; give their folder or their index")
     return path
 
 
@@ -39,28 +57,61 @@ def choose_weights(names: Sequence[str], where: str, prefix: str) -> str:
     Errors call the folder or repository `where`; `prefix` is what a user puts before a name to choose the file. Raises
     MissingInput if none is a checkpoint, InputError naming them if several are and none has a usual name.
     """
-    weights = sorted(name for name in names if name.endswith(SUFFIXES))
+    weights = sorted(name for name in names if _is_weights(name) and not is_shard(name))
     usual = [name for name in _USUAL_NAMES if name in weights]
     if usual or len(weights) == 1:
         return (usual or weights)[0]
     if not weights:
-        raise MissingInput(f"{where}: holds no .safetensors or .pt file; give the file itself")
+        if shards := sorted(name for name in names if is_shard(name)):
+            raise MissingInput(
+                f"{where}: holds shards ({shards[0]} and {len(shards) - 1} more) without their index; put "
+                "model.safetensors.index.json beside them"
+            )
+        seen = f"it holds {', '.join(sorted(names)[:6])}" if names else "it holds no file"
+        raise MissingInput(f"{where}: no file of weights ({', '.join(SUFFIXES)}); {seen}; give the file itself")
     raise InputError(f"{where}: holds several checkpoints, {', '.join(weights)}; give one as {prefix}{weights[0]}")
 
 
 def open_state_dict(path: str | Path) -> AbstractContextManager[Mapping[str, np.ndarray]]:
-    """Opens a `.safetensors` or `.pt` file, or a folder that holds one: PyTorch names to arrays in the file's own
-    dtype.
+    """Opens a checkpoint file, or a folder that holds one: PyTorch names to arrays in the file's own dtype.
 
-    A context manager; its lazy mapping reads tensors only while it is open. Raises as `find_weights`, and InputError
-    for a damaged or truncated file, or a pickle that holds anything but tensors.
+    The content says what the file is: safetensors, an archive of `torch.save`, or the index of several of them. A state
+    dict inside of a trainer's checkpoint is found, and prefixes such as `module.` are taken off its names. A context
+    manager; its lazy mapping reads tensors only while it is open. Raises as `find_weights`, and InputError for any
+    other file, saying what it is; a damaged or truncated one; or a state dict that holds anything but tensors.
     """
-    file = find_weights(Path(path))
-    return _open_safetensors(file) if file.suffix == ".safetensors" else open_torch_zip(file)
+    return _open_plain(find_weights(Path(path)))
 
 
 @contextmanager
-def _open_safetensors(path: Path) -> Iterator[Mapping[str, np.ndarray]]:
+def _open_plain(path: Path) -> Iterator[Mapping[str, np.ndarray]]:
+    with ExitStack() as stack:
+        if content_of(path) == "json":
+            tensors = _enter_shards(stack, path)
+        else:
+            tensors = stack.enter_context(_open_file(path))
+        names = plain_names(list(tensors), str(path))
+        yield LazyTensors(list(names), lambda name: tensors[names[name]], tensors.origin)
+
+
+def _open_file(path: Path) -> AbstractContextManager[LazyTensors]:
+    content = content_of(path)
+    if content == "json":
+        raise InputError(f"{path}: a JSON text, expected weights")
+    return _open_safetensors(path) if content == "safetensors" else open_torch_zip(path)
+
+
+def _enter_shards(stack: ExitStack, path: Path) -> LazyTensors:
+    weight_map = read_index(path)
+    shards = {shard.name: stack.enter_context(_open_file(shard)) for shard in present_shards(path, weight_map)}
+    for tensor, name in weight_map.items():
+        if tensor not in shards[name]:
+            raise InputError(f"{path}: puts {tensor} into {name}, which lacks it; the shards are of another checkpoint")
+    return LazyTensors(list(weight_map), lambda tensor: shards[weight_map[tensor]][tensor])
+
+
+@contextmanager
+def _open_safetensors(path: Path) -> Iterator[LazyTensors]:
     try:
         with disk_errors(path):
             opened = safetensors.safe_open(path, framework="numpy")
@@ -70,4 +121,22 @@ def _open_safetensors(path: Path) -> Iterator[Mapping[str, np.ndarray]]:
             f"{path}: not a readable safetensors file ({reason}); it is damaged or truncated, copy or download it again"
         ) from error
     with opened as file:
-        yield LazyTensors(list(file.keys()), file.get_tensor)
+
+        def read(name: str) -> np.ndarray:
+            dtype = file.get_slice(name).get_dtype()
+            if dtype not in _FLOATS | _INTEGERS:
+                raise refused_type(path, name, dtype)
+            return file.get_tensor(name)
+
+        yield LazyTensors(list(file.keys()), read)
+
+
+def _is_weights(name: str) -> bool:
+    return name.lower().endswith((*SUFFIXES, *(suffix + INDEX_SUFFIX for suffix in SUFFIXES)))
+
+
+def _readable(path: Path) -> bool:
+    try:
+        return content_of(path) != "json"
+    except InputError:
+        return False

@@ -1,61 +1,52 @@
 """Checkpoint files from the Hugging Face hub (extra `hub`)."""
 
-import re
 from pathlib import Path
 from typing import Any
 
-from logvggt_jax.errors import MissingInput, MissingPackage
-from logvggt_jax.weights.files import SUFFIXES, choose_weights
+from rich.console import Console
 
-_PREFIX = "hf:"
-_NAME = r"[\w-][\w.-]*"
-_ADDRESS = re.compile(rf"(?P<repository>{_NAME}/{_NAME})(?:/(?P<file>.+))?")
+from logvggt_jax.errors import InputError, MissingInput, MissingPackage, one_line
+from logvggt_jax.weights.files import choose_weights
+from logvggt_jax.weights.shards import INDEX_SUFFIX, read_index
+
+PREFIX = "hf:"
 _TIMEOUT = 10.0  # seconds for the hub's answer, not for a download
 
 
-def resolve(path_or_repo: str | Path) -> Path:
-    """The local path that a path or an address on the hub means; downloads in the second case.
-
-    Raises MissingInput as `download`, or for what is neither a path that exists nor an address.
-    """
-    found = _address(path_or_repo)
-    if found is not None:
-        return download(*found)
-    path = Path(path_or_repo).expanduser()
-    if not path.exists():
-        raise MissingInput(
-            f"{path}: no such file or folder; give a checkpoint file, its folder, or a hub repository as {_PREFIX}"
-            "owner/name"
-        )
-    return path
-
-
-def licence(path_or_repo: str | Path) -> str | None:
-    """The licence that a hub repository names for itself; None for local paths, or where it cannot be asked."""
-    found = _address(path_or_repo)
-    card = None if found is None else getattr(_ask(found[0]), "card_data", None)
+def licence(repository: str) -> str | None:
+    """The licence that a repository `owner/name` names for itself; None where it cannot be asked."""
+    card = getattr(_ask(repository), "card_data", None)
     return None if card is None else card.get("license_name") or card.get("license")
 
 
 def download(repository: str, file: str | None = None) -> Path:
     """Fetches the weights of `owner/name` into the hub's cache, unless they are there; the path of the file in the
-    cache.
+    cache. A line on standard error says what is downloaded, from where and how much, before it begins.
 
-    `file` is one of the repository's, None takes the one that `choose_weights` finds. Raises MissingInput where the
-    repository does not exist or asks for a login, holds no such file, or the hub cannot be reached and the cache has no
-    copy; InputError naming several files of weights; MissingPackage without `huggingface_hub`.
+    `file` is one of the repository's, None takes the one that `choose_weights` finds; with an index come its shards.
+    Raises MissingInput where the repository does not exist or asks for a login, holds no such file, or the hub cannot
+    be reached and the cache has no copy; InputError naming several files of weights, or for a download that fails;
+    MissingPackage without `huggingface_hub`.
     """
     hub = _client(repository)
     try:
         if file is None:
-            info = _ask(repository)
+            info, where = _ask(repository), f"{repository} on the hub"
             if info is None:  # what the cache has of it
+                where = f"{repository} in this machine's cache (the hub cannot be reached)"
                 folder = Path(hub.snapshot_download(repository, local_files_only=True))
                 names = [path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()]
             else:
                 names = [sibling.rfilename for sibling in info.siblings or ()]
-            file = choose_weights(names, f"{repository} on the hub", f"{_PREFIX}{repository}/")
-        return Path(hub.hf_hub_download(repository, file))
+            file = choose_weights(names, where, f"{PREFIX}{repository}/")
+        path = _fetch(hub, repository, file)
+        if file.endswith(INDEX_SUFFIX):
+            for shard in dict.fromkeys(read_index(path).values()):
+                file = (Path(file).parent / shard).as_posix()
+                _fetch(hub, repository, file)
+        return path
+    except InputError:
+        raise
     except hub.errors.RepositoryNotFoundError as error:  # a gated repository raises a subclass
         raise _not_found(repository) from error
     except hub.errors.LocalEntryNotFoundError as error:
@@ -65,20 +56,29 @@ def download(repository: str, file: str | None = None) -> Path:
         ) from error
     except hub.errors.RemoteEntryNotFoundError as error:
         raise MissingInput(f"{repository}: the repository holds no {file}; look for the name on its page") from error
+    except Exception as error:  # a full disk, a lost connection: the client's transport library has its own errors
+        raise InputError(
+            f"{repository}: {file or 'the repository'} cannot be downloaded ({type(error).__name__}: "
+            f"{one_line(error):.200}); try again, or download the file elsewhere and give its path"
+        ) from error
 
 
-def _address(path_or_repo: str | Path) -> tuple[str, str | None] | None:
-    """Repository and file of a hub address; None for a path.
-
-    `hf:owner/name` and `hf:owner/name/file` are addresses, as is `owner/name` where no folder `owner` is here and
-    the name has no checkpoint's suffix.
-    """
-    text = str(path_or_repo)
-    match = _ADDRESS.fullmatch(text.removeprefix(_PREFIX))
-    if match is None:
-        return None
-    local = match["file"] or text.endswith(SUFFIXES) or Path(text).parent.exists()
-    return (match["repository"], match["file"]) if text.startswith(_PREFIX) or not local else None
+def _fetch(hub: Any, repository: str, file: str) -> Path:
+    try:
+        metadata = hub.get_hf_file_metadata(hub.hf_hub_url(repository, file), timeout=_TIMEOUT)
+    except Exception:  # asked again below, where it counts
+        metadata = None
+    if metadata is not None:
+        cached = hub.try_to_load_from_cache(repository, file, revision=metadata.commit_hash)
+        if not isinstance(cached, str):
+            size = f", {metadata.size / 1e6:,.1f} MB" if metadata.size else ""
+            Console(stderr=True).print(
+                f"downloading {repository}/{file}{size}, from {hub.constants.ENDPOINT}",
+                soft_wrap=True,
+                markup=False,
+                highlight=False,
+            )
+    return Path(hub.hf_hub_download(repository, file))
 
 
 def _ask(repository: str) -> Any:
@@ -88,6 +88,8 @@ def _ask(repository: str) -> Any:
         return hub.HfApi(endpoint=hub.constants.ENDPOINT).model_info(repository, timeout=_TIMEOUT)
     except hub.errors.RepositoryNotFoundError as error:
         raise _not_found(repository) from error
+    except hub.errors.HFValidationError as error:
+        raise InputError(f"{repository}: no name of a repository ({one_line(error)}); expected owner/name") from error
     except Exception:  # what an unreachable host raises differs with the client's transport library
         return None
 
@@ -99,7 +101,7 @@ def _client(repository: str) -> Any:
         import huggingface_hub.errors
     except ImportError as error:
         raise MissingPackage(
-            f"{repository}: reading from the hub needs huggingface_hub; "
+            f"{repository}: no such path here, and reading from the hub needs huggingface_hub; "
             'pip install "logvggt-jax[hub]" or download the file and give its path'
         ) from error
     return huggingface_hub
@@ -107,6 +109,6 @@ def _client(repository: str) -> Any:
 
 def _not_found(repository: str) -> MissingInput:
     return MissingInput(
-        f"{repository}: no such repository on the hub, or it needs a login; check the name, accept its licence on its "
-        "page and run `hf auth login`"
+        f"{repository}: no such repository on the hub, or it needs a login, and no such path here; check the name, "
+        "accept its licence on its page and run `hf auth login`"
     )

@@ -23,6 +23,7 @@ from logvggt_jax.config import (
 )
 from logvggt_jax.errors import InputError
 from logvggt_jax.model.logvggt import LogVGGT
+from logvggt_jax.weights.digests import non_finite
 
 ParamPath = tuple[str, ...]
 Layout = Callable[[np.ndarray], np.ndarray]
@@ -31,6 +32,12 @@ _TRANSPOSED_CONV = functools.partial(np.transpose, axes=(2, 3, 0, 1))
 
 _OUTPUT_HIDDEN = 32  # width between the two convolutions of the DPT head's output, in every VGGT
 _DTYPES = ("float32", "float16", "bfloat16", "float64")
+# Blocks of the encoder by its width, as DINOv2 was published, and of the camera head beside VGGT-1B's.
+_DINOV2_DEPTHS = {384: 12, 768: 12, 1024: 24, 1536: 40}
+_TRUNK_DEPTHS = {1024: 4}
+# Constants that some checkpoints hold, and the one parameter that only training used.
+_BUFFERS = ("aggregator._resnet_mean", "aggregator._resnet_std")
+_MASK_TOKEN = "aggregator.patch_embed.mask_token"
 # The fields that shapes tell.
 _SIZES = {
     "encoder": ("embed_dim", "depth", "mlp_ratio", "num_registers", "position_grid", "patch_size"),
@@ -57,8 +64,9 @@ class ConversionReport:
 
     Attributes:
       used: PyTorch names whose tensors went into the parameters.
-      skipped: PyTorch names left out: the track head, and the point head where the configuration has none.
-      initialised: Paths (`gccr/query/kernel`) of parameters that VGGT does not have.
+      skipped: PyTorch names left out: the track head, the point head where the configuration has none, constants.
+      initialised: Paths (`gccr/query/kernel`) of parameters that VGGT does not have, and of DINOv2's mask token, which
+        nothing reads, where the file lacks it.
     """
 
     used: list[str] = dataclasses.field(default_factory=list)
@@ -209,24 +217,30 @@ def params_from_vggt(
       The parameter tree (float32, on the default device) and the report of names.
 
     Raises:
-      ValueError: A name is unknown or missing, or a tensor has another shape or is not floating point.
+      InputError: A name is unknown or missing, or a tensor has another shape, is not floating point, or holds NaN or
+        infinite values.
     """
     rules = vggt_rules(config)
     report = ConversionReport()
     known = {rule.name for rule in rules}
-    heads = ("track_head.",) if config.point_head is not None else ("track_head.", "point_head.")
-    for name in state_dict:
-        if name not in known and not name.startswith(heads):
-            raise InputError(f"unknown key {name!r} in the state dict{_differences(state_dict, config)}")
+    heads = _BUFFERS + (("track_head.",) if config.point_head is not None else ("track_head.", "point_head."))
+    unknown = [name for name in state_dict if name not in known and not name.startswith(heads)]
+    if unknown:
+        others = f" and {len(unknown) - 1} others" if len(unknown) > 1 else ""
+        raise InputError(
+            f"unknown key {unknown[0]!r}{others} in the state dict, expected those of VGGT's aggregator, camera_head, "
+            f"depth_head, point_head and track_head{_differences(state_dict, config)}"
+        )
     report.skipped = [name for name in state_dict if name not in known]
-    missing = [rule.name for rule in rules if rule.name not in state_dict]
+    present = [rule for rule in rules if rule.name in state_dict]
+    missing = [rule.name for rule in rules if rule.name not in state_dict and rule.name != _MASK_TOKEN]
     if missing:
         raise InputError(
             f"{len(missing)} of {len(rules)} keys are missing from the state dict, first {', '.join(missing[:3])}"
-            f"{_differences(state_dict, config)}"
+            f"{_differences(state_dict, config)}; {_seen(state_dict)}"
         )
     params: dict[str, Any] = {}
-    for rule in rules:
+    for rule in present:
         tensor = np.asarray(state_dict[rule.name])
         if tensor.shape != rule.shape:
             raise InputError(
@@ -234,9 +248,12 @@ def params_from_vggt(
             )
         if tensor.dtype.name not in _DTYPES:
             raise InputError(f"{rule.name} is {tensor.dtype.name}, expected one of {', '.join(_DTYPES)}")
+        tensor = tensor.astype(np.float32, copy=False)
+        if wrong := non_finite(tensor):
+            raise InputError(f"{rule.name} has {wrong}; the checkpoint is of a training that failed, or damaged")
         for path, layout in rule.targets:
             # A copy, because a view would keep the caller's array alive and follow its changes.
-            _insert(params, path, jnp.array(layout(tensor).astype(np.float32)))
+            _insert(params, path, jnp.array(layout(tensor)))
         report.used.append(rule.name)
     for path, value in _initial(config, params).items():
         _insert(params, path, value)
@@ -257,20 +274,28 @@ def config_from_vggt(state_dict: Mapping[str, np.ndarray], *, point_head: bool =
       point_head: Whether the model gets the point head, which the checkpoint then has to hold.
 
     Raises:
-      ValueError: A tensor that tells a size is missing or has another rank, or the depth is not 24.
+      InputError: A tensor that tells a size or a block in between is missing, a tensor has another rank, or a depth is
+        not that of VGGT or DINOv2; with some of the names that there are.
     """
 
     def shape(name: str, rank: int) -> tuple[int, ...]:
         if name not in state_dict:
-            raise InputError(f"the state dict lacks {name}, which VGGT has")
+            raise InputError(f"the state dict lacks {name}, which VGGT has; {_seen(state_dict)}")
         found = np.shape(state_dict[name])
         if len(found) != rank:
             raise InputError(f"{name} has shape {found}, VGGT's has {rank} axes")
         return found
 
-    def count(prefix: str) -> int:
-        indices = {n[len(prefix) :].split(".", 1)[0] for n in state_dict if n.startswith(prefix)}
-        return sum(index.isdecimal() for index in indices)
+    def count(prefix: str, expected: int | None = None) -> int:
+        parts = {name[len(prefix) :].split(".", 1)[0] for name in state_dict if name.startswith(prefix)}
+        indices = {int(part) for part in parts if part.isdecimal()}
+        wanted = max(max(indices, default=0) + 1, expected or 0)
+        if missing := sorted(set(range(wanted)) - indices):
+            raise InputError(
+                f"the state dict lacks {', '.join(f'{prefix}{i}' for i in missing[:4])}: it has {len(indices)} blocks "
+                f"{prefix}*, expected {wanted}; {_seen(state_dict)}"
+            )
+        return wanted
 
     def dpt(head: str) -> DPTConfig:
         channels = tuple(shape(f"{head}.projects.{i}.bias", 1)[0] for i in range(4))
@@ -282,7 +307,8 @@ def config_from_vggt(state_dict: Mapping[str, np.ndarray], *, point_head: bool =
     grid = round(positions**0.5)
     if grid * grid != positions:
         raise InputError(f"{encoder}.pos_embed holds {positions} grid positions, expected a square number")
-    depth = count(f"{frame}.")
+    depth = count(f"{frame}.", count("aggregator.global_blocks."))
+    count("aggregator.global_blocks.", depth)
     if depth != 24:
         raise InputError(
             f"the state dict has {depth} aggregator blocks of each kind, VGGT has 24: the key layers are unknown; "
@@ -292,7 +318,7 @@ def config_from_vggt(state_dict: Mapping[str, np.ndarray], *, point_head: bool =
     return ModelConfig(
         encoder=EncoderConfig(
             embed_dim=embed_dim,
-            depth=count(f"{encoder}.blocks."),
+            depth=count(f"{encoder}.blocks.", _DINOV2_DEPTHS.get(embed_dim)),
             num_heads=num_heads,
             mlp_ratio=shape(f"{encoder}.blocks.0.mlp.fc1.bias", 1)[0] // embed_dim,
             num_registers=shape(f"{encoder}.register_tokens", 3)[1],
@@ -305,11 +331,26 @@ def config_from_vggt(state_dict: Mapping[str, np.ndarray], *, point_head: bool =
             mlp_ratio=shape(f"{frame}.0.mlp.fc1.bias", 1)[0] // embed_dim,
             num_registers=shape("aggregator.register_token", 4)[2],
         ),
-        camera_head=CameraHeadConfig(depth=count("camera_head.trunk."), num_heads=num_heads),
+        camera_head=CameraHeadConfig(
+            depth=count("camera_head.trunk.", _TRUNK_DEPTHS.get(embed_dim)), num_heads=num_heads
+        ),
         depth_head=dpt("depth_head"),
         point_head=dpt("point_head") if point_head else None,
         refinement=RefinementConfig(num_heads=num_heads),
     )
+
+
+def _seen(state_dict: Mapping[str, np.ndarray]) -> str:
+    """Some names of a state dict with their shapes, for the end of an error's line."""
+    origin = getattr(state_dict, "origin", None)
+    some = []
+    for name in list(state_dict)[:3]:
+        try:
+            some.append(f"{name} {np.shape(state_dict[name])}")
+        except InputError:  # damage that has no part in the error at hand
+            some.append(name)
+    where = f"{origin} holds" if origin else "it holds"
+    return f"{where} {len(state_dict)} tensors, {', '.join(some) or 'none'}{', …' if len(state_dict) > 3 else ''}"
 
 
 def parameter_shapes(config: ModelConfig) -> dict[str, Any]:

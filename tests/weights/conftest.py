@@ -24,9 +24,7 @@ def vggt_state_dict(vggt_config, random_state_dict):
 
 @pytest.fixture(scope="session")
 def write_torch_file():
-    """Writes a `.pt` file: `write(path, tensors, pickled=None, byteorder=b"little", compression=ZIP_STORED)`.
-
-    `tensors` maps names to arrays or `write.view`s; equal storages are stored once. `pickled` replaces the pickle.
-    """
+    """`torch_files.write_torch_file`, with its `view` and `instance`."""
     torch_files.write_torch_file.view = torch_files.View
+    torch_files.write_torch_file.instance = torch_files.Instance
     return torch_files.write_torch_file

@@ -11,18 +11,18 @@ import orbax.checkpoint as ocp
 import pytest
 from safetensors.numpy import save_file
 
-from logvggt_jax.errors import InputError
+from logvggt_jax.errors import DiskError, InputError, OutputExists
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.weights import checkpoints
 from logvggt_jax.weights.checkpoints import (
     convert,
-    digests,
     from_pretrained,
     load_model,
     read_provenance,
     save_model,
-    verify_digests,
 )
+from logvggt_jax.weights.digests import digests, verify_digests
+from logvggt_jax.weights.folder import read_description, write_description
 from logvggt_jax.weights.provenance import Provenance
 
 
@@ -49,6 +49,7 @@ def vggt_file(tmp_path_factory, vggt_state_dict):
 def _edit(folder, change):
     file = folder / "config.json"
     description = json.loads(file.read_text())
+    description.pop("digest", None)  # as in folders written before it was there, and as after an edit on purpose
     change(description)
     file.write_text(json.dumps(description))
 
@@ -124,6 +125,16 @@ def test_a_failed_save_leaves_the_older_model_and_nothing_else(folder, small_con
     monkeypatch.undo()
     assert [entry.name for entry in folder.parent.iterdir()] == ["model"]
     _assert_same(load_model(folder)[1], small_variables)
+
+
+def test_a_full_disk_is_one_line_with_the_path(tmp_path, small_config, small_variables, monkeypatch):
+    def fail(*args, **kwargs):  # as Orbax does it
+        raise ValueError("RESOURCE_EXHAUSTED: Error writing: No space left on device [os_error_code='28']")
+
+    monkeypatch.setattr(ocp.StandardCheckpointer, "save", fail)
+    with pytest.raises(DiskError, match=r"/model: No space left on device$"):
+        save_model(tmp_path / "model", small_config, small_variables["params"])
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_folder_that_is_no_model_is_never_overwritten(tmp_path, small_config, small_variables):
@@ -246,11 +257,50 @@ def test_a_refused_conversion_leaves_nothing(tmp_path, vggt_state_dict):
     assert [entry.name for entry in tmp_path.iterdir()] == ["model.safetensors"]
 
 
-def test_conversion_checks_the_destination_before_it_reads(tmp_path, vggt_file, monkeypatch):
+def test_conversion_checks_the_destination_before_it_reads(tmp_path, vggt_file, saved, monkeypatch):
     monkeypatch.setattr(checkpoints, "open_state_dict", lambda path: pytest.fail("read before the check"))
+    monkeypatch.setattr(checkpoints, "resolve", lambda path: pytest.fail("looked for before the check"))
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(FileExistsError, match="not a model folder"):
+    with pytest.raises(OutputExists, match="--overwrite"):
         convert(vggt_file, tmp_path)
+    with pytest.raises(OutputExists, match="is no earlier result"):
+        convert(vggt_file, tmp_path, overwrite=True)
+    with pytest.raises(DiskError, match=r"notes\.txt is no folder"):
+        convert(vggt_file, tmp_path / "notes.txt" / "model")
+    with pytest.raises(OutputExists, match="--overwrite"):
+        convert(vggt_file, saved)
+    # A hub repository has a description of the same name.
+    (tmp_path / "config.json").write_text("{}")
+    with pytest.raises(OutputExists, match="not a model folder"):
+        convert(vggt_file, tmp_path, overwrite=True)
+
+
+def test_conversion_replaces_a_model_folder_only_when_asked(folder, vggt_file, vggt_config, small_variables):
+    with pytest.raises(OutputExists, match="--overwrite"):
+        convert(vggt_file, folder)
+    _assert_same(load_model(folder)[1], small_variables)
+    with pytest.raises(InputError, match="no such file"):
+        convert(folder.parent / "absent.pt", folder, overwrite=True)
+    _assert_same(load_model(folder)[1], small_variables)
+    convert(vggt_file, folder, point_head=True, overwrite=True)
+    assert load_model(folder)[0].config == vggt_config
+    assert [entry.name for entry in folder.parent.iterdir()] == ["model"]
+
+
+def test_conversion_says_the_space_it_needs_and_stops_without(tmp_path, vggt_file, monkeypatch, capsys):
+    monkeypatch.setattr(checkpoints.shutil, "disk_usage", lambda path: shutil._ntuple_diskusage(10**9, 10**9, 1000))
+    with pytest.raises(DiskError, match=r"takes about [\d.]+ MB, 0\.0 MB are free"):
+        convert(vggt_file, tmp_path / "model")
+    assert list(tmp_path.iterdir()) == []
+    monkeypatch.undo()
+    convert(vggt_file, tmp_path / "model")
+    error = capsys.readouterr().err
+    assert "the folder takes about" in error and "encoder of 1 blocks and width 16" in error
+
+
+def test_a_model_folder_is_not_converted_again(saved, tmp_path):
+    with pytest.raises(InputError, match="is a model folder already"):
+        convert(saved, tmp_path / "model")
 
 
 def test_the_compute_type_can_be_chosen(saved, small_config, small_variables):
@@ -266,3 +316,81 @@ def test_a_path_that_does_not_exist_is_named(tmp_path):
         from_pretrained(tmp_path / "nothing" / "here" / "at" / "all")
     with pytest.raises(FileNotFoundError, match=r"nothing/config\.json"):
         load_model(tmp_path / "nothing")
+
+
+def test_every_flipped_bit_of_a_description_is_noticed(tmp_path, small_config):
+    provenance = dataclasses.asdict(Provenance("windows", 224, "CC-BY-4.0", "rooms, Bärenweg"))
+    write_description(
+        tmp_path,
+        {
+            "config": {part: small_config.to_dict()[part] for part in ("aggregator", "windows", "dtype")},
+            "provenance": provenance,
+            "digests": {"encoder/norm/scale": "0f" * 16},
+            "libraries": {"jax": "0.10.2"},
+        },
+    )
+    file = tmp_path / "config.json"
+    good, content = file.read_bytes(), read_description(tmp_path)
+    for bit in range(8 * len(good)):
+        flipped = bytearray(good)
+        flipped[bit // 8] ^= 1 << bit % 8
+        file.write_bytes(flipped)
+        try:
+            found = read_description(tmp_path)
+        except InputError as error:
+            assert str(file) in str(error) and "\n" not in str(error)
+        else:
+            assert found == content, f"bit {bit} changes the model without a word: {bytes(flipped)!r}"
+
+
+def test_a_folder_from_before_the_description_had_a_digest_loads(folder, small_variables):
+    _edit(folder, lambda description: None)
+    _assert_same(load_model(folder)[1], small_variables)
+
+
+def test_an_edit_by_hand_is_told_from_damage(folder):
+    file = folder / "config.json"
+    file.write_text(file.read_text().replace('"rope_base": 100.0', '"rope_base": 101.0'))
+    with pytest.raises(InputError, match=r"config\.json: differs from its digest.*edited on purpose, remove its entry"):
+        load_model(folder)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_stored_model_with_values_that_are_not_finite_is_refused(tmp_path, small_config, small_variables, value):
+    params = jax.tree.map(np.array, small_variables["params"])
+    params["gccr"]["key"]["kernel"][3, 5] = value
+    save_model(tmp_path / "model", small_config, params)
+    with pytest.raises(InputError, match=rf"gccr/key/kernel has 1 of \d+ values .*first at \(3, 5\): {value}"):
+        load_model(tmp_path / "model")
+
+
+def test_a_training_runs_folder_means_its_model(folder, small_variables):
+    run = folder.parent
+    (run / "checkpoints" / "6").mkdir(parents=True)
+    for load in (load_model, from_pretrained):
+        _assert_same(load(run)[1], small_variables)
+    assert read_provenance(run) == Provenance()
+    with pytest.raises(InputError, match=r"the model of this training run is \S+/model$"):
+        load_model(run / "checkpoints" / "6")
+
+
+def test_a_missing_parameters_folder_is_said_rather_than_taken_for_vggts(folder):
+    shutil.rmtree(folder / "params")
+    with pytest.raises(FileNotFoundError, match=r"params: the parameters are missing"):
+        from_pretrained(folder)
+
+
+def test_a_misspelt_folder_is_answered_with_the_right_one(saved):
+    for load in (load_model, from_pretrained):
+        with pytest.raises(FileNotFoundError, match=rf"did you mean {saved}\?"):
+            load(saved.with_name("modle"))
+
+
+def test_weights_by_any_name_are_vggts(tmp_path, write_torch_file, vggt_state_dict, vggt_config):
+    content = {"epoch": 3, "state_dict": {f"module.{name}": tensor for name, tensor in vggt_state_dict.items()}}
+    write_torch_file(tmp_path / "checkpoint-best.pth", content)
+    model, variables = from_pretrained(tmp_path, point_head=True)
+    assert model.config == vggt_config
+    expected = vggt_state_dict["aggregator.patch_embed.norm.weight"]
+    np.testing.assert_array_equal(variables["params"]["encoder"]["norm"]["scale"], expected)
+    assert read_provenance(tmp_path) == Provenance("vggt", 518, None, f"VGGT checkpoint {tmp_path}")

@@ -3,14 +3,16 @@
 import http.server
 import json
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
 from safetensors.numpy import save
 
 from logvggt_jax.errors import InputError
-from logvggt_jax.weights import read_provenance
-from logvggt_jax.weights.hub import download, resolve
+from logvggt_jax.weights import open_state_dict, read_provenance
+from logvggt_jax.weights.address import resolve
+from logvggt_jax.weights.hub import download
 
 constants = pytest.importorskip("huggingface_hub.constants")
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
@@ -132,6 +134,37 @@ def test_a_cached_file_serves_offline(hub):
     assert download("owner/vggt") == path
 
 
+def test_a_download_is_announced_once_before_it_begins(hub, capsys):
+    hub.files = {"owner/vggt/model.safetensors": b"weights" * 1_000_000}
+    download("owner/vggt")
+    captured = capsys.readouterr()
+    lines = [line for line in captured.err.splitlines() if line.startswith("downloading")]
+    assert lines == [f"downloading owner/vggt/model.safetensors, 7.0 MB, from {hub.url}"]
+    assert captured.out == ""
+    download("owner/vggt")
+    assert "downloading" not in capsys.readouterr().err
+
+
+def test_an_index_brings_its_shards(hub):
+    index = {"weight_map": {"a": "model-00001-of-00002.safetensors", "b": "model-00002-of-00002.safetensors"}}
+    hub.files = {"owner/vggt/model.safetensors.index.json": json.dumps(index).encode()}
+    for name, value in zip(index["weight_map"], (1, 2), strict=True):
+        content = save({name: np.full(2, value, np.float32)})
+        hub.files[f"owner/vggt/{index['weight_map'][name]}"] = content
+    with open_state_dict(resolve("hf:owner/vggt")) as found:
+        assert {name: found[name][0] for name in found} == {"a": 1, "b": 2}
+
+
+def test_the_caches_own_folder_of_a_repository_is_read_as_a_path(hub, tmp_path):
+    hub.files = {"owner/vggt/model.safetensors": save({"w": np.ones(1, np.float32)})}
+    path = download("owner/vggt")
+    hub.close()
+    folder = tmp_path / "cache" / "models--owner--vggt"
+    assert resolve(folder) == path.parent
+    with open_state_dict(path.resolve()) as found:  # a blob, which has no suffix
+        assert list(found) == ["w"]
+
+
 def test_an_unreachable_hub_is_named(hub, monkeypatch):
     hub.close()
     monkeypatch.setattr("huggingface_hub.utils._http.time.sleep", lambda seconds: None)  # between attempts
@@ -143,7 +176,7 @@ def test_an_unknown_repository_and_one_without_weights_are_named(hub):
     hub.files = {"owner/other/README.md": b"text"}
     with pytest.raises(FileNotFoundError, match=r"owner/vggt: no such repository on the hub"):
         download("owner/vggt")
-    with pytest.raises(FileNotFoundError, match=r"owner/other on the hub: holds no \.safetensors or \.pt file"):
+    with pytest.raises(FileNotFoundError, match=r"owner/other on the hub: no file of weights .*holds README\.md"):
         download("owner/other")
 
 
@@ -157,4 +190,15 @@ def test_a_path_that_exists_is_never_a_repository(hub, tmp_path, monkeypatch):
         resolve("owner/vggt.safetensors")
     with pytest.raises(FileNotFoundError, match=r"a/b/c: no such file"):
         resolve("a/b/c")
+    for text in ("./owner/vgtt", "../owner/vgtt", "/owner/vgtt", "~/owner-of-nothing", "other/vggt.ckpt", "a/b/c"):
+        with pytest.raises(FileNotFoundError, match="no such file or folder"):
+            resolve(text)
+    with pytest.raises(FileNotFoundError, match=r"hf:vggt: no address on the hub; expected hf:owner/name"):
+        resolve("hf:vggt")
+    with pytest.raises(FileNotFoundError, match=r"stranger/vggt: no such file or folder"):
+        resolve(Path("stranger/vggt"))  # whoever has a path says so
+    with pytest.raises(FileNotFoundError, match=r"did you mean owner/vggt\?"):
+        resolve("owner/vgtt")
+    with pytest.raises(FileNotFoundError, match=r"did you mean owner/vggt\?"):
+        resolve("./ownr/vggt")
     assert hub.requests == []

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from logvggt_jax.config import DPTConfig, ModelConfig, RefinementConfig
+from logvggt_jax.errors import InputError
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.weights.lazy import LazyTensors
 from logvggt_jax.weights.vggt import config_from_vggt, parameter_shapes, params_from_vggt, vggt_rules
@@ -188,7 +189,7 @@ def test_sizes_that_cannot_be_read_are_errors(vggt_state_dict):
     shallow = {n: t for n, t in vggt_state_dict.items() if "_blocks.23." not in n}
     with pytest.raises(ValueError, match=r"23 aggregator blocks.*params_from_vggt"):
         config_from_vggt(shallow)
-    with pytest.raises(ValueError, match=r"lacks aggregator\.camera_token"):
+    with pytest.raises(ValueError, match=r"lacks aggregator\.camera_token.*holds 1 tensors, encoder\.weight \(3,\)"):
         config_from_vggt({"encoder.weight": np.zeros(3, np.float32)})
     oblong = {**vggt_state_dict, "aggregator.patch_embed.pos_embed": np.zeros((1, 9, 16), np.float32)}
     with pytest.raises(ValueError, match="8 grid positions, expected a square"):
@@ -199,3 +200,35 @@ def test_a_state_dict_without_point_head_gives_none(vggt_state_dict):
     without = {n: t for n, t in vggt_state_dict.items() if not n.startswith("point_head.")}
     with pytest.raises(ValueError, match=r"lacks point_head\."):
         config_from_vggt(without, point_head=True)
+
+
+@pytest.mark.parametrize("lost", ["aggregator.frame_blocks.5.", "aggregator.global_blocks.5.", "camera_head.trunk.0."])
+def test_a_missing_block_is_named(vggt_state_dict, lost):
+    fewer = {name: tensor for name, tensor in vggt_state_dict.items() if not name.startswith(lost)}
+    with pytest.raises(InputError, match=f"lacks {lost[:-1]}: it has .* expected .*holds {len(fewer)} tensors"):
+        config_from_vggt(fewer)
+
+
+@pytest.mark.parametrize("lost", ["aggregator.patch_embed.blocks.23.", "camera_head.trunk.3."])
+def test_a_last_block_that_the_width_asks_for_is_named(golden_dir, lost):
+    shapes = json.loads((golden_dir / "vggt_1b.json").read_text())["shapes"]
+    fewer = _zeros({name: shape for name, shape in shapes.items() if not name.startswith(lost)})
+    with pytest.raises(InputError, match=f"lacks {lost[:-1]}: "):
+        config_from_vggt(fewer)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e300])
+def test_values_that_are_not_finite_are_refused_by_name(vggt_state_dict, vggt_config, value):
+    name = "aggregator.frame_blocks.0.attn.qkv.weight"
+    bad = vggt_state_dict[name].astype(np.float64)
+    bad[7, 3] = value
+    with np.errstate(over="ignore"), pytest.raises(InputError, match=rf"^{name} has 1 of \d+ values .*at \(7, 3\)"):
+        params_from_vggt({**vggt_state_dict, name: bad}, vggt_config)
+
+
+def test_constants_are_skipped_and_the_mask_token_may_be_missing(vggt_state_dict, vggt_config):
+    state_dict = {**vggt_state_dict, "aggregator._resnet_mean": np.zeros((1, 1, 3, 1, 1), np.float32)}
+    del state_dict["aggregator.patch_embed.mask_token"]
+    params, report = params_from_vggt(state_dict, vggt_config)
+    assert "aggregator._resnet_mean" in report.skipped and "encoder/mask_token" in report.initialised
+    assert params["encoder"]["mask_token"].shape == (1, vggt_config.encoder.embed_dim)

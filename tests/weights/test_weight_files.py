@@ -1,5 +1,9 @@
 """Finding and opening checkpoint files."""
 
+import json
+import os
+import struct
+
 import ml_dtypes
 import numpy as np
 import pytest
@@ -58,11 +62,101 @@ def test_a_truncated_safetensors_file_is_an_error(tmp_path, kept):
 
 
 def test_paths_that_hold_no_weights_are_named(tmp_path):
-    other = tmp_path / "model.ckpt"
-    other.write_bytes(b"x")
     with pytest.raises(FileNotFoundError, match=r"nothing: no such file"):
         open_state_dict(tmp_path / "nothing")
-    with pytest.raises(FileNotFoundError, match=r"holds no \.safetensors or \.pt file"):
+    with pytest.raises(FileNotFoundError, match=r"no file of weights .*it holds no file"):
         open_state_dict(tmp_path)
-    with pytest.raises(ValueError, match=r"unknown suffix '\.ckpt'"):
-        open_state_dict(other)
+    (tmp_path / "README.md").write_text("x")
+    with pytest.raises(FileNotFoundError, match=r"no file of weights \(\.safetensors, .*it holds README\.md"):
+        open_state_dict(tmp_path)
+    os.mkfifo(tmp_path / "model.pt")
+    with pytest.raises(FileNotFoundError, match=r"model\.pt: neither a file nor a folder"):
+        open_state_dict(tmp_path / "model.pt")
+
+
+@pytest.mark.parametrize(
+    "name", ["model.pth", "last.ckpt", "pytorch_model.bin", "MODEL.PT", "weights", "model.safetensors"]
+)
+@pytest.mark.parametrize("torch", [False, True])
+def test_the_content_says_what_a_file_is(tmp_path, write_torch_file, name, torch):
+    tensors = {"w": np.arange(3, dtype=np.float32)}
+    (write_torch_file(tmp_path / name, tensors) if torch else save_file(tensors, tmp_path / name))
+    for path in (tmp_path, tmp_path / name):
+        with open_state_dict(path) as found:
+            np.testing.assert_array_equal(found["w"], tensors["w"])
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19.\x80\x02M\xe9\x03.", r"PyTorch 1\.6.*torch\.save"),
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:", "Git LFS.*git lfs pull"),
+        (b"\n<!DOCTYPE html><html>404", "web page"),
+        (b"\x89HDF\r\n\x1a\n", "HDF5"),
+        (b"GGUF\x03\0\0\0", "GGUF"),
+        (b"\x08\x07\x12\x07pytorch", "ONNX"),
+        (b"x" * 257 + b"ustar", "tar archive.*unpack"),
+        (b"\x1f\x8b\x08", "compressed.*unpack"),
+        (b"\x93NUMPY\x01", "NumPy array"),
+        (b"\0" * 600, "zeros.*interrupted"),
+        (b"", "empty"),
+        (b"weights of a friend", "begins with b'weights of a fri'"),
+        (b'{"error": "not found"}', "JSON text.*weight_map"),
+        (b'{"weight_map": ' + b"[" * 100_000, "not valid JSON"),
+        (b'{"weight_map": ' + b"9" * 5000, "not valid JSON"),
+        (b"PK\x03\x04 and then nothing", "zip archive is truncated"),
+    ],
+)
+def test_what_is_no_checkpoint_is_said(tmp_path, content, words):
+    path = tmp_path / "model.pt"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=words) as caught, open_state_dict(path):
+        pass
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def _write_shards(folder, write_torch_file, *, torch):
+    """Two shards of one tensor each, and their index."""
+    weight_map = {}
+    suffix, name = ("bin", "pytorch_model") if torch else ("safetensors", "model")
+    for i, tensor in enumerate("ab", start=1):
+        path = folder / f"{name}-{i:05}-of-00002.{suffix}"
+        content = {tensor: np.full(2, i, np.float32)}
+        (write_torch_file(path, content) if torch else save_file(content, path))
+        weight_map[tensor] = path.name
+    index = folder / f"{name}.{suffix}.index.json"
+    index.write_text(json.dumps({"metadata": {"total_size": 16}, "weight_map": weight_map}))
+    return index
+
+
+@pytest.mark.parametrize("torch", [False, True])
+def test_all_shards_of_an_index_are_read(tmp_path, write_torch_file, torch):
+    index = _write_shards(tmp_path, write_torch_file, torch=torch)
+    for path in (tmp_path, index):
+        with open_state_dict(path) as found:
+            assert {name: found[name][0] for name in found} == {"a": 1, "b": 2}
+    shard = next(tmp_path.glob("*-00002-*"))
+    with pytest.raises(InputError, match="one of several shards"):
+        open_state_dict(shard)
+    shard.unlink()
+    with pytest.raises(FileNotFoundError, match=f"1 of 2 shards are missing, {shard.name}"), open_state_dict(tmp_path):
+        pass
+    index.unlink()
+    with pytest.raises(FileNotFoundError, match="without their index"):
+        open_state_dict(tmp_path)
+
+
+def test_an_index_that_does_not_fit_is_refused(tmp_path, write_torch_file):
+    index = _write_shards(tmp_path, write_torch_file, torch=False)
+    good = json.loads(index.read_text())["weight_map"]
+    for weight_map, words in (({**good, "c": good["a"]}, "which lacks it"), ({"a": "../a.safetensors"}, r"\.\./a")):
+        index.write_text(json.dumps({"weight_map": weight_map}))
+        with pytest.raises(InputError, match=words), open_state_dict(index):
+            pass
+
+
+def test_float8_is_refused_with_the_tensors_name(tmp_path):
+    header = json.dumps({"w": {"dtype": "F8_E4M3", "shape": [4], "data_offsets": [0, 4]}}).encode()
+    (tmp_path / "model.safetensors").write_bytes(struct.pack("<Q", len(header)) + header + bytes(4))
+    with open_state_dict(tmp_path) as found, pytest.raises(InputError, match="tensor w is F8_E4M3"):
+        found["w"]

@@ -16,7 +16,8 @@ from logvggt_jax.evaluation.scratch import scratch_array
 from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.model.parameters import in_compute_type
 from logvggt_jax.streaming import METHODS, Predictor, open_predictor
-from logvggt_jax.weights.checkpoints import digests, load_model
+from logvggt_jax.weights.checkpoints import load_model
+from logvggt_jax.weights.digests import digests
 
 
 class ClipPrediction(NamedTuple):

@@ -30,6 +30,7 @@ def open_source(path: str | Path, **options: Any) -> Source:
     chosen = SourceOptions(**options)
     if is_live(path):
         return VideoSource(path, chosen)
+    given = path
     try:
         path = Path(path).expanduser()
         pictures = names_pictures(path)
@@ -40,7 +41,7 @@ def open_source(path: str | Path, **options: Any) -> Source:
         raise MissingInput(f"{path} does not exist: expected a folder of images or a video file") from error
     except (RuntimeError, ValueError) as error:
         # No such user, or a null character.
-        raise error if isinstance(error, InputError) else InputError(f"{path!r} is no path: {error}") from error
+        raise error if isinstance(error, InputError) else InputError(f"{given!r} is no path: {error}") from error
     if pictures:
         return FolderSource(path, chosen)
     if path.suffix.lower() in IMAGE_SUFFIXES:

@@ -1,0 +1,76 @@
+"""Digests of arrays and of JSON, which find what Orbax and JSON restore without complaint: flipped bits."""
+
+import hashlib
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from logvggt_jax.errors import InputError
+
+_MEND = "the checkpoint is damaged: copy or convert it again"
+_SIZE = 16  # bytes
+
+
+def digests(tree: Any) -> dict[str, str]:
+    """BLAKE2b of dtype, shape and bytes of every leaf of a pytree, under its path (`encoder/norm/scale`).
+
+    Leaves are arrays, Python numbers or typed random keys; arrays of several processes have to be replicated.
+    """
+    return {name: _digest(leaf) for name, leaf in named_leaves(tree)}
+
+
+def verify_digests(tree: Any, expected: dict[str, str], where: str) -> None:
+    """Compares a restored tree with the digests stored when it was saved; `where` is the checkpoint's path.
+
+    Raises InputError naming the leaf that differs, is missing or has no digest.
+    """
+    found = digests(tree)
+    for name in sorted(found.keys() | expected.keys()):
+        if name not in found or name not in expected:
+            which = "is not in the checkpoint" if name not in found else "has no digest"
+            raise InputError(f"{where}: leaf {name} {which}; {_MEND}")
+        if found[name] != expected[name]:
+            raise InputError(
+                f"{where}: leaf {name} differs from its digest ({found[name]}, expected {expected[name]}); {_MEND}"
+            )
+
+
+def json_digest(content: Any) -> str:
+    """BLAKE2b of what JSON text means: the same for other spaces and another order of the keys of a mapping."""
+    canonical = json.dumps(content, sort_keys=True, separators=(",", ":"))
+    return hashlib.blake2b(canonical.encode(), digest_size=_SIZE).hexdigest()
+
+
+def check_finite(tree: Any, where: str) -> None:
+    """Raises InputError naming the first leaf of floating point that holds NaN or an infinite value."""
+    for name, leaf in named_leaves(tree):
+        if wrong := non_finite(np.asarray(leaf)):
+            raise InputError(f"{where}: parameter {name} has {wrong}; such a model predicts nothing, use another one")
+
+
+def non_finite(array: np.ndarray) -> str | None:
+    """How many values of an array are NaN or infinite, and where the first is, in words; None where all are finite."""
+    finite = np.isfinite(array)
+    if finite.all():
+        return None
+    first = tuple(int(axis[0]) for axis in np.nonzero(~finite))
+    return f"{np.count_nonzero(~finite)} of {array.size} values NaN or infinite, first at {first}: {array[first]}"
+
+
+def named_leaves(tree: Any) -> Iterator[tuple[str, Any]]:
+    """Every leaf of a pytree under its path (`encoder/norm/scale`)."""
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+        yield jax.tree_util.keystr(path, simple=True, separator="/"), leaf
+
+
+def _digest(leaf: Any) -> str:
+    if isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+        leaf = jax.random.key_data(leaf)
+    array = np.asarray(leaf)
+    digest = hashlib.blake2b(f"{array.dtype.name}{array.shape}".encode(), digest_size=_SIZE)
+    digest.update(array.tobytes())
+    return digest.hexdigest()
