@@ -86,5 +86,6 @@ def _ends_flat(picture: Image.Image) -> bool:
 
     Of its up to 16 x 16 pixels those that are smoothed with other units' are left out.
     """
-    corner = [length - max(1, (length - 1) % 16 - 1) for length in picture.size]
-    return len(picture.crop((corner[0], corner[1], *picture.size)).getcolors() or ()) == 1
+    right, bottom = picture.size
+    left, top = (length - max(1, (length - 1) % 16 - 1) for length in picture.size)
+    return len(picture.crop((left, top, right, bottom)).getcolors() or ()) == 1

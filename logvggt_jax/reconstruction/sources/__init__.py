@@ -33,17 +33,17 @@ def open_source(path: str | Path, **options: Any) -> Source:
     given = path
     try:
         path = Path(path).expanduser()
-        if names_pictures(path):
-            return FolderSource(path, chosen)
-        with disk_errors(path):
-            path.stat()
+        pictures = names_pictures(path)
+        if not pictures:
+            with disk_errors(path):
+                path.stat()
     except MissingInput as error:
-        if Path(path).exists():
-            raise
         raise MissingInput(f"{path} does not exist: expected a folder of images or a video file") from error
     except (RuntimeError, ValueError) as error:
         # No such user, or a null character.
         raise error if isinstance(error, InputError) else InputError(f"{given!r} is no path: {error}") from error
+    if pictures:
+        return FolderSource(path, chosen)
     if path.suffix.lower() in IMAGE_SUFFIXES:
         raise InputError(f"{path} is a single image: give the folder that holds the sequence, a glob, or a video")
     return VideoSource(path, chosen)

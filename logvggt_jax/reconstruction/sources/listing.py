@@ -130,11 +130,12 @@ def _of_list(path: Path, pattern: str | None) -> Listing:
         text = line.strip()
         if not text or text.startswith("#"):
             continue
-        file = path.parent / Path(text).expanduser()
+        file = path.absolute().parent / text
         with disk_errors(f"{path}, line {number}"):
             if "\0" in text or not file.exists():
                 raise MissingInput(
-                    f"{path}, line {number}: no such file: {text!r}; paths are relative to {path.parent}"
+                    f"{path} is text and taken for a list of images; line {number} names no file: {text!r}; paths are "
+                    f"relative to {path.parent}"
                 )
             if not file.is_file():
                 raise InputError(f"{path}, line {number}: {text!r} is no file: expected an image a line")
