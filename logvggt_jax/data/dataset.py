@@ -63,7 +63,7 @@ class About:
     source: str  # how one gets it
     licence: str  # its terms
     size: str  # bytes and counts, as far as known
-    roles: tuple[str, ...]  # `training`, `evaluation` or both, in the paper
+    roles: tuple[str, ...]  # `training`, `evaluation` or both; as in the paper, where it has the set
     extra: str | None = None  # extra of this package that its files need; None = none
 
 

@@ -111,6 +111,24 @@ def test_a_calibration_of_a_whole_sequence_that_leaves_float32_is_named(tmp_path
     assert named(error, str(tmp_path / "kitchen/focal.txt"))
 
 
+def test_what_leaves_a_copy_without_sequences_is_named(tmp_path: Path):
+    for name, file, complaint in (
+        ("scannet", "scans_train/scene0000_00/intrinsic/intrinsic_depth.txt", "intrinsics are not finite"),
+        ("co3dv2", "apple/sequence_annotations.jgz", "viewpoint_quality_score above 0.5"),
+    ):
+        layout, root = layout_of(name), tmp_path / name
+        layout.write(root, layout.views)
+        if name == "scannet":
+            np.savetxt(root / file, np.full((4, 4), np.nan))
+        else:
+            scores = json.loads(gzip.decompress((root / file).read_bytes()))
+            without = [{**each, "viewpoint_quality_score": None} for each in scores]
+            (root / file).write_bytes(gzip.compress(json.dumps(without).encode()))
+        with pytest.raises(InputError, match=complaint) as error:
+            opened(layout, root)
+        assert named(error, str(root / file))
+
+
 @pytest.mark.parametrize(
     ("place", "value"),
     [

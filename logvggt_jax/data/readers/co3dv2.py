@@ -118,6 +118,12 @@ class Co3Dv2(FolderDataset):
                 f"{self.split!r}; unpack the sequences and lists (the single-sequence subset has none) or choose "
                 "split='all'"
             )
+        if categories and not places:
+            raise EmptySplit(
+                f"{self.root}: no sequence that has a folder has a viewpoint_quality_score above {_MIN_QUALITY} in "
+                f"{_SEQUENCES} of {len(categories)} categories ({categories[0] / _SEQUENCES}, for example): unpack the "
+                "sequences or fetch the annotations again"
+            )
         return places
 
     def _listed_frames(self, category: Path, files: SourceFiles) -> set[tuple[str, int]] | None:

@@ -92,7 +92,8 @@ class HyperSim(FolderDataset):
         camera = _camera(_table_lines(files, self.root / _CAMERA_TABLE), scene, self.root / _CAMERA_TABLE)
         scale = _metres_per_unit(files, folder / "_detail" / "metadata_scene.csv")
         detail = folder / "_detail" / camera_name
-        orientations = _keyframes(files, detail / "camera_keyframe_orientations.hdf5", (None, 3, 3))
+        orientation_file = detail / "camera_keyframe_orientations.hdf5"
+        orientations = _keyframes(files, orientation_file, (None, 3, 3))
         positions = _keyframes(files, detail / "camera_keyframe_positions.hdf5", (len(orientations), 3)) * scale
         final, geometry = (folder / "images" / f"scene_{camera_name}_{kind}_hdf5" for kind in ("final", "geometry"))
         paths = numbered_frames(
@@ -111,7 +112,7 @@ class HyperSim(FolderDataset):
         for number, (image, distance, entities) in paths.items():
             pose = np.eye(4)
             pose[:3, :3], pose[:3, 3] = orientations[number], positions[number]
-            where = f"{detail}, keyframe {number}"
+            where = f"{orientation_file}, keyframe {number}"
             stored = world_to_camera(pose @ OPENGL_AXES, where, stored="camera_to_world")
             extrinsics = None if stored is None else turn @ stored
             name = f"frame.{number:04d}"

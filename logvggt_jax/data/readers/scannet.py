@@ -20,7 +20,7 @@ import numpy as np
 from absl import logging
 
 from logvggt_jax.data.dataset import EVALUATION, TRAINING, About
-from logvggt_jax.data.errors import MissingFiles, UnequalSizes
+from logvggt_jax.data.errors import AbsurdIntrinsics, MissingFiles, UnequalSizes
 from logvggt_jax.data.formats.calibration import numbers, world_to_camera
 from logvggt_jax.data.formats.image import read_depth, read_rgb
 from logvggt_jax.data.formats.numbered_files import numbered_frames, without_gaps
@@ -62,8 +62,10 @@ class ScanNet(FolderDataset):
 
     def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
         places: dict[str, Path] = {}
+        left_out: list[Path] = []
         for scene, folder in sorted(self._chosen_scenes(files).items()):
             if not _is_calibrated(folder, files):
+                left_out.append(folder)
                 logging.warning("%s is left out: its intrinsics are not finite", folder)
                 continue
             names = files.names(folder, "color, depth, pose and intrinsic")
@@ -72,6 +74,11 @@ class ScanNet(FolderDataset):
                 places[scene] = folder
             else:
                 places |= {f"{scene}/{name}": folder / name for name in prepared}
+        if left_out and not places:
+            raise AbsurdIntrinsics(
+                f"{_calibration(left_out[0])}: intrinsics are not finite, nor are those of any other of "
+                f"{len(left_out)} scenes: export them again"
+            )
         return places
 
     def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
@@ -88,7 +95,7 @@ class ScanNet(FolderDataset):
                 files, (folder / "color", "{}.jpg"), (folder / "depth", "{}.png"), (folder / "pose", "{}.txt")
             )
             frames = [(image, depth, _pose(path, files), path) for image, depth, path in export.values()]
-        path = scene / "intrinsic" / "intrinsic_depth.txt"
+        path = _calibration(scene)
         intrinsics = numbers(files.text(path, "the depth camera's intrinsics"), path, count=16).reshape(4, 4)[:3, :3]
         for image, depth, pose, where in frames:
             extrinsics = world_to_camera(pose, where, stored="camera_to_world")
@@ -135,9 +142,13 @@ class ScanNet(FolderDataset):
         return {name: scenes[name] for name in names}
 
 
+def _calibration(scene: Path) -> Path:
+    return scene / "intrinsic" / "intrinsic_depth.txt"
+
+
 def _is_calibrated(scene: Path, files: SourceFiles) -> bool:
     """Whether the intrinsics are finite; a scene without the file passes, so that listing it names the file."""
-    path = scene / "intrinsic" / "intrinsic_depth.txt"
+    path = _calibration(scene)
     return not files.exists(path) or bool(np.isfinite(numbers(files.text(path, "intrinsics"), path)).all())
 
 
