@@ -288,8 +288,8 @@ def test_conversion_replaces_a_model_folder_only_when_asked(folder, vggt_file, v
 
 
 def test_conversion_says_the_space_it_needs_and_stops_without(tmp_path, vggt_file, monkeypatch, capsys):
-    monkeypatch.setattr(checkpoints.shutil, "disk_usage", lambda path: shutil._ntuple_diskusage(10**9, 10**9, 1000))
-    with pytest.raises(DiskError, match=r"takes about [\d.]+ MB, 0\.0 MB are free"):
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: shutil._ntuple_diskusage(10**9, 10**9, 1000))
+    with pytest.raises(DiskError, match=r"needs about [\d.]+ MB, 0\.0 MB are free"):
         convert(vggt_file, tmp_path / "model")
     assert list(tmp_path.iterdir()) == []
     monkeypatch.undo()

@@ -11,7 +11,6 @@ Layout: the root is such a recording, or holds folders that are. A recording hol
 Poses are world-to-camera, OpenCV axes, in a unit of the model's own.
 """
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
@@ -22,6 +21,7 @@ from logvggt_jax.data.errors import missing_files
 from logvggt_jax.data.formats.calibration import in_pixels, relative
 from logvggt_jax.data.formats.colmap_model import ColmapCamera, read_cameras, read_depth_map, read_images
 from logvggt_jax.data.formats.image import read_rgb
+from logvggt_jax.data.formats.ordering import natural_order
 from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame, read_depth_of
 from logvggt_jax.errors import InputError
@@ -63,7 +63,7 @@ class Colmap(FolderDataset):
         model = sparse / "0" if files.exists(sparse / "0") else sparse
         camera_file, cameras = read_cameras(files, model)
         image_file, images = read_images(files, model)
-        images = sorted(images, key=lambda image: _natural_order(image.name))
+        images = [images[position] for position in natural_order([image.name for image in images])]
         paths = [_inside(pictures, image.name, image_file) for image in images]
         names = {each: set(files.names(each, self.expects)) for each in {pictures, *(path.parent for path in paths)}}
         absent = [path for path in paths if path.name not in names[path.parent]]
@@ -88,11 +88,6 @@ class Colmap(FolderDataset):
         is_map = record.depth.suffix == ".bin"
         depth = read_depth_map(record.depth) if is_map else read_depth_of(record, image, _DEPTH_UNITS)
         return image, depth, in_pixels(record.intrinsics, image.shape[:2], record.image, record.calibration)
-
-
-def _natural_order(name: str) -> list[tuple[int, int, str]]:
-    parts = re.split(r"(\d+)", name)
-    return [(1, int(part), part) if part.isdecimal() else (0, 0, part) for part in parts]
 
 
 def _inside(folder: Path, name: str, model_file: Path) -> Path:

@@ -14,10 +14,10 @@ from itertools import pairwise
 from pathlib import Path
 
 from logvggt_jax.data.errors import BrokenPicture
+from logvggt_jax.data.formats.ordering import natural_order, time_stamps
 from logvggt_jax.errors import InputError, MissingInput, MissingPackage, disk_errors
 from logvggt_jax.reconstruction.sources.headers import PictureHeader, read_header
 from logvggt_jax.reconstruction.sources.listing import is_glob, list_pictures, some, stem
-from logvggt_jax.reconstruction.sources.ordering import natural_order, time_stamps
 from logvggt_jax.reconstruction.sources.pictures import read_picture, refuse_depth
 from logvggt_jax.reconstruction.sources.source import SkippedFrame, Source, SourceFrame, SourceOptions, fingerprint
 

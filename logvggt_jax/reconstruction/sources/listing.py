@@ -13,8 +13,8 @@ from collections.abc import Iterable
 from fnmatch import fnmatchcase
 from pathlib import Path
 
+from logvggt_jax.data.formats.ordering import missing_numbers
 from logvggt_jax.errors import InputError, MissingInput, disk_errors
-from logvggt_jax.reconstruction.sources.ordering import missing_numbers
 from logvggt_jax.reconstruction.sources.pictures import IMAGE_SUFFIXES
 
 LIST_SUFFIXES = (".txt", ".lst", ".list")

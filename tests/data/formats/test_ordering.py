@@ -4,7 +4,7 @@ import random
 
 import pytest
 
-from logvggt_jax.reconstruction.sources.ordering import missing_numbers, natural_order, time_stamps
+from logvggt_jax.data.formats.ordering import missing_numbers, natural_order, time_stamps
 
 
 @pytest.mark.parametrize(
