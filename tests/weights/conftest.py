@@ -24,9 +24,11 @@ def vggt_state_dict(vggt_config, random_state_dict):
 
 @pytest.fixture(scope="session")
 def write_torch_file():
-    """Writes a `.pt` file: `write(path, tensors, pickled=None, byteorder=b"little", compression=ZIP_STORED)`.
+    """Writes a file of torch.save: `write(path, content, pickled=None, byteorder=b"little", compression=ZIP_STORED)`.
 
-    `tensors` maps names to arrays or `write.view`s; equal storages are stored once. `pickled` replaces the pickle.
+    `content` maps names to arrays, `write.view`s, numbers, texts, lists, `write.instance`s and mappings of these; equal
+    storages are stored once. `pickled` replaces the pickle.
     """
-    torch_files.write_torch_file.view = torch_files.View
-    return torch_files.write_torch_file
+    write = torch_files.write_torch_file
+    write.view, write.instance = torch_files.View, torch_files.Instance
+    return write

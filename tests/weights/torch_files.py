@@ -57,6 +57,15 @@ class View:
     strides: tuple[int, ...]
 
 
+@dataclasses.dataclass(frozen=True)
+class Instance:
+    """An object of a class with attributes, as trainers keep their settings."""
+
+    module: str
+    name: str
+    attributes: dict
+
+
 def _text(value):
     data = value.encode()
     return b"X" + struct.pack("<I", len(data)) + data
@@ -96,18 +105,39 @@ def _tensor(view, key):
     return _global("torch._utils", "_rebuild_tensor_v2") + arguments + b"R"
 
 
-def write_torch_file(path, tensors, *, pickled=None, byteorder=b"little", compression=zipfile.ZIP_STORED):
-    """Writes a `.pt` file as `torch.save` does; returns its path.
+def _pickled(value, storages):
+    """Instructions that make a value; arrays and views become tensors whose storages are added to `storages`."""
+    if isinstance(value, np.ndarray):
+        strides = tuple(s // value.itemsize for s in value.strides)
+        value = View(np.ravel(value), 0, value.shape, strides)
+    match value:
+        case View():
+            key, _ = storages.setdefault(id(value.storage), (str(len(storages)), value.storage))
+            return _tensor(value, key)
+        case Instance():
+            return _global(value.module, value.name) + b")\x81" + _pickled(value.attributes, storages) + b"b"
+        case dict():
+            items = b"".join(_pickled(name, storages) + _pickled(item, storages) for name, item in value.items())
+            return b"}(" + items + b"u"
+        case list():
+            return b"](" + b"".join(_pickled(item, storages) for item in value) + b"e"
+        case str():
+            return _text(value)
+        case float():
+            return b"G" + struct.pack(">d", value)
+        case int():
+            return _integer(value)
+    raise TypeError(value)
 
-    `tensors` maps names to arrays or `View`s; equal storages are stored once. `pickled` replaces the pickle.
+
+def write_torch_file(path, content, *, pickled=None, byteorder=b"little", compression=zipfile.ZIP_STORED):
+    """Writes a file as `torch.save` does; returns its path.
+
+    `content` maps names to arrays, `View`s, numbers, texts, lists, `Instance`s and mappings of these; equal storages
+    are stored once. `pickled` replaces the pickle.
     """
-    storages, items = {}, b""
-    for name, tensor in tensors.items():
-        if isinstance(tensor, np.ndarray):
-            strides = tuple(s // tensor.itemsize for s in tensor.strides)
-            tensor = View(np.ravel(tensor), 0, tensor.shape, strides)
-        key, _ = storages.setdefault(id(tensor.storage), (str(len(storages)), tensor.storage))
-        items += _text(name) + _tensor(tensor, key)
+    storages = {}
+    items = b"".join(_text(name) + _pickled(value, storages) for name, value in content.items())
     # An OrderedDict whose module metadata is an attribute, as Module.state_dict() returns it.
     metadata = b"}" + _text("_metadata") + _EMPTY_ORDERED_DICT + b"s"
     state_dict = b"\x80\x02" + _EMPTY_ORDERED_DICT + b"(" + items + b"u" + metadata + b"b."
