@@ -7,7 +7,7 @@ from logvggt_jax.data.dataset import check_frames
 from logvggt_jax.data.rooms import ray_caster
 from logvggt_jax.data.rooms.layout import CLEARANCE, STYLES
 from logvggt_jax.data.rooms.rooms import Rooms
-from logvggt_jax.geometry import camera_centres, unproject
+from logvggt_jax.geometry import camera_centres, rotation_angle, unproject
 
 SMALL = {"height": 42, "width": 56, "num_frames": 60, "num_rooms": 4}
 HOUSE = {"rooms": 3, "period": 240, "num_frames": 240}
@@ -39,7 +39,9 @@ def test_cameras_walk_through_all_rooms_and_keep_clear(style: str) -> None:
         changes = visited[np.flatnonzero(np.diff(visited)) + 1].tolist()
         # There and back, wherever it begins.
         assert sorted(changes) == [0, 1, 1, 2] and np.abs(np.diff(visited)).max() == 1
+        turns = rooms.cameras(name, range(720))[1][:, :3, :3]
         assert np.linalg.norm(np.diff(places, axis=0), axis=1).max() < 0.25
+        assert np.rad2deg(rotation_angle(turns[1:], turns[:-1])).max() < 18
 
 
 def test_partitions_have_doors_that_one_sees_through() -> None:
