@@ -82,6 +82,7 @@ def test_lamps_cast_shadows() -> None:
         room, frames = rooms.room(name), rooms.read(name, [0, 30])
         points = unproject(*(a.astype(np.float64) for a in (frames.depth, frames.intrinsics, frames.extrinsics)))
         points, lamp = points.reshape(-1, 3), room.lights[0, :3]
+        assert room.clearance(lamp[None]) > 0 and lamp[1] < -0.5 * room.half_size[1]
         # A little off the surface, and through everything that stands before the lamp.
         start = points + 0.01 * (lamp - points)
         hidden = ray_caster._hidden(room, list(start.T.astype(np.float32)), list((lamp - start).T.astype(np.float32)))
@@ -165,3 +166,15 @@ def test_exposure_changes_brightness_slowly_and_nothing_else() -> None:
 def test_bad_options_are_named(options: dict) -> None:
     with pytest.raises(ValueError, match=f"rooms: .*{next(iter(options))}"):
         Rooms(**options)
+
+
+def test_houses_and_laps_can_face_north_as_well() -> None:
+    ahead, north = (
+        Rooms("train", **{**SMALL, "num_frames": 400}, rooms=2, period=200, laps=2, facing_north=share)
+        for share in (0.0, 1.0)
+    )
+    for name in north.sequences:
+        forward = north.cameras(name, range(400))[1][:, 2, :3]
+        # The swing to either side, and what laps differ by.
+        assert np.degrees(np.abs(np.arctan2(forward[:, 0], forward[:, 2]))).max() < 60 + 31
+        np.testing.assert_allclose(centres(north, name, range(9)), centres(ahead, name, range(9)), atol=1e-5)
