@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from logvggt_jax.config import CameraHeadConfig
 from logvggt_jax.model.initializers import constant
 from logvggt_jax.model.layers import MLP, Block, dense, layer_norm
+from logvggt_jax.model.memory import Memory, RoundMemory
 
 
 class CameraHead(nn.Module):
@@ -22,47 +23,55 @@ class CameraHead(nn.Module):
     implementation: str
 
     @nn.compact
-    def __call__(self, camera_tokens: jax.Array, camera_mask: jax.Array) -> jax.Array:
-        """Pose encodings [B, N, R, 9] after each of the R rounds; the last one is the best.
+    def __call__(
+        self, camera_tokens: jax.Array, camera_mask: jax.Array | None, memory: RoundMemory | None = None
+    ) -> tuple[jax.Array, RoundMemory]:
+        """Pose encodings [B, N, R, 9] after each of the R rounds, the last one the best; and the memory it leaves.
 
-        In the trunk every frame sees all frames that count. No gradient flows from a round into the pose of the round
-        before. Negative fields of view become 0 in the result, and stay negative in what the next round is given.
+        In the trunk every frame sees all frames that count, and what the memory adds. No gradient flows from a round
+        into the pose of the round before. Negative fields of view become 0 in the result, and stay negative in what the
+        next round is given.
 
         Args:
           camera_tokens: [B, N, 2C].
-          camera_mask: which frames count: bool [B, N], or int32 [B] for the first so many.
+          camera_mask: which frames count: bool [B, N], or int32 [B] for the first so many; None for all.
+          memory: of the trunk; None for frames that see one another and nothing else.
         """
-        config = self.config
+        config, memory = self.config, memory or RoundMemory()
         width = camera_tokens.shape[-1]
         tokens = layer_norm(1e-5, "token_norm")(camera_tokens.astype(jnp.float32))
         empty = self.param("empty_pose_tokens", constant(0.0), (1, 1, 9))
         plain = layer_norm(1e-6, "adaptive_norm", affine=False)(tokens)
 
         def one_round(
-            module: CameraHead, carry: tuple[jax.Array, jax.Array], nothing: None
-        ) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
-            del module, nothing  # the submodules below attach to this module's scope by themselves
-            embedded, pose = carry
+            module: CameraHead, carry: tuple[jax.Array, jax.Array, Memory | None], own: Memory | None
+        ) -> tuple[tuple[jax.Array, jax.Array, Memory | None], tuple[jax.Array, Memory | None]]:
+            del module  # the submodules below attach to this module's scope by themselves
+            embedded, pose, shared = carry
+            seen = shared if own is None else own
             features = jax.nn.silu(dense(width, "embed_pose")(embedded))
             shift, scale, gate = jnp.split(dense(3 * width, "modulation")(features), 3, axis=-1)
             z = gate * (plain * (1.0 + scale) + shift) + tokens
             for i in range(config.depth):
-                z, _ = Block(
+                z, left = Block(
                     config.num_heads,
                     4,
                     epsilon=1e-5,
                     layer_scale=config.layer_scale,
                     implementation=self.implementation,
                     name=f"trunk_{i}",
-                )(z, valid=camera_mask)
+                )(z, valid=camera_mask, memory=None if seen is None else seen.at(i))
+                if seen is not None and left is not None:
+                    seen = seen.updated(i, left)
             z = layer_norm(1e-5, "trunk_norm")(z)
             pose = jax.lax.stop_gradient(pose) + MLP(width // 2, 9, "float32", name="pose_branch")(z)
             emitted = jnp.concatenate([pose[..., :7], jax.nn.relu(pose[..., 7:])], axis=-1)
-            return (jax.lax.stop_gradient(pose), pose), emitted
+            own, shared = (own, seen) if own is None else (seen, shared)
+            return (jax.lax.stop_gradient(pose), pose, shared), (emitted, own)
 
         shape = (*tokens.shape[:2], 9)
         first = jnp.broadcast_to(empty, shape)
         initial = jnp.broadcast_to(jnp.asarray(config.initial_pose, jnp.float32), shape)
         rounds = nn.scan(one_round, variable_broadcast="params", split_rngs={"params": False}, length=config.iterations)
-        _, encodings = rounds(self, (first, initial), None)
-        return jnp.moveaxis(encodings, 0, 2)
+        (_, _, shared), (encodings, each) = rounds(self, (first, initial, memory.shared), memory.each)
+        return jnp.moveaxis(encodings, 0, 2), RoundMemory(each, shared)

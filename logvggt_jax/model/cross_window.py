@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from logvggt_jax.model.memory import Keys, LayerMemory, Project
+from logvggt_jax.model.memory import Attend, Keys, LayerMemory, OwnTokens, Project
 
 
 @struct.dataclass
@@ -32,18 +32,19 @@ class CachedTokens:
     tokens: jax.Array
     length: jax.Array
 
-    def extend(self, own: Keys, project: Project) -> tuple[Keys, LayerMemory]:
-        """Keys and values [H, C]; the cache is replaced by the windows, not by the block."""
+    def attend(self, own: OwnTokens, attention: Attend, project: Project) -> tuple[jax.Array, LayerMemory]:
+        """Keys and values are [H, C]; the cache is replaced by the windows, not by the block."""
         batch, frames, tokens, width = self.tokens.shape
         cached = project(self.tokens.astype(jnp.float32).reshape(batch, frames * tokens, width))
+        key, value, valid = own.keys
         empty = self.length == 0
-        count = jnp.int32(own.key.shape[1]) if own.valid is None else own.valid
+        count = jnp.int32(key.shape[1]) if valid is None else valid
         keys = Keys(
-            _joined(own.key, cached.key, empty),
-            _joined(own.value, cached.value, empty),
+            _joined(key, cached.key, empty),
+            _joined(value, cached.value, empty),
             count + self.length * tokens,
         )
-        return keys, self
+        return attention(own.query, keys), self
 
 
 @struct.dataclass

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from logvggt_jax.model.attention import attention
 from logvggt_jax.model.initializers import constant, fan_in_normal
-from logvggt_jax.model.memory import Keys, LayerMemory
+from logvggt_jax.model.memory import Keys, LayerMemory, OwnTokens
 from logvggt_jax.model.precision import product_precision
 from logvggt_jax.model.rope import RopeTable, apply_rope
 
@@ -123,10 +123,13 @@ class Attention(nn.Module):
         key = key if rope is None else apply_rope(key, rope)
         return Keys(key.astype(self.dtype), value.astype(self.dtype), valid)
 
-    def __call__(self, query: jax.Array, keys: Keys) -> jax.Array:
-        """Queries [B, N, heads, head_dim] to the branch [B, N, C], before its LayerScale."""
-        out = attention(query, keys.key, keys.value, keys.valid, implementation=self.implementation)
-        return self.output(out.reshape(*out.shape[:2], self.width))
+    def attend(self, query: jax.Array, keys: Keys) -> jax.Array:
+        """Queries [B, Q, heads, head_dim] to what they take in of the keys, of the same shape."""
+        return attention(query, keys.key, keys.value, keys.valid, implementation=self.implementation)
+
+    def __call__(self, taken: jax.Array) -> jax.Array:
+        """What the tokens take in, [B, N, heads, head_dim], to the branch [B, N, C], before its LayerScale."""
+        return self.output(taken.reshape(*taken.shape[:2], self.width))
 
     def _heads(self, x: jax.Array) -> jax.Array:
         return x.reshape(*x.shape[:-1], self.num_heads, self.width // self.num_heads)
@@ -157,8 +160,8 @@ class Block(nn.Module):
     ) -> tuple[jax.Array, LayerMemory | None]:
         """Tokens after the block, and the memory that it leaves.
 
-        Every token of `x` is a query. It attends to the tokens of `x` that count and to those that `memory` has stored;
-        all of them pass through this block's own LayerNorm and projections:
+        Every token of `x` is a query. It attends to the tokens of `x` that count and to what `memory` adds; tokens that
+        a memory has stored pass through this block's own LayerNorm and projections:
 
             x ← x + γ₁ · Attn(Q(LN(x)), [K(LN(x)), K(LN(stored))], [V(LN(x)), V(LN(stored))])
             x ← x + γ₂ · MLP(LN(x))
@@ -174,11 +177,12 @@ class Block(nn.Module):
         norm1 = layer_norm(self.epsilon, "norm1", self.dtype)
         attention_ = Attention(self.num_heads, width, self.qk_norm, self.dtype, self.implementation, name="attention")
         normed = norm1(x)
-        keys = attention_.keys(normed, rope, valid)
-        if memory is not None:
-            keys, memory = memory.extend(keys, lambda tokens: attention_.keys(norm1(tokens), rope))
-        branch = attention_(attention_.queries(normed, rope), keys)
-        x = x + LayerScale(self.layer_scale, name="scale1")(branch)
+        own = OwnTokens(normed, attention_.queries(normed, rope), attention_.keys(normed, rope, valid))
+        if memory is None:
+            taken = attention_.attend(own.query, own.keys)
+        else:
+            taken, memory = memory.attend(own, attention_.attend, lambda tokens: attention_.keys(norm1(tokens), rope))
+        x = x + LayerScale(self.layer_scale, name="scale1")(attention_(taken))
         branch = MLP(self.mlp_ratio * width, width, self.dtype, name="mlp")(
             layer_norm(self.epsilon, "norm2", self.dtype)(x)
         )

@@ -1,7 +1,8 @@
-"""What a global block may attend to besides the tokens of its own window: the seam between methods.
+"""What a block may attend to besides the tokens of its own window: the seam between methods.
 
-The aggregator hands every global block the memory of its layer and knows no method by name. Cross-window attention
-(`cross_window.py`) is one memory; a key-value cache that grows, rolls or is pruned is another.
+The aggregator hands every global block the memory of its layer, the camera head every block of its trunk, and neither
+knows a method by name. Cross-window attention (`cross_window.py`) is one memory; a key-value cache that grows, rolls or
+is pruned is another, and so is a mask or a merging of the block's own tokens, which remembers nothing.
 """
 
 from __future__ import annotations
@@ -26,31 +27,62 @@ class Keys(NamedTuple):
     valid: jax.Array | None
 
 
+class OwnTokens(NamedTuple):
+    """A block's own tokens on their way into its attention.
+
+    Attributes:
+      normed: [B, N, C] float32, after the block's LayerNorm.
+      query: [B, N, heads, head_dim], normalised and rotated.
+      keys: of the same tokens; `valid` says which of them count.
+    """
+
+    normed: jax.Array
+    query: jax.Array
+    keys: Keys
+
+
+Attend = Callable[[jax.Array, Keys], jax.Array]
+"""Queries [B, Q, heads, head_dim] and the keys that all of them see, to [B, Q, heads, head_dim]. It has no parameters
+and may stand in loops."""
+
 Project = Callable[[jax.Array], Keys]
 """Tokens [B, n · P, C] of n frames, as the residual stream has them, to their keys and values in this block: its
 LayerNorm, projections, key norm and rotary embedding."""
 
 
 class LayerMemory(Protocol):
-    """A pytree: what one layer's global block has seen before."""
+    """A pytree: what one block has seen before, and how its tokens attend to it."""
 
-    def extend(self, own: Keys, project: Project) -> tuple[Keys, LayerMemory]:
-        """The keys that the block's queries attend to, and the memory that the block leaves.
+    def attend(self, own: OwnTokens, attention: Attend, project: Project) -> tuple[jax.Array, LayerMemory]:
+        """What the block's N tokens take in, [B, N, heads, head_dim], and the memory that the block leaves.
 
         Args:
-          own: the keys of the block's own tokens.
-          project: makes keys of stored tokens.
+          own: the block's own tokens.
+          attention: the block's attention, of queries to keys.
+          project: makes keys of tokens that are stored as the residual stream has them.
         """
         ...
 
 
 class Memory(Protocol):
-    """A pytree: the memories of all layers."""
+    """A pytree: the memories of all layers of a stack of blocks."""
 
     def at(self, layer: int) -> LayerMemory | None:
-        """What the global block of `layer` (0-based) reads; None where it sees its own window alone."""
+        """What the block of `layer` (0-based) reads; None where it sees its own tokens alone."""
         ...
 
     def updated(self, layer: int, memory: LayerMemory) -> Memory:
-        """The memory after the global block of `layer`, which left `memory`."""
+        """The memory after the block of `layer`, which left `memory`."""
         ...
+
+
+class RoundMemory(NamedTuple):
+    """What the camera head's trunk remembers, over its R rounds of correction; one of the two is None.
+
+    Attributes:
+      each: a memory for each round, every leaf with a leading axis of R: a round sees what the same round has left.
+      shared: one memory that all rounds read and write one after the other.
+    """
+
+    each: Memory | None = None
+    shared: Memory | None = None

@@ -223,7 +223,8 @@ class Refinement:
         check_array("camera_tokens", camera_tokens, (None, None, self._width), jnp.floating)
         if frames.ndim != 1:
             check_array("camera_mask", frames, camera_tokens.shape[:2], jnp.bool_)
-        return run(self.camera_head, variables["params"]["camera_head"], camera_tokens, frames)
+        encodings, _ = run(self.camera_head, variables["params"]["camera_head"], camera_tokens, frames)
+        return encodings
 
     @property
     def camera_head(self) -> CameraHead:

@@ -11,7 +11,7 @@ from flax import struct
 from logvggt_jax import ModelConfig
 from logvggt_jax.model.aggregator import Aggregator
 from logvggt_jax.model.cross_window import CrossWindowMemory
-from logvggt_jax.model.memory import Keys, LayerMemory, Project
+from logvggt_jax.model.memory import Attend, Keys, LayerMemory, OwnTokens, Project
 
 GRID, WIDTH, FRAMES = (2, 3), 32, 3
 TOKENS = 5 + GRID[0] * GRID[1]
@@ -25,12 +25,13 @@ class LayerCache:
     value: jax.Array
     length: jax.Array
 
-    def extend(self, own: Keys, project: Project) -> tuple[Keys, LayerMemory]:
+    def attend(self, own: OwnTokens, attention: Attend, project: Project) -> tuple[jax.Array, LayerMemory]:
         def write(cache: jax.Array, new: jax.Array) -> jax.Array:
             return jax.lax.dynamic_update_slice_in_dim(cache, new, self.length[0], axis=1)
 
-        longer = LayerCache(write(self.key, own.key), write(self.value, own.value), self.length + own.key.shape[1])
-        return Keys(longer.key, longer.value, longer.length), longer
+        key, value, _ = own.keys
+        longer = LayerCache(write(self.key, key), write(self.value, value), self.length + key.shape[1])
+        return attention(own.query, Keys(longer.key, longer.value, longer.length)), longer
 
 
 @struct.dataclass
