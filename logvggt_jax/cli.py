@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 OUTPUT_LOST, BAD_INPUT, INTERRUPTED = 1, 2, 130
 SOURCE_OPTIONS = ("stride", "max_frames", "fps", "start", "end", "pattern", "size_mismatch", "strict")
-MODES = ("windows", "chunks", "offline")  # the registry of methods, which would load JAX
+MODES = ("windows", "chunks", "offline", "merged")  # the registry of methods, which would load JAX
 PROBLEMS_FOUND = 1
 
 
@@ -330,7 +330,8 @@ def _parser() -> argparse.ArgumentParser:
         default="auto",
         help="windows: LoG-VGGT's stream. chunks: plain VGGT on overlapping chunks chained by similarities, for public "
         "VGGT weights, which never learned the relay from window to window. offline: plain VGGT on all frames at once, "
-        "where they fit the memory. auto: what the weights were trained for",
+        "where they fit the memory. merged: the same with merged tokens (FastVGGT). auto: what the weights were "
+        "trained for",
     )
     sub.add_argument(
         "--chunk-size",

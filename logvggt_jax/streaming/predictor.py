@@ -15,6 +15,7 @@ import numpy as np
 from logvggt_jax.errors import InputError
 from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.streaming.chunks import ChunkPlan, ChunkSession, chunk_program
+from logvggt_jax.streaming.merged import MergedSession, MergedSettings, merged_program
 from logvggt_jax.streaming.offline import OfflineSession, OfflineSettings, offline_program
 from logvggt_jax.streaming.program import Program
 from logvggt_jax.streaming.results import Cameras, FrameResult
@@ -107,6 +108,14 @@ METHODS: dict[str, Method] = {
         "vggt",
         "overlapping chunks without memory, chained by robust similarities",
         chunk_program,
+    ),
+    "merged": Method(
+        "FastVGGT",
+        MergedSession,
+        MergedSettings,
+        "vggt",
+        "all frames at once, merged tokens in the global attention",
+        merged_program,
     ),
 }
 

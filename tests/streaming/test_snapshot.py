@@ -21,6 +21,7 @@ CASES = {
     "windows without refinement": ("windows", None, RefinementConfig(enabled=False)),
     "chunks": ("chunks", ChunkPlan(4, 2), RefinementConfig()),
     "offline": ("offline", None, RefinementConfig()),
+    "merged": ("merged", None, RefinementConfig()),
 }
 
 
