@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -102,10 +103,8 @@ def _predict(model: LogVGGT, variables: Variables, images: jax.Array, merging: T
     out = windows.decode_dense(variables, tokens, mask, size)
     encodings = model.refinement.refine_sequence(variables, out.camera_tokens, out.register_tokens, mask)
     extrinsics, intrinsics = decode_poses(encodings[:, :, -1], size)
-    prediction = PlainPrediction(
-        out.depth, out.depth_confidence, extrinsics, intrinsics, out.points, out.points_confidence
-    )
-    return jax.tree.map(lambda x: x[0], prediction)
+    arrays: Any = (out.depth, out.depth_confidence, extrinsics, intrinsics, out.points, out.points_confidence)
+    return jax.tree.map(lambda x: x[0], PlainPrediction(*arrays))
 
 
 def merged_program(
