@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from logvggt_jax.errors import InputError, disk_errors, one_line
+from logvggt_jax.errors import InputError, disk_errors, one_line, printable
 from logvggt_jax.interruption import Interrupted
 from logvggt_jax.terminal import forgiving_streams
 
@@ -109,8 +109,9 @@ def _reconstruct(options: argparse.Namespace) -> int:
     needs = describe(source, target, config if options.dry_run else None, method, settings, longer_edge, point_filter)
     if provenance.longer_edge not in (None, longer_edge):
         source.notes.append(f"these weights were trained at {provenance.longer_edge} pixels, not {longer_edge}")
+    said = len(source.notes)
     for note in source.notes:
-        print(f"logvggt: note: {note}", file=sys.stderr)
+        print(f"logvggt: note: {printable(note)}", file=sys.stderr)
     for line in needs:
         print(line if options.dry_run else f"logvggt: {line}", file=sys.stdout if options.dry_run else sys.stderr)
     if options.dry_run:
@@ -130,6 +131,8 @@ def _reconstruct(options: argparse.Namespace) -> int:
         num_previews=options.previews,
         overwrite=options.overwrite,
     )
+    for note in source.notes[said:]:  # what only reading told
+        print(f"logvggt: note: {printable(note)}", file=sys.stderr)
     print(result.summary())
     return 0 if result.complete else INTERRUPTED
 
@@ -182,7 +185,7 @@ def _info(options: argparse.Namespace) -> None:
     model, variables = load_model(options.checkpoint)
     console = Console()
     console.print(model_summary(model.config, variables["params"]))
-    console.print(provenance_lines(read_provenance(options.checkpoint)), highlight=False, soft_wrap=True)
+    console.print(provenance_lines(read_provenance(options.checkpoint)), highlight=False, markup=False, soft_wrap=True)
     console.print("every parameter is finite and equals the digest stored with it")
 
 
@@ -521,4 +524,4 @@ def _with_dashes(arguments: Sequence[str]) -> list[str]:
 
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
-    print(f"logvggt: warning: {message}", file=sys.stderr)
+    print(f"logvggt: warning: {printable(str(message))}", file=sys.stderr)

@@ -51,11 +51,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     started = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="fuzz-", ignore_cleanup_errors=True) as folder:
         settings = {"workers": options.workers, "limit": options.limit, "keep": options.keep}
-        for outcome in run_cases(KINDS, cases, Path(folder), **settings):
-            counts[outcome.kind, outcome.verdict] += 1
-            if outcome.failed:
-                command = f"python scripts/fuzz.py --kind {outcome.kind} --seed {outcome.seed} --cases 1"
-                print(json.dumps({**dataclasses.asdict(outcome), "again": command}), flush=True)
+        try:
+            for outcome in run_cases(KINDS, cases, Path(folder), **settings):
+                counts[outcome.kind, outcome.verdict] += 1
+                if outcome.failed:
+                    command = f"python scripts/fuzz.py --kind {outcome.kind} --seed {outcome.seed} --cases 1"
+                    print(json.dumps({**dataclasses.asdict(outcome), "again": command}), flush=True)
+        except KeyboardInterrupt:
+            print("interrupted: the cases so far", file=sys.stderr)
     _print_summary(chosen, counts, time.monotonic() - started)
     return any(verdict not in ("result", "line") for _, verdict in counts)
 

@@ -6,6 +6,7 @@ import jax
 from rich.table import Table
 
 from logvggt_jax.config import ModelConfig
+from logvggt_jax.errors import printable
 from logvggt_jax.weights.provenance import Provenance
 
 
@@ -47,4 +48,4 @@ def provenance_lines(provenance: Provenance) -> str:
         "licence": provenance.licence,
         "source": provenance.source,
     }
-    return "\n".join(f"{title}: {value or 'not recorded'}" for title, value in lines.items())
+    return "\n".join(f"{title}: {printable(value or 'not recorded')}" for title, value in lines.items())

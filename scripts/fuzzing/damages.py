@@ -44,11 +44,24 @@ def _one_damage(root: Path, random: np.random.Generator) -> str:
         change_place(path)
         return f"{place}: {name}"
     name, change = _pick(_contents(path, [Path(name) for _, name in files]), random)
+    _write(path, change(_read(path), random))
+    return f"{place}: {name}"
+
+
+def _read(path: Path) -> bytes:
+    """What is in a file, also in one that was made unreadable before."""
     mode = path.stat().st_mode
     path.chmod(0o600)
-    path.write_bytes(change(path.read_bytes(), random))
+    content = path.read_bytes()
     path.chmod(mode)
-    return f"{place}: {name}"
+    return content
+
+
+def _write(path: Path, content: bytes) -> None:
+    mode = path.stat().st_mode
+    path.chmod(0o600)
+    path.write_bytes(content)
+    path.chmod(mode)
 
 
 def _pick(choices: dict, random: np.random.Generator) -> tuple:
@@ -78,8 +91,7 @@ def _contents(path: Path, files: list[Path]) -> dict[str, Damage]:
     damages: dict[str, Damage] = {**CONTENT_DAMAGES, **_BYTES}
 
     def another(content: bytes, random: np.random.Generator) -> bytes:
-        readable = [file for file in files if os.access(file, os.R_OK)]
-        return readable[random.integers(len(readable))].read_bytes()
+        return _read(files[random.integers(len(files))])
 
     damages["content of another file"] = another
     suffix = path.suffix.lower()
@@ -272,4 +284,4 @@ def _renamed(path: Path) -> None:
 
 
 def _copied(path: Path) -> None:
-    path.with_name(f"{path.stem} (1){path.suffix}").write_bytes(path.read_bytes())
+    path.with_name(f"{path.stem} (1){path.suffix}").write_bytes(_read(path))

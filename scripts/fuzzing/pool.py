@@ -8,6 +8,7 @@ import os
 import resource
 import shutil
 import time
+import traceback
 from collections.abc import Iterable, Iterator, Sequence
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
@@ -138,7 +139,11 @@ def _work(connection: Connection, kinds: list[Kind], folder: Path, keep: Path | 
                 connection.send(Outcome(name, seed, "exception", "none", f"the valid input is not read: {error!r}"))
                 continue
         connection.send(_READY)
-        connection.send(run_case(kind, valid, folder / "case", seed, keep))
+        try:
+            outcome = run_case(kind, valid, folder / "case", seed, keep)
+        except Exception:
+            outcome = Outcome(name, seed, "exception", detail=f"the harness itself: {traceback.format_exc()}")
+        connection.send(outcome)
         shutil.rmtree(folder / "cache", ignore_errors=True)
 
 

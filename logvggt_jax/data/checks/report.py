@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from logvggt_jax.errors import printable
+
 # What a terminal shows; JSON has everything.
 _LINES, _EXAMPLES = 40, 3
 
@@ -105,7 +107,7 @@ class CheckReport:
             lines.append(f"({len(shown):,} of {len(self.sequences):,} sequences shown; --json prints all)")
         for sequence in faulty:
             lines += _problem_lines(sequence)
-        return "\n".join(lines)
+        return "\n".join(map(printable, lines))
 
     def _totals(self) -> Iterator[str]:
         frames = sum(sequence.num_frames for sequence in self.sequences)
