@@ -71,7 +71,16 @@ def _convert(options: argparse.Namespace) -> None:
     from logvggt_jax.weights.checkpoints import convert
 
     check_devices()
-    report = convert(options.source, options.output, point_head=options.point_head, overwrite=options.overwrite)
+    report = convert(
+        options.source,
+        options.output,
+        point_head=options.point_head,
+        overwrite=options.overwrite,
+        trained_for=options.trained_for,
+    )
+    if options.keys:
+        for name in report.used:
+            print(f"  used: {name} -> {', '.join(report.targets[name])}")
     for title, names in (("skipped", report.skipped), ("initialised", report.initialised)):
         for name in names:
             print(f"  {title}: {name}")
@@ -280,6 +289,16 @@ def _parser() -> argparse.ArgumentParser:
     )
     sub.add_argument("--output", type=Path, required=True, metavar="DIR", help="model folder to make")
     sub.add_argument("--point-head", action="store_true", help="keep the point head")
+    sub.add_argument(
+        "--trained-for",
+        choices=("vggt", "causal"),
+        default="vggt",
+        help="vggt: all frames at once. causal: each frame sees those before it, as StreamVGGT's checkpoints, whose "
+        "names and shapes are VGGT's",
+    )
+    sub.add_argument(
+        "--keys", action="store_true", help="list every tensor that is used and what it becomes, not the others alone"
+    )
     sub.add_argument("--overwrite", action="store_true", help="replace an earlier model folder")
 
     sub = command(

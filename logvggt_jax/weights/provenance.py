@@ -10,8 +10,9 @@ from logvggt_jax.config import check_longer_edge
 class Provenance:
     """Kept in a model folder beside the sizes; None where it is not known."""
 
-    # `windows`, LoG-VGGT's windows with memory between them; or `vggt`, all frames at once, as public VGGT weights are.
-    trained_for: Literal["windows", "vggt"] | None = None
+    # `windows`, LoG-VGGT's windows with memory between them; `vggt`, all frames at once, as public VGGT weights are; or
+    # `causal`, frames that see those before them, as StreamVGGT's are.
+    trained_for: Literal["windows", "vggt", "causal"] | None = None
     # Pixels of the longer edge of the largest images that they were trained on, a multiple of 14.
     longer_edge: int | None = None
     licence: str | None = None  # of the weights, as their source names it

@@ -40,7 +40,11 @@ def model_summary(config: ModelConfig, params: dict[str, Any]) -> Table:
 
 def provenance_lines(provenance: Provenance) -> str:
     """What the weights were trained for and where they come from, one line each."""
-    purpose = {"windows": "windows (LoG-VGGT)", "vggt": "all frames at once (VGGT)"}
+    purpose = {
+        "windows": "windows (LoG-VGGT)",
+        "vggt": "all frames at once (VGGT)",
+        "causal": "each frame sees those before it (StreamVGGT)",
+    }
     edge = provenance.longer_edge
     lines = {
         "trained for": purpose.get(provenance.trained_for or ""),
