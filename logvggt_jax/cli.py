@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 
 OUTPUT_LOST, BAD_INPUT, INTERRUPTED = 1, 2, 130
 SOURCE_OPTIONS = ("stride", "max_frames", "fps", "start", "end", "pattern", "size_mismatch", "strict")
-MODES = ("windows", "chunks", "offline", "merged")  # the registry of methods, which would load JAX
+# The registry of methods, which would load JAX.
+MODES = ("windows", "chunks", "offline", "merged", "causal", "anchored-window", "rolling")
 PROBLEMS_FOUND = 1
 
 
@@ -113,7 +114,7 @@ def _reconstruct(options: argparse.Namespace) -> int:
     config = read_config(checkpoint, dtype=options.dtype)
     check_devices()
     enable_compilation_cache(options.compilation_cache)
-    method = choose_method(provenance, None if options.mode == "auto" else options.mode)
+    method = choose_method(provenance, None if options.method == "auto" else options.method)
     settings = _settings(options, method)
     needs = describe(source, target, config if options.dry_run else None, method, settings, longer_edge, point_filter)
     if provenance.longer_edge not in (None, longer_edge):
@@ -347,13 +348,16 @@ def _parser() -> argparse.ArgumentParser:
         "--dtype", choices=("float32", "bfloat16"), default=None, help="compute type instead of the checkpoint's own"
     )
     sub.add_argument(
+        "--method",
         "--mode",
+        dest="method",
         choices=("auto", *MODES),
         default="auto",
         help="windows: LoG-VGGT's stream. chunks: plain VGGT on overlapping chunks chained by similarities, for public "
         "VGGT weights, which never learned the relay from window to window. offline: plain VGGT on all frames at once, "
-        "where they fit the memory. merged: the same with merged tokens (FastVGGT). auto: what the weights were "
-        "trained for",
+        "where they fit the memory. merged: the same with merged tokens (FastVGGT). causal (StreamVGGT), "
+        "anchored-window (STream3R), rolling (InfiniteVGGT): frame by frame with a cache of all earlier frames, of the "
+        "first and the newest, or within a budget. auto: what the weights were trained for",
     )
     sub.add_argument(
         "--chunk-size",

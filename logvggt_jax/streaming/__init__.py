@@ -1,15 +1,20 @@
-"""How frames become predictions: windows of LoG-VGGT, plain VGGT on chunks, plain VGGT on everything."""
+"""How frames become predictions: LoG-VGGT's windows, and the other methods for the same network."""
 
+from logvggt_jax.streaming.anchored_window import AnchoredWindowSettings
+from logvggt_jax.streaming.causal import CausalSettings
 from logvggt_jax.streaming.chunks import ChunkPlan, ChunkSession
 from logvggt_jax.streaming.merged import MergedSession, MergedSettings
 from logvggt_jax.streaming.offline import OfflineSession, OfflineSettings
 from logvggt_jax.streaming.predictor import METHODS, Method, Predictor, open_predictor
 from logvggt_jax.streaming.results import Cameras, FrameResult, PredictionError
+from logvggt_jax.streaming.rolling import RollingSettings
 from logvggt_jax.streaming.windows import StreamSession, WindowSettings
 
 __all__ = [
     "METHODS",
+    "AnchoredWindowSettings",
     "Cameras",
+    "CausalSettings",
     "ChunkPlan",
     "ChunkSession",
     "FrameResult",
@@ -20,6 +25,7 @@ __all__ = [
     "OfflineSettings",
     "PredictionError",
     "Predictor",
+    "RollingSettings",
     "StreamSession",
     "WindowSettings",
     "open_predictor",

@@ -14,11 +14,18 @@ import numpy as np
 
 from logvggt_jax.errors import InputError
 from logvggt_jax.model.logvggt import LogVGGT, Variables
+from logvggt_jax.streaming.anchored_window import (
+    AnchoredWindowSettings,
+    anchored_window_program,
+    open_anchored_window,
+)
+from logvggt_jax.streaming.causal import CausalSettings, causal_program, open_causal
 from logvggt_jax.streaming.chunks import ChunkPlan, ChunkSession, chunk_program
 from logvggt_jax.streaming.merged import MergedSession, MergedSettings, merged_program
 from logvggt_jax.streaming.offline import OfflineSession, OfflineSettings, offline_program
 from logvggt_jax.streaming.program import Program
 from logvggt_jax.streaming.results import Cameras, FrameResult
+from logvggt_jax.streaming.rolling import RollingSettings, open_rolling, rolling_program
 from logvggt_jax.streaming.windows import StreamSession, WindowSettings, window_program
 
 
@@ -70,7 +77,8 @@ class Method(NamedTuple):
       title: what tables call it.
       open: model, variables and settings to a predictor of one sequence.
       settings: the frozen dataclass of what can be set, all fields with defaults.
-      trained_for: what its weights have to be trained for: `windows` (LoG-VGGT) or `vggt` (plain VGGT).
+      trained_for: what its weights have to be trained for: `windows` (LoG-VGGT), `vggt` (plain VGGT) or `causal`
+        (StreamVGGT).
       summary: what the method does, in a few words.
       program: model, (H, W) of the images, settings and number of frames (None: not known) to the program in which the
         method spends its time.
@@ -116,6 +124,30 @@ METHODS: dict[str, Method] = {
         "vggt",
         "all frames at once, merged tokens in the global attention",
         merged_program,
+    ),
+    "causal": Method(
+        "StreamVGGT",
+        open_causal,
+        CausalSettings,
+        "causal",
+        "each frame sees all before it through a cache of their keys and values",
+        causal_program,
+    ),
+    "anchored-window": Method(
+        "STream3R's window",
+        open_anchored_window,
+        AnchoredWindowSettings,
+        "causal",
+        "each frame sees the first and the newest few through a cache",
+        anchored_window_program,
+    ),
+    "rolling": Method(
+        "InfiniteVGGT",
+        open_rolling,
+        RollingSettings,
+        "causal",
+        "a cache within a budget, which drops the keys that are most like the others",
+        rolling_program,
     ),
 }
 

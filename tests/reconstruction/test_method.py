@@ -7,6 +7,7 @@ import warnings
 import pytest
 
 from logvggt_jax.reconstruction.method import choose_method
+from logvggt_jax.streaming import METHODS
 from logvggt_jax.weights.provenance import Provenance
 
 
@@ -18,6 +19,9 @@ from logvggt_jax.weights.provenance import Provenance
         ("vggt", None, "chunks"),
         ("vggt", "chunks", "chunks"),
         ("vggt", "offline", "offline"),
+        ("causal", None, "causal"),
+        ("causal", "rolling", "rolling"),
+        ("causal", "anchored-window", "anchored-window"),
         (None, "windows", "windows"),
     ],
 )
@@ -33,6 +37,10 @@ def test_weights_are_used_as_they_were_trained(trained_for: str, asked: str | No
         ("vggt", "windows", "windows", "never learned to pass the first camera on"),
         ("windows", "chunks", "chunks", "chunks shows them more frames at once"),
         ("windows", "offline", "offline", "offline shows them more frames at once"),
+        ("vggt", "causal", "causal", "causal shows a frame earlier ones alone.*leave --mode out for chunks"),
+        ("windows", "rolling", "rolling", "rolling gives all layers a memory.*leave --mode out for windows"),
+        ("causal", "windows", "windows", "never learned to pass the first camera on.*leave --mode out for causal"),
+        ("causal", "offline", "offline", "offline shows them later ones as well"),
         (None, None, "windows", "does not say what its weights were trained for"),
     ],
 )
@@ -41,3 +49,13 @@ def test_another_use_is_a_warning_that_says_why(
 ) -> None:
     with pytest.warns(UserWarning, match=why):
         assert choose_method(Provenance(trained_for), asked) == method
+
+
+def test_whatever_the_weights_there_is_at_most_one_warning() -> None:
+    for trained_for in ("windows", "vggt", "causal", None):
+        for method in METHODS:
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always")
+                choose_method(Provenance(trained_for), method)  # type: ignore[arg-type]
+            suits = trained_for in (None, METHODS[method].trained_for)
+            assert len(caught) == (0 if suits else 1), (trained_for, method)

@@ -12,7 +12,16 @@ from safetensors.numpy import load_file, save_file
 
 from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.config import RefinementConfig
-from logvggt_jax.streaming import METHODS, ChunkPlan, FrameResult, Predictor, open_predictor
+from logvggt_jax.streaming import (
+    METHODS,
+    AnchoredWindowSettings,
+    CausalSettings,
+    ChunkPlan,
+    FrameResult,
+    Predictor,
+    RollingSettings,
+    open_predictor,
+)
 
 COUNT = 11
 CASES = {
@@ -22,6 +31,10 @@ CASES = {
     "chunks": ("chunks", ChunkPlan(4, 2), RefinementConfig()),
     "offline": ("offline", None, RefinementConfig()),
     "merged": ("merged", None, RefinementConfig()),
+    "causal": ("causal", CausalSettings(first_capacity=2), RefinementConfig()),
+    "causal with one camera cache": ("causal", CausalSettings("single"), RefinementConfig(enabled=False)),
+    "anchored-window": ("anchored-window", AnchoredWindowSettings(window=3), RefinementConfig()),
+    "rolling": ("rolling", RollingSettings(budget=4 * 25, first_capacity=2), RefinementConfig()),
 }
 
 
