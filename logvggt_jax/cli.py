@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 OUTPUT_LOST, BAD_INPUT, INTERRUPTED = 1, 2, 130
 SOURCE_OPTIONS = ("stride", "max_frames", "fps", "start", "end", "pattern", "size_mismatch", "strict")
 # The registry of methods, which would load JAX.
-MODES = ("windows", "chunks", "offline", "merged", "causal", "anchored-window", "rolling")
+MODES = ("windows", "chunks", "offline", "merged", "causal", "anchored-window", "rolling", "pruned")
 PROBLEMS_FOUND = 1
 
 
@@ -356,8 +356,9 @@ def _parser() -> argparse.ArgumentParser:
         help="windows: LoG-VGGT's stream. chunks: plain VGGT on overlapping chunks chained by similarities, for public "
         "VGGT weights, which never learned the relay from window to window. offline: plain VGGT on all frames at once, "
         "where they fit the memory. merged: the same with merged tokens (FastVGGT). causal (StreamVGGT), "
-        "anchored-window (STream3R), rolling (InfiniteVGGT): frame by frame with a cache of all earlier frames, of the "
-        "first and the newest, or within a budget. auto: what the weights were trained for",
+        "anchored-window (STream3R), rolling (InfiniteVGGT), pruned (XStreamVGGT): frame by frame with a cache of all "
+        "earlier frames, of the first and the newest, within a budget, or of what the newest frame looks for. auto: "
+        "what the weights were trained for",
     )
     sub.add_argument(
         "--chunk-size",
