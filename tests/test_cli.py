@@ -139,8 +139,10 @@ def test_public_weights_run_in_chunks_unless_told_otherwise(
     # Only chunks take a size.
     assert main([*arguments, "--chunk-size", "4"]) == 0
     assert "warning" not in capsys.readouterr().err
-    assert main([*arguments, "--mode", "windows", "--overwrite"]) == 0
+    assert main([*arguments, "--method", "windows", "--overwrite"]) == 0
     assert "logvggt: warning: these weights are public VGGT's, which never learned" in capsys.readouterr().err
+    assert main([*arguments, "--method", "rolling", "--overwrite"]) == 0
+    assert "rolling shows a frame earlier ones alone" in capsys.readouterr().err
 
 
 def test_a_dry_run_says_what_a_run_needs_and_leaves_nothing(

@@ -37,7 +37,7 @@ class KeyValueCache:
     def grown(self, room: int) -> KeyValueCache:
         """The same with so many more places, which are empty."""
         key, value = (with_places(x, x.ndim - 3, room) for x in (self.key, self.value))
-        return self.replace(key=key, value=value)  # type: ignore[attr-defined, no-any-return]
+        return self.replace(key=key, value=value)  # type: ignore[attr-defined]
 
     def extended(self, new: Keys) -> tuple[Keys, KeyValueCache]:
         """What the N new tokens attend to, and the cache with them."""

@@ -73,7 +73,7 @@ class PrunedCache(KeyValueCache):
           count: int32 scalar.
         """
         kept = choose_kept(query, key, count, special=self.special, keep=self.capacity)
-        return self.replace(  # type: ignore[attr-defined, no-any-return]
+        return self.replace(  # type: ignore[attr-defined]
             key=_taken(key, kept), value=_taken(value, kept), length=jnp.minimum(count, self.capacity)
         )
 
@@ -106,7 +106,7 @@ class PackedPrunedCache(PrunedCache):
         arrays = {name: with_places(getattr(self, name), 1, room) for name in per_token}
         more = num_groups(self.capacity + room + self.tokens) - self.key_scale.shape[1]
         arrays |= {name: with_places(getattr(self, name), 1, more) for name in ("key_scale", "key_zero")}
-        return self.replace(**arrays)  # type: ignore[attr-defined, no-any-return]
+        return self.replace(**arrays)  # type: ignore[attr-defined]
 
     def opened(self, dtype: Any) -> tuple[jax.Array, jax.Array]:
         """The keys and values that the codes stand for."""
@@ -125,7 +125,7 @@ class PackedPrunedCache(PrunedCache):
 
         seen = of_tokens(keys.numbers()).astype(key.dtype)
         kept = choose_kept(query, seen, count, special=self.special, keep=self.capacity)
-        return self.replace(  # type: ignore[attr-defined, no-any-return]
+        return self.replace(  # type: ignore[attr-defined]
             key=packed(_taken(of_tokens(keys.code), kept)),
             value=packed(_taken(values.code, kept)),
             length=jnp.minimum(count, self.capacity),
@@ -137,9 +137,7 @@ class PackedPrunedCache(PrunedCache):
         )
 
 
-def empty_pruned(
-    shape: tuple[int, int, int, int], dtype: str, *, special: int, rounds: int | None = None
-) -> PrunedCache:
+def empty_pruned(shape: tuple[int, ...], dtype: str, *, special: int, rounds: int | None = None) -> PrunedCache:
     """A cache [B, capacity, heads, head_dim] in full precision that has seen nothing; one for each of `rounds`."""
     leading = () if rounds is None else (rounds,)
     # Two buffers: a donated state holds none twice.
@@ -147,7 +145,7 @@ def empty_pruned(
     return PrunedCache(key, value, jnp.zeros(leading, jnp.int32), special)
 
 
-def empty_packed(shape: tuple[int, int, int, int], *, special: int, tokens: int) -> PackedPrunedCache:
+def empty_packed(shape: tuple[int, ...], *, special: int, tokens: int) -> PackedPrunedCache:
     """A packed cache [B, capacity, heads, head_dim] for frames of so many tokens that has seen nothing."""
     batch, capacity, heads, width = shape
     groups = num_groups(capacity + tokens)

@@ -80,7 +80,7 @@ class RollingMemory:
         cache = self.layers[layer]
         # Below the anchor, where the original stops with an index error, the anchor alone stays.
         budget = jnp.maximum(budgets(self.scores, self.total, self.temperature)[layer], cache.anchor)
-        return cache.replace(budget=budget)  # type: ignore[attr-defined, no-any-return]
+        return cache.replace(budget=budget)  # type: ignore[attr-defined]
 
     def updated(self, layer: int, memory: LayerMemory) -> RollingMemory:
         """With the cache that the block of `layer` left; after the last one the next frame's scores are known."""
@@ -88,7 +88,7 @@ class RollingMemory:
         scores = self.scores
         if layer == len(layers) - 1:
             scores = jnp.stack([cache.score for cache in layers])  # type: ignore[attr-defined]
-        return self.replace(layers=layers, scores=scores)  # type: ignore[attr-defined, no-any-return]
+        return self.replace(layers=layers, scores=scores)  # type: ignore[attr-defined]
 
 
 def budgets(scores: jax.Array, total: int, temperature: float) -> jax.Array:

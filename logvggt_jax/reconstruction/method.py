@@ -11,7 +11,7 @@ from logvggt_jax.weights.provenance import Provenance
 _PREFERRED = {"windows": "windows", "vggt": "chunks", "causal": "causal", None: "windows"}
 
 # What to expect of weights that were trained for the first, in a method that wants them trained for the second.
-_EXPECT = {
+_EXPECT: dict[tuple[str | None, str], str] = {
     ("vggt", "windows"): "these weights are public VGGT's, which never learned to pass the first camera on from window "
     "to window: cameras and depth of a sequence longer than one window will be wrong",
     ("vggt", "causal"): "these weights are public VGGT's, where every frame saw all others, and {method} shows a frame "

