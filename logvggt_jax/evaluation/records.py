@@ -147,9 +147,10 @@ def _are_metrics(value: object) -> bool:
 
 
 def _are_figures(value: object) -> bool:
-    """Pictures in the folder of figures, and nowhere else."""
-    return isinstance(value, list) and all(
-        isinstance(name, str) and PurePosixPath(name).parent == PurePosixPath(FIGURES_FOLDER) for name in value
+    """Pictures in the folder of figures, and nowhere else; None where nothing was drawn."""
+    return value is None or (
+        isinstance(value, list)
+        and all(isinstance(name, str) and PurePosixPath(name).parent == PurePosixPath(FIGURES_FOLDER) for name in value)
     )
 
 

@@ -193,7 +193,9 @@ def test_other_results_stay_until_the_new_ones_are_complete(rooms: Rooms, tmp_pa
     assert theirs[1].read_text() == before and theirs[0].exists() and theirs[2].exists()
     assert records(tmp_path)[:4] == measured and len(records(tmp_path)) == 4 + 2
     # Those of the same clip by another method or model beside them, under other names.
-    pictures = {picture: (tmp_path / picture).read_bytes() for record in measured for picture in record["figures"]}
+    pictures = {
+        picture: (tmp_path / picture).read_bytes() for record in measured for picture in record["figures"] or ()
+    }
     assert pictures == old_pictures
     run(rooms, [new], tmp_path, drawn)
     assert len(records(tmp_path)) == 4
