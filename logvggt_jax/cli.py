@@ -25,14 +25,8 @@ if TYPE_CHECKING:
 
 OUTPUT_LOST, BAD_INPUT, INTERRUPTED = 1, 2, 130
 SOURCE_OPTIONS = ("stride", "max_frames", "fps", "start", "end", "pattern", "size_mismatch", "strict")
-MODES = (
-    "windows",
-    "chunks",
-    "offline",
-    "causal",
-    "anchored-window",
-    "rolling",
-)  # the registry of methods, which would load JAX
+# The registry of methods, which would load JAX.
+MODES = ("windows", "chunks", "offline", "merged", "causal", "anchored-window", "rolling", "pruned")
 PROBLEMS_FOUND = 1
 
 
@@ -78,7 +72,16 @@ def _convert(options: argparse.Namespace) -> None:
     from logvggt_jax.weights.checkpoints import convert
 
     check_devices()
-    report = convert(options.source, options.output, point_head=options.point_head, overwrite=options.overwrite)
+    report = convert(
+        options.source,
+        options.output,
+        point_head=options.point_head,
+        overwrite=options.overwrite,
+        trained_for=options.trained_for,
+    )
+    if options.keys:
+        for name in report.used:
+            print(f"  used: {name} -> {', '.join(report.targets[name])}")
     for title, names in (("skipped", report.skipped), ("initialised", report.initialised)):
         for name in names:
             print(f"  {title}: {name}")
@@ -287,6 +290,16 @@ def _parser() -> argparse.ArgumentParser:
     )
     sub.add_argument("--output", type=Path, required=True, metavar="DIR", help="model folder to make")
     sub.add_argument("--point-head", action="store_true", help="keep the point head")
+    sub.add_argument(
+        "--trained-for",
+        choices=("vggt", "causal"),
+        default="vggt",
+        help="vggt: all frames at once. causal: each frame sees those before it, as StreamVGGT's checkpoints, whose "
+        "names and shapes are VGGT's",
+    )
+    sub.add_argument(
+        "--keys", action="store_true", help="list every tensor that is used and what it becomes, not the others alone"
+    )
     sub.add_argument("--overwrite", action="store_true", help="replace an earlier model folder")
 
     sub = command(
@@ -342,9 +355,10 @@ def _parser() -> argparse.ArgumentParser:
         default="auto",
         help="windows: LoG-VGGT's stream. chunks: plain VGGT on overlapping chunks chained by similarities, for public "
         "VGGT weights, which never learned the relay from window to window. offline: plain VGGT on all frames at once, "
-        "where they fit the memory. causal (StreamVGGT), anchored-window (STream3R), rolling (InfiniteVGGT): frame by "
-        "frame with a cache of all earlier frames, of the first and the newest, or within a budget. auto: what the "
-        "weights were trained for",
+        "where they fit the memory. merged: the same with merged tokens (FastVGGT). causal (StreamVGGT), "
+        "anchored-window (STream3R), rolling (InfiniteVGGT), pruned (XStreamVGGT): frame by frame with a cache of all "
+        "earlier frames, of the first and the newest, within a budget, or of what the newest frame looks for. auto: "
+        "what the weights were trained for",
     )
     sub.add_argument(
         "--chunk-size",

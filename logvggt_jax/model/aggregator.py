@@ -55,10 +55,10 @@ class Aggregator(nn.Module):
         patch_tokens: jax.Array,
         lengths: jax.Array | None,
         starts_sequence: jax.Array,
-        memory: Memory,
+        memory: Memory | None,
         *,
         grid: tuple[int, int],
-    ) -> tuple[WindowTokens, Memory]:
+    ) -> tuple[WindowTokens, Memory | None]:
         """Runs all layers over a window.
 
         Args:
@@ -68,7 +68,7 @@ class Aggregator(nn.Module):
           starts_sequence: bool [B], whether the window's first frame is the sequence's first, which has camera
             and register tokens of its own.
           memory: what the global blocks attend to besides the window: with cross-window attention the caches of the
-            key layers, see `cross_window.py`.
+            key layers, see `cross_window.py`. None for the window alone.
           grid: (h, w).
 
         Returns:
@@ -137,12 +137,12 @@ class Aggregator(nn.Module):
 
         key_tokens, first = [], 0
         for layer in range(sizes.depth):
-            read = memory.at(layer)
+            read = None if memory is None else memory.at(layer)
             if read is None and layer not in outlets:
                 continue
             frame_out, x, left = single(layer, plain(first, layer, x), read)
             first = layer + 1
-            if left is not None:
+            if memory is not None and left is not None:
                 memory = memory.updated(layer, left)
             both = jnp.concatenate([frame_out, x], axis=-1)
             if layer in sizes.key_layers:

@@ -34,6 +34,11 @@ class KeyValueCache:
         """Tokens that fit."""
         return self.key.shape[-3]
 
+    def grown(self, room: int) -> KeyValueCache:
+        """The same with so many more places, which are empty."""
+        key, value = (with_places(x, x.ndim - 3, room) for x in (self.key, self.value))
+        return self.replace(key=key, value=value)  # type: ignore[attr-defined]
+
     def extended(self, new: Keys) -> tuple[Keys, KeyValueCache]:
         """What the N new tokens attend to, and the cache with them."""
         raise NotImplementedError
@@ -126,6 +131,11 @@ def empty(
     # Two buffers: a donated state holds none twice.
     key, value = (jnp.zeros((*leading, *shape), dtype) for _ in range(2))
     return kind(key, value, jnp.zeros(leading, jnp.int32))
+
+
+def with_places(x: jax.Array, axis: int, room: int) -> jax.Array:
+    """`x` followed by `room` zeros along an axis."""
+    return jnp.pad(x, [(0, room if i == axis else 0) for i in range(x.ndim)])
 
 
 def _keys_of(cache: KeyValueCache) -> Keys:

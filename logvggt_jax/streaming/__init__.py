@@ -3,8 +3,10 @@
 from logvggt_jax.streaming.anchored_window import AnchoredWindowSettings
 from logvggt_jax.streaming.causal import CausalSettings
 from logvggt_jax.streaming.chunks import ChunkPlan, ChunkSession
+from logvggt_jax.streaming.merged import MergedSession, MergedSettings
 from logvggt_jax.streaming.offline import OfflineSession, OfflineSettings
 from logvggt_jax.streaming.predictor import METHODS, Method, Predictor, open_predictor
+from logvggt_jax.streaming.pruned import PrunedSettings
 from logvggt_jax.streaming.results import Cameras, FrameResult, PredictionError
 from logvggt_jax.streaming.rolling import RollingSettings
 from logvggt_jax.streaming.windows import StreamSession, WindowSettings
@@ -17,11 +19,14 @@ __all__ = [
     "ChunkPlan",
     "ChunkSession",
     "FrameResult",
+    "MergedSession",
+    "MergedSettings",
     "Method",
     "OfflineSession",
     "OfflineSettings",
     "PredictionError",
     "Predictor",
+    "PrunedSettings",
     "RollingSettings",
     "StreamSession",
     "WindowSettings",

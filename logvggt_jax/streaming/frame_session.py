@@ -274,8 +274,7 @@ def with_room(memory: Memories, entries: int, *, at_most: int | None = None) -> 
         capacity = doubled(cache.capacity, entries)
         if at_most is not None:
             capacity = min(capacity, at_most)
-        key, value = _grown((cache.key, cache.value), room=capacity - cache.capacity)
-        nodes[i] = cache.replace(key=key, value=value)
+        nodes[i] = _grown(cache, room=capacity - cache.capacity)
         cache.key.delete()
         cache.value.delete()
     grown: Memories = jax.tree.unflatten(structure, nodes)
@@ -302,10 +301,8 @@ def frame_program(model: LogVGGT, image_size: tuple[int, int], keeping: Keeping,
 
 
 @functools.partial(jax.jit, static_argnames="room")
-def _grown(pair: tuple[jax.Array, jax.Array], *, room: int) -> tuple[jax.Array, jax.Array]:
-    """Keys and values [..., capacity + room, heads, head_dim]."""
-    key, value = (jnp.pad(x, [(0, room if axis == x.ndim - 3 else 0) for axis in range(x.ndim)]) for x in pair)
-    return key, value
+def _grown(cache: KeyValueCache, *, room: int) -> KeyValueCache:
+    return cache.grown(room)
 
 
 def _is_cache(node: Any) -> bool:
@@ -317,7 +314,8 @@ def _caches(memory: StreamMemory | None) -> list[KeyValueCache]:
 
 
 def _bytes(cache: KeyValueCache) -> int:
-    return cache.key.nbytes + cache.value.nbytes
+    # Without counts and other scalars.
+    return sum(leaf.nbytes for leaf in jax.tree.leaves(cache) if leaf.ndim > 1)
 
 
 def _filled(cache: KeyValueCache) -> int:

@@ -169,7 +169,7 @@ class OfflineSession:
     def push(self, frames: np.ndarray | jax.Array | Sequence[np.ndarray]) -> list[FrameResult]:
         """Takes frames; see `Predictor.push`. Raises PredictionError for more than `max_frames`."""
         if self._closed:
-            raise ValueError("this sequence is closed: make another OfflineSession for another one")
+            raise ValueError(f"this sequence is closed: make another {type(self).__name__} for another one")
         before = self._images[-1] if self._images else None
         self._images += list(checked_frames(frames, patch_size=self._model.config.encoder.patch_size, before=before))
         limit = self._settings.max_frames
@@ -189,7 +189,10 @@ class OfflineSession:
         with device_memory(
             f"full attention over {len(images)} frames of {height} x {width} pixels", "take fewer or smaller frames"
         ):
-            return self._final.add(predict_plain(self._model, self._variables, np.stack(images)))
+            return self._final.add(self._predict(np.stack(images)))
+
+    def _predict(self, images: np.ndarray) -> PlainPrediction:
+        return predict_plain(self._model, self._variables, images)
 
     def snapshot(self) -> tuple[list[FrameResult], dict[str, np.ndarray]]:
         """See `Predictor.snapshot`: the frames, since nothing is computed before the end."""

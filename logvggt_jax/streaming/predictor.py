@@ -21,8 +21,10 @@ from logvggt_jax.streaming.anchored_window import (
 )
 from logvggt_jax.streaming.causal import CausalSettings, causal_program, open_causal
 from logvggt_jax.streaming.chunks import ChunkPlan, ChunkSession, chunk_program
+from logvggt_jax.streaming.merged import MergedSession, MergedSettings, merged_program
 from logvggt_jax.streaming.offline import OfflineSession, OfflineSettings, offline_program
 from logvggt_jax.streaming.program import Program
+from logvggt_jax.streaming.pruned import PrunedSettings, open_pruned, pruned_program
 from logvggt_jax.streaming.results import Cameras, FrameResult
 from logvggt_jax.streaming.rolling import RollingSettings, open_rolling, rolling_program
 from logvggt_jax.streaming.windows import StreamSession, WindowSettings, window_program
@@ -116,6 +118,14 @@ METHODS: dict[str, Method] = {
         "overlapping chunks without memory, chained by robust similarities",
         chunk_program,
     ),
+    "merged": Method(
+        "FastVGGT",
+        MergedSession,
+        MergedSettings,
+        "vggt",
+        "all frames at once, merged tokens in the global attention",
+        merged_program,
+    ),
     "causal": Method(
         "StreamVGGT",
         open_causal,
@@ -139,6 +149,14 @@ METHODS: dict[str, Method] = {
         "causal",
         "a cache within a budget, which drops the keys that are most like the others",
         rolling_program,
+    ),
+    "pruned": Method(
+        "XStreamVGGT",
+        open_pruned,
+        PrunedSettings,
+        "causal",
+        "a cache in four bits of the first frame, the newest, and what the newest looks for",
+        pruned_program,
     ),
 }
 

@@ -14,7 +14,7 @@ import os
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -164,10 +164,15 @@ def from_pretrained(
 
 
 def convert(
-    source: str | Path, destination: str | Path, *, point_head: bool = False, overwrite: bool = False
+    source: str | Path,
+    destination: str | Path,
+    *,
+    point_head: bool = False,
+    overwrite: bool = False,
+    trained_for: Literal["vggt", "causal"] = "vggt",
 ) -> ConversionReport:
     """Writes a VGGT checkpoint (as `open_state_dict` reads it, or a hub repository) as a model folder that computes the
-    same as VGGT.
+    same as VGGT. StreamVGGT's checkpoints have VGGT's names and shapes: `trained_for` records which of the two it is.
 
     Shows progress, the sizes that were found and the space that the folder needs on standard error; prints how many
     names were used, skipped and initialised once all is written, and returns them. `point_head` keeps the point head.
@@ -200,7 +205,7 @@ def convert(
 
             params, report = params_from_vggt(LazyTensors(list(state_dict), read), config)
     with progress_console.status("Writing the model folder"):
-        save_model(destination, config, params, _vggt_provenance(source), replace=overwrite)
+        save_model(destination, config, params, _vggt_provenance(source, trained_for), replace=overwrite)
     Console().print(
         f"{path}: {len(report.used)} tensors used, {len(report.skipped)} skipped, "
         f"{len(report.initialised)} parameters initialised",
@@ -218,10 +223,11 @@ def _sizes(config: ModelConfig) -> str:
     )
 
 
-def _vggt_provenance(source: str | Path) -> Provenance:
+def _vggt_provenance(source: str | Path, trained_for: Literal["vggt", "causal"] = "vggt") -> Provenance:
     address = hub_address(source)
     terms = None if address is None else licence(address[0])
-    return Provenance("vggt", _VGGT_LONGER_EDGE, terms, f"VGGT checkpoint {source}")
+    kind = {"vggt": "VGGT", "causal": "StreamVGGT"}[trained_for]
+    return Provenance(trained_for, _VGGT_LONGER_EDGE, terms, f"{kind} checkpoint {source}")
 
 
 def _checkpointer() -> ocp.StandardCheckpointer:

@@ -65,12 +65,14 @@ class ConversionReport:
     Attributes:
       used: PyTorch names whose tensors went into the parameters.
       skipped: PyTorch names left out: the track head, the point head where the configuration has none, constants.
-      initialised: Paths (`gccr/query/kernel`) of parameters that VGGT does not have, and of DINOv2's mask token, which
+      targets: For each used name the paths (`gccr/query/kernel`) of the parameters that were made from it.
+      initialised: Paths of parameters that VGGT does not have, and of DINOv2's mask token, which
         nothing reads, where the file lacks it.
     """
 
     used: list[str] = dataclasses.field(default_factory=list)
     skipped: list[str] = dataclasses.field(default_factory=list)
+    targets: dict[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
     initialised: list[str] = dataclasses.field(default_factory=list)
 
 
@@ -255,6 +257,7 @@ def params_from_vggt(
             # A copy, because a view would keep the caller's array alive and follow its changes.
             _insert(params, path, jnp.array(layout(tensor)))
         report.used.append(rule.name)
+        report.targets[rule.name] = tuple("/".join(path) for path, _ in rule.targets)
     for path, value in _initial(config, params).items():
         _insert(params, path, value)
         report.initialised.append("/".join(path))

@@ -12,7 +12,8 @@ import jax
 import numpy as np
 
 from logvggt_jax import ModelConfig
-from logvggt_jax.weights import config_from_vggt, params_from_vggt
+from logvggt_jax.config import AggregatorConfig, CameraHeadConfig, DPTConfig, EncoderConfig, RefinementConfig
+from logvggt_jax.weights import params_from_vggt
 
 TOKENS, POSES = 2e-5, 5e-6
 
@@ -30,18 +31,30 @@ class Golden:
         return self.arrays[name]
 
 
-def load(golden_dir: Path, name: str) -> Golden:
-    """The file `name`.npz, with weights that are made from their names alone."""
+def load(golden_dir: Path, name: str, model: str = "") -> Golden:
+    """The file `name`.npz, with weights that are made from their names alone; of two models in it the one that `model`
+    names."""
     spec = importlib.util.spec_from_file_location("make_vggt_weights", golden_dir / "make_vggt_weights.py")
     assert spec is not None and spec.loader is not None
     maker = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(maker)
     with np.load(golden_dir / "methods" / f"{name}.npz") as file:
         arrays = dict(file)
-    state_dict = dict(maker.weights(json.loads(str(arrays["shapes"]))))
-    config = config_from_vggt(state_dict)
+    settings = json.loads(str(arrays["config"]))
+    sizes = settings[f"{model}_config"] if model else settings
+    state_dict = dict(maker.weights(json.loads(str(arrays[f"{model}_shapes" if model else "shapes"]))))
+    # Spelt out, since of a model of other depths than VGGT's the weights do not tell the key layers.
+    config = ModelConfig(
+        encoder=EncoderConfig(
+            sizes["embed"], sizes["dino_depth"], sizes["dino_heads"], position_grid=sizes["img"] // 14
+        ),
+        aggregator=AggregatorConfig(sizes["depth"], sizes["heads"], key_layers=tuple(sizes["layers"])),
+        camera_head=CameraHeadConfig(sizes["cam_depth"], sizes["cam_heads"]),
+        depth_head=DPTConfig(sizes["feat"], tuple(sizes["oc"])),
+        refinement=RefinementConfig(num_heads=sizes["heads"]),
+    )
     params, _ = params_from_vggt(state_dict, config)
-    return Golden(arrays, json.loads(str(arrays["config"])), config, jax.device_put({"params": params}))
+    return Golden(arrays, settings, config, jax.device_put({"params": params}))
 
 
 def assert_depth(found: np.ndarray, expected: np.ndarray) -> None:

@@ -17,6 +17,7 @@ from logvggt_jax.streaming import (
     AnchoredWindowSettings,
     CausalSettings,
     FrameResult,
+    PrunedSettings,
     RollingSettings,
     frame_session,
     open_predictor,
@@ -28,6 +29,8 @@ FRAMES, TOKENS, LAYERS, WIDTH = 9, 5 + 2 * 3, 4, 32
 IMAGES = np.random.default_rng(0).integers(0, 256, (FRAMES, 28, 42, 3), np.uint8)
 # Three frames a layer: evicts from the fourth on.
 SMALL_BUDGET = RollingSettings(budget=3 * TOKENS * LAYERS)
+# Three frames and a bit: prunes from the fourth on.
+SMALL_CAP = 3 * TOKENS + 2
 
 
 def opened(method: str, config: ModelConfig, variables: dict, settings: Any = None) -> FrameSession:
@@ -112,12 +115,36 @@ def test_rolling_is_causal_until_it_evicts(
     assert_differ(found[-1], causal[-1])
 
 
+def test_pruned_is_causal_until_it_prunes(
+    small_config: ModelConfig, small_variables: dict, causal: list[FrameResult]
+) -> None:
+    whole = PrunedSettings(cap=FRAMES * TOKENS, bits=16, first_capacity=2)
+    assert_alike(run("pruned", small_config, small_variables, whole), causal)
+    found = run("pruned", small_config, small_variables, PrunedSettings(SMALL_CAP, 16))
+    assert_alike(found[:3], causal[:3])
+    # A frame attends before it is pruned; of the registers it sees as many frames' as fit the cap.
+    np.testing.assert_allclose(found[3].depth, causal[3].depth, rtol=2e-4)
+    assert_differ(found[-1], causal[-1])
+
+
+def test_four_bits_are_another_model_from_the_second_frame_on(
+    small_config: ModelConfig, small_variables: dict, causal: list[FrameResult]
+) -> None:
+    """A frame sees its own keys and values as they are, and older ones as they are stored."""
+    found = run("pruned", small_config, small_variables, PrunedSettings(FRAMES * TOKENS))
+    assert_alike(found[:1], causal[:1])
+    assert_differ(found[1], causal[1])
+    assert_alike(run("pruned", small_config, small_variables, PrunedSettings(FRAMES * TOKENS, first_capacity=1)), found)
+
+
 @pytest.mark.parametrize(
     ("method", "settings"),
     [
         ("causal", CausalSettings(first_capacity=2)),
         ("anchored-window", AnchoredWindowSettings(window=2)),
         ("rolling", SMALL_BUDGET),
+        ("pruned", PrunedSettings(SMALL_CAP, 16)),
+        ("pruned", PrunedSettings(SMALL_CAP, camera_cache="single")),
     ],
 )
 def test_no_output_depends_on_a_later_frame(
@@ -170,6 +197,25 @@ def test_bytes_of_the_state(small_config: ModelConfig, small_variables: dict) ->
     assert len(set(allocated)) == 1
 
 
+def test_bytes_of_a_pruned_state(small_config: ModelConfig, small_variables: dict) -> None:
+    """Two codes a byte, a scale and a zero point for every 64 keys of a channel and for every token's values in a head,
+    the number of its group for every token; registers of GCCR of as many frames as fit the cap."""
+    camera = 4 * 2 * 2 * WIDTH * small_config.camera_head.iterations * small_config.camera_head.depth
+    registers = 4 * 2 * 2 * WIDTH * small_config.aggregator.num_registers
+    heads = small_config.aggregator.num_heads
+    groups = -(-(SMALL_CAP + TOKENS) // 64)
+    in_16_bits = 2 * LAYERS * WIDTH * 4 * SMALL_CAP
+    in_4_bits = LAYERS * (SMALL_CAP * (WIDTH + 5 * heads + 4) + 5 * groups * WIDTH)
+    for bits, expected in ((16, in_16_bits), (4, in_4_bits)):
+        stream = opened("pruned", small_config, small_variables, PrunedSettings(SMALL_CAP, bits))
+        found = []
+        for image in IMAGES:
+            stream.push(image)
+            found.append(stream.state_bytes)
+        full = [bytes_ - camera * n for n, bytes_ in enumerate(found, 1)][3:]
+        assert full == [expected + 3 * registers] * len(full)
+
+
 def test_one_program_serves_all_frames(small_config: ModelConfig, small_variables: dict) -> None:
     """Nothing compiles again but where buffers double: at 3, 5 and 9 frames of a cache that starts with two."""
     # A model of another configuration has compiled nothing yet.
@@ -178,6 +224,8 @@ def test_one_program_serves_all_frames(small_config: ModelConfig, small_variable
         ("causal", CausalSettings(first_capacity=2), 4),
         ("anchored-window", AnchoredWindowSettings(), 1),
         ("rolling", SMALL_BUDGET, 1),
+        ("pruned", PrunedSettings(SMALL_CAP), 1),
+        ("pruned", PrunedSettings(SMALL_CAP, 16, first_capacity=2), 2),
     ):
         before = frame_session._step._cache_size(), frame_session._locate._cache_size()
         run(method, config, small_variables, settings)
@@ -204,6 +252,8 @@ def test_a_layer_whose_budget_exceeds_its_share_gets_room(small_config: ModelCon
         (lambda: CausalSettings("shared"), "CausalSettings.camera_cache must be one of 'per_round', 'single'"),
         (lambda: CausalSettings(first_capacity=0), "CausalSettings.first_capacity must be a positive integer"),
         (lambda: AnchoredWindowSettings(window=0), "AnchoredWindowSettings.window must be a positive integer, got 0"),
+        (lambda: PrunedSettings(cap=0), "PrunedSettings.cap must be a positive integer, got 0"),
+        (lambda: PrunedSettings(bits=8), "PrunedSettings.bits must be one of 4, 16, got 8"),
         (lambda: RollingSettings(budget=0), "RollingSettings.budget must be a positive integer, got 0"),
         (lambda: RollingSettings(budget=2**31), "RollingSettings.budget must lie in"),
         (lambda: RollingSettings(temperature=0.0), "RollingSettings.temperature must lie in"),
@@ -224,6 +274,19 @@ def test_a_budget_below_a_frame(anchor: int, small_config: ModelConfig, small_va
     stream = opened("rolling", small_config, small_variables, RollingSettings(budget=least, anchor=anchor))
     stream.push(IMAGES[:2])
     assert len(stream.close()) >= 1
+
+
+def test_a_cap_below_a_frame(small_config: ModelConfig, small_variables: dict) -> None:
+    stream = opened("pruned", small_config, small_variables, PrunedSettings(cap=TOKENS - 1))
+    with pytest.raises(InputError, match=rf"cap: {TOKENS - 1} tokens are fewer than .* take at least {TOKENS}, or"):
+        stream.push(IMAGES[0])
+    stream = opened("pruned", small_config, small_variables, PrunedSettings(cap=TOKENS))
+    for image in IMAGES:
+        stream.push(image)
+    # The first frame and the newest, whatever the cap.
+    assert stream._memory is not None
+    assert {int(cache.length) for cache in stream._memory.blocks.layers} == {2 * TOKENS}
+    assert len(stream.close()) == 1
 
 
 def test_a_closed_stream_takes_no_frame(small_config: ModelConfig, small_variables: dict) -> None:

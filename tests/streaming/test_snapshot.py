@@ -19,6 +19,7 @@ from logvggt_jax.streaming import (
     ChunkPlan,
     FrameResult,
     Predictor,
+    PrunedSettings,
     RollingSettings,
     open_predictor,
 )
@@ -30,9 +31,12 @@ CASES = {
     "windows without refinement": ("windows", None, RefinementConfig(enabled=False)),
     "chunks": ("chunks", ChunkPlan(4, 2), RefinementConfig()),
     "offline": ("offline", None, RefinementConfig()),
+    "merged": ("merged", None, RefinementConfig()),
     "causal": ("causal", CausalSettings(first_capacity=2), RefinementConfig()),
     "causal with one camera cache": ("causal", CausalSettings("single"), RefinementConfig(enabled=False)),
     "anchored-window": ("anchored-window", AnchoredWindowSettings(window=3), RefinementConfig()),
+    "pruned": ("pruned", PrunedSettings(cap=25, first_capacity=1), RefinementConfig()),
+    "pruned in 16 bits": ("pruned", PrunedSettings(30, 16, "single"), RefinementConfig(enabled=False)),
     "rolling": ("rolling", RollingSettings(budget=4 * 25, first_capacity=2), RefinementConfig()),
 }
 

@@ -11,6 +11,7 @@ import orbax.checkpoint as ocp
 import pytest
 from safetensors.numpy import save_file
 
+from logvggt_jax.cli import main
 from logvggt_jax.errors import DiskError, InputError, OutputExists
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.weights import checkpoints
@@ -24,6 +25,7 @@ from logvggt_jax.weights.checkpoints import (
 from logvggt_jax.weights.digests import digests, verify_digests
 from logvggt_jax.weights.folder import read_description, write_description
 from logvggt_jax.weights.provenance import Provenance
+from logvggt_jax.weights.vggt import params_from_vggt
 
 
 @pytest.fixture(scope="module")
@@ -394,3 +396,36 @@ def test_weights_by_any_name_are_vggts(tmp_path, write_torch_file, vggt_state_di
     expected = vggt_state_dict["aggregator.patch_embed.norm.weight"]
     np.testing.assert_array_equal(variables["params"]["encoder"]["norm"]["scale"], expected)
     assert read_provenance(tmp_path) == Provenance("vggt", 518, None, f"VGGT checkpoint {tmp_path}")
+
+
+def test_a_streamvggt_checkpoint_is_converted_key_by_key(
+    tmp_path, write_torch_file, vggt_state_dict, vggt_config, capsys
+):
+    """As its training writes it: under `model`, behind the prefix of a wrapper, with the optimiser beside it."""
+    wrapped = {f"module.{name}": tensor for name, tensor in vggt_state_dict.items()}
+    moments = {"state": {0: {"exp_avg": vggt_state_dict["aggregator.camera_token"]}}}
+    content = {"args": {"lr": 1e-5}, "model": wrapped, "optimizer": moments, "epoch": 3}
+    write_torch_file(tmp_path / "checkpoint.pth", content)
+    command = ["convert", str(tmp_path / "checkpoint.pth"), "--output", str(tmp_path / "model")]
+    assert main([*command, "--point-head", "--trained-for", "causal", "--keys"]) == 0
+
+    model, variables = load_model(tmp_path / "model")
+    assert model.config == vggt_config
+    expected, _ = params_from_vggt(vggt_state_dict, vggt_config)
+    _assert_same(variables, {"params": expected})
+    assert read_provenance(tmp_path / "model").trained_for == "causal"
+    lines = capsys.readouterr().out.splitlines()
+    reported = [line.split()[1] for line in lines if line.startswith(("  used: ", "  skipped: "))]
+    assert sorted(reported) == sorted(vggt_state_dict)
+    assert "  used: aggregator.camera_token -> aggregator/camera_token" in lines
+    fused = "aggregator/frame_block_0/attention/"
+    assert f"  used: aggregator.frame_blocks.0.attn.qkv.weight -> {fused}query/kernel, {fused}key_value/kernel" in lines
+
+
+def test_a_checkpoint_of_another_layout_is_one_line(tmp_path, vggt_state_dict):
+    other = {name.replace("aggregator.", "decoder."): tensor for name, tensor in vggt_state_dict.items()}
+    save_file(other, tmp_path / "model.safetensors")
+    with pytest.raises(
+        InputError, match=r"^\S+model\.safetensors: the state dict lacks aggregator\.\S+, which VGGT has"
+    ):
+        convert(tmp_path / "model.safetensors", tmp_path / "model", trained_for="causal")
