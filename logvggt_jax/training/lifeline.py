@@ -1,7 +1,7 @@
 """A connection between process 0 and each of the others, whose end tells at once that a process is gone.
 
-JAX's own heartbeats notice it after their time-out, and end the survivors with a trace of C++ that names nobody's host. Only where
-process 0 is killed may that trace still come beside the line: JAX watches its connection to process 0 in the same way.
+JAX's own heartbeats notice it after their time-out, and end the survivors with a trace of C++ that names no host. Only
+where process 0 is killed may that trace still come beside the line: JAX watches its connection to it in the same way.
 """
 
 from __future__ import annotations
