@@ -35,7 +35,7 @@ from logvggt_jax.training.sharding import data_mesh, use_cpu_cores
 _CONFIG = config_flags.DEFINE_config_file("config", None, "File with the run's settings.", lock_config=True)
 _WORKDIR = flags.DEFINE_string("workdir", None, "Folder for checkpoints, the model and logs.")
 _RESUME_STEP = flags.DEFINE_integer(
-    "resume_step", None, "Checkpoint to go on from, dropping later ones; by default the latest."
+    "resume_step", None, "Checkpoint to go back to, once; later ones are moved aside. By default the latest."
 )
 _DISTRIBUTED = flags.DEFINE_bool(
     "distributed", False, "This is one of several processes; start the same command once on every machine."

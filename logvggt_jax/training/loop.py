@@ -20,12 +20,13 @@ from logvggt_jax.interruption import StopRequest
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.model.parameters import stack_layers
 from logvggt_jax.training.batches import open_sources, stage_batches
-from logvggt_jax.training.checkpoints import Position, RunCheckpoints
+from logvggt_jax.training.checkpoint_files import Position
+from logvggt_jax.training.checkpoints import RunCheckpoints
 from logvggt_jax.training.config import StageConfig, TrainConfig
 from logvggt_jax.training.device_batches import DeviceBatches
 from logvggt_jax.training.initialization import initial_parameters
-from logvggt_jax.training.metrics_log import MetricsLog
-from logvggt_jax.training.processes import Vote, check_agreement, check_shared
+from logvggt_jax.training.metrics_log import MetricsLog, read_metrics
+from logvggt_jax.training.processes import Vote, any_process, check_agreement, check_shared
 from logvggt_jax.training.program import abstract_parameters, make_program
 from logvggt_jax.training.progress import Speedometer, duration, progress_line
 from logvggt_jax.training.sharding import check_batch_size, replicated
@@ -48,7 +49,7 @@ def train(config: TrainConfig, workdir: Path, *, mesh: Mesh, resume_step: int | 
 
     Leaves `checkpoints/`, `model/` (for `load_model`), `metrics.jsonl` and `tensorboard/` in `workdir`. SIGTERM, Ctrl-C
     and `config.max_minutes` end the run after the current step with a checkpoint; `resume_step` is the one to go on
-    from, None takes the latest.
+    from, once, None takes the latest. A run begins with a save and a validation, so that either fails at once.
 
     Raises InputError for settings, data or a checkpoint that do not fit, in one line, and NonFiniteTraining where
     `config.max_skipped_in_a_row` updates in a row were not finite.
@@ -93,7 +94,8 @@ class _Run:
         Returns the number of steps done and where the data stand.
         """
         config, everywhere = self.config, replicated(self.mesh)
-        if resume_step is None and not self.checkpoints.steps:
+        # The checkpoint of step 0 is there to show that one can be written: nothing is lost by beginning again.
+        if resume_step is None and not any(self.checkpoints.steps):
             params = initial_parameters(config.model, seed=config.seed, weights=config.initial_weights)
             self.state = jax.device_put(initial_state(stack_layers(params), self.optimizer), everywhere)
             return 0, None
@@ -120,11 +122,18 @@ class _Run:
             # Otherwise they would wait for one another in different programs.
             check_agreement(f"stage {stage.name!r}: the data", {**source.get_state(), "broken": None})
             left.append((index, stage, end, source))
+        if step == 0:
+            self.checkpoints.save(self.state, Position(0, left[0][3].get_state()))
+            self.checkpoints.wait()
+        # After a save, and again where the run was killed between the two.
+        if self._validation_is_due(step) and any_process(not log.silent and not _is_validated(log.path, step)):
+            self._validate(step, log)
         for index, stage, end, source in left:
             with source, DeviceBatches(source, self.mesh) as batches, self._device_memory(stage):
                 step, ended = self._train_stage(index, stage, batches, step, end, log, stop)
             if ended:
                 break
+        self.checkpoints.wait()
         log.say(f"{step}/{self.config.total_steps} steps done; model in {self.checkpoints.model_folder}")
 
     def _train_stage(
@@ -154,11 +163,12 @@ class _Run:
             last = step == end or ending is not None
             if step % config.log_every == 0 or step == 1 or last:
                 self._log(step, stage, metrics, batches.broken_clips, log)
-            if config.validation is not None and (step % config.validation.every == 0 or step == config.total_steps):
-                self._validate(step, log)
+            self.checkpoints.check()
             if step % config.save_every == 0 or last:
                 self.checkpoints.save(self.state, Position(index, batches.get_state()))
                 self.speed.restart()
+            if self._validation_is_due(step):
+                self._validate(step, log)
             if ending is not None:
                 log.say(f"stopping after step {step}: {ending}; run the same command to go on")
                 return step, True
@@ -211,6 +221,10 @@ class _Run:
                 "optimizer.learning_rate, or resume from an earlier checkpoint with --resume_step"
             )
 
+    def _validation_is_due(self, step: int) -> bool:
+        every = None if self.config.validation is None else self.config.validation.every
+        return every is not None and (step % every == 0 or step == self.config.total_steps)
+
     def _validate(self, step: int, log: MetricsLog) -> None:
         if self.validation is None:
             return
@@ -234,3 +248,7 @@ class _Run:
             reason = f"max_minutes={self.config.max_minutes} are over"
         # A process that left alone would let the others wait for its share of the next step for ever.
         return (reason or "another process is to stop") if self.vote(reason is not None) else None
+
+
+def _is_validated(metrics: Path, step: int) -> bool:
+    return any(entry["step"] == step and "validation/abs_rel" in entry for entry in read_metrics(metrics))

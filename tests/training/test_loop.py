@@ -16,7 +16,8 @@ import pytest
 from logvggt_jax.errors import InputError
 from logvggt_jax.interruption import StopRequest
 from logvggt_jax.training import loop
-from logvggt_jax.training.checkpoints import Position, RunCheckpoints
+from logvggt_jax.training.checkpoint_files import Position
+from logvggt_jax.training.checkpoints import RunCheckpoints
 from logvggt_jax.training.config import SourceConfig, TrainConfig, ValidationConfig
 from logvggt_jax.training.loop import NonFiniteTraining, train
 from logvggt_jax.training.metrics_log import MetricsLog, read_metrics
@@ -104,7 +105,7 @@ def test_sigterm_saves_ends_cleanly_and_can_be_resumed(
         stopped = train(run_config, tmp_path, mesh=data_mesh(2))
     assert 1 <= int(stopped.step) <= 2 and signal.getsignal(signal.SIGTERM) == before
     with RunCheckpoints(tmp_path, run_config) as checkpoints:
-        assert checkpoints.steps == [int(stopped.step)]
+        assert checkpoints.steps == [0, int(stopped.step)]
     _same(train(run_config, tmp_path, mesh=data_mesh(2)), straight[0])
 
 
@@ -152,16 +153,15 @@ def test_finished_run_is_left_alone(run_config: TrainConfig, straight: tuple[Tra
 
 
 @pytest.mark.usefixtures("abandoned_reads")
-def test_damaged_checkpoint_is_named_with_the_way_out(
+def test_run_whose_newest_checkpoint_is_damaged_ends_the_same(
     run_config: TrainConfig, straight: tuple[TrainState, Path], finished: Path
 ) -> None:
     files = [path for path in (finished / "checkpoints" / "6" / "params").rglob("*") if path.is_file()]
     largest = max(files, key=lambda path: path.stat().st_size)
     largest.write_bytes(largest.read_bytes()[: largest.stat().st_size // 2])
-    with pytest.raises(ValueError, match=r"step 6 in .*checkpoints/6.*--resume_step \(there are \[4\]\)") as error:
-        train(run_config, finished, mesh=data_mesh(2))
-    assert "\n" not in str(error.value)
-    _same(train(run_config, finished, mesh=data_mesh(2), resume_step=4), straight[0])
+    _same(train(run_config, finished, mesh=data_mesh(2)), straight[0])
+    assert _numbers(finished) == _numbers(straight[1])
+    assert (finished / "checkpoints" / "6.aside").is_dir()
 
 
 def test_changed_leaf_is_refused_by_its_digest(
@@ -171,9 +171,10 @@ def test_changed_leaf_is_refused_by_its_digest(
     true = digests(state.params)
     with RunCheckpoints(tmp_path, run_config) as checkpoints, pytest.MonkeyPatch.context() as patch:
         # What Orbax stores differs from what was digested, as after a flipped byte.
-        patch.setattr("logvggt_jax.training.checkpoints.digests", lambda tree: true)
+        patch.setattr("logvggt_jax.training.checkpoint_files.digests", lambda tree: true)
         wrong = {**state.params, "camera_head": jax.tree.map(lambda x: x + 1, state.params["camera_head"])}
         checkpoints.save(state._replace(params=wrong), Position(1, {}))
+        checkpoints.wait()
         with pytest.raises(ValueError, match=r"step 6 .*leaf camera_head/bias differs from its digest"):
             checkpoints.restore(state)
 
@@ -228,12 +229,73 @@ def test_validation_reports_held_out_clips(run_config: TrainConfig, tmp_path: Pa
     validation = ValidationConfig(source=source, every=4, num_clips=4, clip_length=3, stride=2, size=(28, 42))
     train(dataclasses.replace(run_config, validation=validation), tmp_path, mesh=data_mesh(2))
     entries = [entry for entry in _numbers(tmp_path) if "validation/abs_rel" in entry]
-    assert [entry["step"] for entry in entries] == [4, 6]
+    # Once before the first step: what cannot be judged says so at once.
+    assert [entry["step"] for entry in entries] == [0, 4, 6]
     for entry in entries:
         assert 0 < entry["validation/abs_rel"] < 2
         assert entry["validation/rotation_over_identity"] == pytest.approx(
             entry["validation/rotation"] / entry["validation/identity_rotation"]
         )
+
+
+def _validated(config: TrainConfig) -> TrainConfig:
+    source = SourceConfig(name="rooms", root=None, split="val", options=config.data.sources[0].options)
+    validation = ValidationConfig(source=source, every=3, num_clips=2, clip_length=3, stride=2, size=(28, 42))
+    return dataclasses.replace(config, validation=validation)
+
+
+def test_a_validation_that_fails_has_its_checkpoint_and_is_made_up_for(
+    run_config: TrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = _validated(run_config)
+    train(config, tmp_path / "straight", mesh=data_mesh(2))
+    judged = loop.Validation.__call__
+
+    def fail(*given: Any) -> Any:
+        if int(RunCheckpoints(tmp_path / "run", config).steps[-1]) == 3:
+            raise RuntimeError("out of memory")
+        return judged(*given)
+
+    with monkeypatch.context() as patch, pytest.raises(RuntimeError, match="out of memory"):
+        patch.setattr(loop.RunCheckpoints, "save", _saved_at_once(loop.RunCheckpoints.save))
+        patch.setattr(loop.Validation, "__call__", fail)
+        train(config, tmp_path / "run", mesh=data_mesh(2))
+    with RunCheckpoints(tmp_path / "run", config) as checkpoints:
+        assert checkpoints.steps == [0, 3]
+    train(config, tmp_path / "run", mesh=data_mesh(2))
+    assert _numbers(tmp_path / "run") == _numbers(tmp_path / "straight")
+
+
+def _saved_at_once(save: Callable[..., None]) -> Callable[..., None]:
+    def saved(checkpoints: RunCheckpoints, *given: Any, **options: Any) -> None:
+        save(checkpoints, *given, **options)
+        checkpoints.wait()
+
+    return saved
+
+
+@pytest.mark.parametrize("failing", ["save", "validation"])
+def test_a_save_or_a_validation_that_fails_says_so_before_the_first_step(
+    failing: str, run_config: TrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any) -> None:
+        raise OSError("cannot be done")
+
+    if failing == "save":
+        monkeypatch.setattr("logvggt_jax.training.checkpoints.write_checkpoint", fail)
+    else:
+        monkeypatch.setattr(loop.Validation, "__call__", fail)
+    monkeypatch.setattr(loop._Run, "_program", lambda *_: pytest.fail("no step is to be compiled"))
+    with pytest.raises(OSError, match="cannot be done"):
+        train(_validated(run_config), tmp_path, mesh=data_mesh(1))
+
+
+def test_settings_may_change_until_a_step_is_done(run_config: TrainConfig, tmp_path: Path) -> None:
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyError, match="crash"):
+        patch.setattr(loop._Run, "_program", lambda *_: _crash())
+        train(run_config, tmp_path, mesh=data_mesh(1))
+    other = dataclasses.replace(run_config, loss=dataclasses.replace(run_config.loss, alpha=0.5))
+    assert int(train(other, tmp_path, mesh=data_mesh(1)).step) == 6
 
 
 def test_a_run_goes_on_when_its_initial_weights_are_gone(
