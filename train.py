@@ -30,6 +30,7 @@ from logvggt_jax.training.dry_run import described_mesh, dry_run
 from logvggt_jax.training.lifeline import Lifeline
 from logvggt_jax.training.loop import NonFiniteTraining, train
 from logvggt_jax.training.processes import JOIN_SECONDS, LOSS_SECONDS, check_processes, join_processes
+from logvggt_jax.training.profile import ProfiledSteps
 from logvggt_jax.training.sharding import data_mesh, use_cpu_cores
 
 _CONFIG = config_flags.DEFINE_config_file("config", None, "File with the run's settings.", lock_config=True)
@@ -44,6 +45,10 @@ _COORDINATOR = flags.DEFINE_string("coordinator", None, "host:port of process 0,
 _NUM_PROCESSES = flags.DEFINE_integer("num_processes", None, "Processes of the run, where the cluster does not say.")
 _PROCESS_ID = flags.DEFINE_integer("process_id", None, "Of this process, from 0, where the cluster does not say.")
 _JOIN_SECONDS = flags.DEFINE_float("join_seconds", JOIN_SECONDS, "How long to wait for the others at the start.")
+_WATCHDOG = flags.DEFINE_float(
+    "watchdog", 30.0, "End the process, with all stacks, when no step ended in so many median steps; 0: never."
+)
+_PROFILE = flags.DEFINE_string("profile", None, "Steps to write a trace of to WORKDIR/profile, such as 20:25.")
 _DRY_RUN = flags.DEFINE_bool("dry_run", False, "Say what every step needs and how many clips fit; train nothing.")
 _DESCRIBED = flags.DEFINE_string(
     "described", None, "TPU slice to compile for instead of the devices at hand, such as v5p:2x2x4; with --dry_run."
@@ -61,6 +66,7 @@ def main(arguments: Sequence[str]) -> None:
     watched: Lifeline | None = None
     try:
         config = TrainConfig.from_dict(_settings())
+        profile = ProfiledSteps.parse(_PROFILE.value) if _PROFILE.value else None
         use_cpu_cores(config, num_processes=_NUM_PROCESSES.value or 1)
         if _DISTRIBUTED.value:
             watched = join_processes(
@@ -74,7 +80,14 @@ def main(arguments: Sequence[str]) -> None:
         if _DRY_RUN.value:
             dry_run(config, described_mesh(_DESCRIBED.value) if _DESCRIBED.value else data_mesh())
         else:
-            train(config, Path(_WORKDIR.value), mesh=data_mesh(), resume_step=_RESUME_STEP.value)
+            train(
+                config,
+                Path(_WORKDIR.value),
+                mesh=data_mesh(),
+                resume_step=_RESUME_STEP.value,
+                watchdog=_WATCHDOG.value,
+                profile=profile,
+            )
     except BaseException as error:
         _fail(error, watched)
     if watched is not None:

@@ -3,6 +3,7 @@
 import os
 import shutil
 import warnings
+from collections.abc import Iterable
 from pathlib import Path
 
 import jax
@@ -50,6 +51,12 @@ def device_bytes(device: jax.Device) -> int | None:
     except jax.errors.JaxRuntimeError:
         return None
     return (statistics or {}).get("bytes_limit")
+
+
+def most_device_bytes(devices: Iterable[jax.Device]) -> int | None:
+    """The most bytes that one of these devices has held so far; None where none says (CPUs)."""
+    found = [(device.memory_stats() or {}).get("peak_bytes_in_use") for device in devices]
+    return max((size for size in found if size is not None), default=None)
 
 
 def default_cache_folder() -> Path:
