@@ -184,6 +184,7 @@ class _Run:
         """Steps up to `end`, or fewer if the run is to stop; the number of steps done, and whether it is to stop."""
         config = self.config
         in_flight: deque[tuple[int, Metrics, list[str]]] = deque()
+        logged = saved = step
         self.times.begin()
         while step < end:
             try:
@@ -191,9 +192,10 @@ class _Run:
                     batch = next(batches)
             except Exception:
                 # Of several processes the others wait in a step that this one has no share for.
-                if jax.process_count() == 1 and step % config.save_every and in_flight:
+                if jax.process_count() == 1 and step > saved:
                     self._finish(in_flight)
-                    self._log(step, end, stage, batches.broken_clips, log)
+                    if step > logged:
+                        self._log(step, end, stage, batches.broken_clips, log)
                     self._save(Position(index, batches.get_state()))
                 raise
             program = self._program(stage, batch, log)
@@ -213,12 +215,14 @@ class _Run:
             if step % config.log_every == 0 or step == 1 or saving or self._failing():
                 self._finish(in_flight)
                 self._log(step, end, stage, batches.broken_clips, log)
+                logged = step
             self.checkpoints.check()
             position = Position(index, batches.get_state())
             if self._failing():
                 self._fail(step, position)
             if saving:
                 self._save(position)
+                saved = step
             if self._validation_is_due(step):
                 self._validate(step, log)
             if ending is not None:
