@@ -22,7 +22,7 @@ import jax
 from absl import app, flags, logging
 from ml_collections import config_flags
 
-from logvggt_jax.compile import check_devices, enable_compilation_cache
+from logvggt_jax.compile import check_devices, check_nccl, enable_compilation_cache
 from logvggt_jax.errors import InputError, one_line
 from logvggt_jax.terminal import forgiving_streams
 from logvggt_jax.training.config import TrainConfig
@@ -68,6 +68,7 @@ def main(arguments: Sequence[str]) -> None:
         config = TrainConfig.from_dict(_settings())
         profile = ProfiledSteps.parse(_PROFILE.value) if _PROFILE.value else None
         use_cpu_cores(config, num_processes=_NUM_PROCESSES.value or 1)
+        check_nccl()
         if _DISTRIBUTED.value:
             watched = join_processes(
                 coordinator=_COORDINATOR.value,

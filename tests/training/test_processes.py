@@ -14,7 +14,7 @@ import pytest
 
 from logvggt_jax.training import processes
 from logvggt_jax.training.metrics_log import read_metrics
-from logvggt_jax.training.processes import any_process, check_agreement, join_processes
+from logvggt_jax.training.processes import any_process, check_agreement, check_processes, join_processes
 from logvggt_jax.weights.checkpoints import load_model
 
 ROOT = Path(__file__).parents[2]
@@ -70,6 +70,17 @@ def test_processes_that_differ_are_named(monkeypatch: pytest.MonkeyPatch) -> Non
     )
     with pytest.raises(ValueError, match=r"the data of the processes \[1\] differ from those of process 0"):
         check_agreement("the data", {"a": 1})
+
+
+@pytest.mark.parametrize(("gpus", "warned"), [(8, True), (1, False)])
+def test_several_gpus_of_one_process_draw_a_warning(
+    gpus: int, warned: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(jax, "process_count", lambda: 2)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(jax, "local_device_count", lambda: gpus)
+    check_processes()
+    assert warned == ("owns 8 GPUs beside 1 other processes" in caplog.text)
 
 
 def test_half_an_address_is_refused() -> None:
