@@ -3,9 +3,9 @@
     python train.py --config=configs/tiny.py --workdir=runs/tiny
 
 Run the same command again to go on after an interruption. On several machines start it on each of them with
---distributed. With --dry_run nothing is trained: the step of every stage and size is compiled, and what it needs is
-printed. Any field of the configuration can be changed on the command line:
---config.optimizer.learning_rate=5e-4.
+--distributed (docs/clusters.md). With --dry_run nothing is trained: the step of every stage and size is compiled, and
+what it needs is printed. With --preflight the same command tries network, data, folder and step beforehand. Any field
+of the configuration can be changed on the command line: --config.optimizer.learning_rate=5e-4.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.dry_run import described_mesh, dry_run
 from logvggt_jax.training.lifeline import Lifeline
 from logvggt_jax.training.loop import NonFiniteTraining, train
+from logvggt_jax.training.preflight import preflight
 from logvggt_jax.training.processes import JOIN_SECONDS, LOSS_SECONDS, check_processes, join_processes
 from logvggt_jax.training.profile import ProfiledSteps
 from logvggt_jax.training.sharding import data_mesh, use_cpu_cores
@@ -50,6 +51,7 @@ _WATCHDOG = flags.DEFINE_float(
 )
 _PROFILE = flags.DEFINE_string("profile", None, "Steps to write a trace of to WORKDIR/profile, such as 20:25.")
 _DRY_RUN = flags.DEFINE_bool("dry_run", False, "Say what every step needs and how many clips fit; train nothing.")
+_PREFLIGHT = flags.DEFINE_bool("preflight", False, "Try network, data, folder and step in minutes; train nothing.")
 _DESCRIBED = flags.DEFINE_string(
     "described", None, "TPU slice to compile for instead of the devices at hand, such as v5p:2x2x4; with --dry_run."
 )
@@ -80,6 +82,8 @@ def main(arguments: Sequence[str]) -> None:
         check_processes()
         if _DRY_RUN.value:
             dry_run(config, described_mesh(_DESCRIBED.value) if _DESCRIBED.value else data_mesh())
+        elif _PREFLIGHT.value:
+            preflight(config, Path(_WORKDIR.value), data_mesh())
         else:
             train(
                 config,

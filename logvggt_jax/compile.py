@@ -24,9 +24,7 @@ def nvidia_gpu_present() -> bool:
 
 def installed_packages() -> dict[str, str]:
     """Versions of what is installed, by name in small letters."""
-    return {
-        each.metadata["Name"].lower(): each.version for each in importlib.metadata.distributions() if each.metadata
-    }
+    return {each.metadata["Name"].lower(): each.version for each in importlib.metadata.distributions() if each.metadata}
 
 
 def builds_side_by_side(installed: Iterable[str]) -> dict[str, list[str]]:

@@ -32,7 +32,7 @@ def test_two_builds_of_nccl_are_refused(monkeypatch: pytest.MonkeyPatch, asked: 
     monkeypatch.setattr(module, "installed_packages", lambda: names)
     monkeypatch.setattr(type(jax.config), "jax_platforms", asked, raising=False)
     if refused:
-        with pytest.raises(InputError, match="nvidia-nccl-cu12 and nvidia-nccl-cu13 are both installed, .*uninstall"):
+        with pytest.raises(InputError, match=r"nvidia-nccl-cu12 and nvidia-nccl-cu13 are both installed, .*uninstall"):
             module.check_nccl()
     del names["nvidia-nccl-cu12" if refused else "nvidia-cudnn-cu13"]
     module.check_nccl()

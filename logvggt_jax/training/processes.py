@@ -127,10 +127,11 @@ def check_processes() -> None:
     if jax.process_count() > 1 and jax.default_backend() == "gpu" and jax.local_device_count() > 1:
         logging.warning(
             "process %d owns %d GPUs beside %d other processes, in which JAX 0.11.0 can wait for ever (a deadlock in "
-            "NCCL); start one process a GPU, for example with srun --ntasks-per-node=%d --gpus-per-task=1",
+            "NCCL); start one process a GPU, for example with srun --ntasks-per-node=%d --gpus-per-node=%d",
             jax.process_index(),
             jax.local_device_count(),
             jax.process_count() - 1,
+            jax.local_device_count(),
             jax.local_device_count(),
         )
 
