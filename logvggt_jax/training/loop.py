@@ -26,7 +26,7 @@ from logvggt_jax.training.config import StageConfig, TrainConfig
 from logvggt_jax.training.device_batches import DeviceBatches
 from logvggt_jax.training.initialization import initial_parameters
 from logvggt_jax.training.metrics_log import MetricsLog, read_metrics
-from logvggt_jax.training.processes import ASK_EVERY, any_process, check_agreement
+from logvggt_jax.training.processes import Vote, any_process, check_agreement, check_shared
 from logvggt_jax.training.program import abstract_parameters, make_program
 from logvggt_jax.training.progress import Speedometer, duration, progress_line
 from logvggt_jax.training.sharding import check_batch_size, replicated
@@ -56,6 +56,7 @@ def train(config: TrainConfig, workdir: Path, *, mesh: Mesh, resume_step: int | 
     """
     for stage in config.stages:
         check_batch_size(stage, mesh)
+    check_shared(workdir)
     run = _Run(config, workdir, mesh)
     with run.checkpoints, StopRequest("SIGTERM", "SIGINT") as stop:
         first, position = run.start(resume_step)
@@ -85,6 +86,7 @@ class _Run:
         self.validation = None if config.validation is None else Validation(model, config.validation, mesh)
         self.checkpoints = RunCheckpoints(workdir, config)
         self.speed = Speedometer(config.stages)
+        self.vote = Vote(mesh, delay=STEPS_IN_FLIGHT)
 
     def start(self, resume_step: int | None) -> tuple[int, Position | None]:
         """Takes up a checkpoint, or the initial weights if there is none.
@@ -157,7 +159,7 @@ class _Run:
             if len(in_flight) > STEPS_IN_FLIGHT:
                 in_flight.popleft().block_until_ready()
 
-            ending = self._reason_to_end(stop, step)
+            ending = self._reason_to_end(stop)
             last = step == end or ending is not None
             if step % config.log_every == 0 or step == 1 or last:
                 self._log(step, stage, metrics, batches.broken_clips, log)
@@ -238,18 +240,14 @@ class _Run:
         )
         self.speed.restart()
 
-    def _reason_to_end(self, stop: StopRequest, step: int) -> str | None:
+    def _reason_to_end(self, stop: StopRequest) -> str | None:
         reason = None
         if stop.reason is not None:
             reason = f"received {stop.reason}"
         elif self.deadline is not None and time.monotonic() > self.deadline:
             reason = f"max_minutes={self.config.max_minutes} are over"
-        if jax.process_count() == 1:
-            return reason
         # A process that left alone would let the others wait for its share of the next step for ever.
-        if step % ASK_EVERY or not any_process(reason is not None):
-            return None
-        return reason or "another process is to stop"
+        return (reason or "another process is to stop") if self.vote(reason is not None) else None
 
 
 def _is_validated(metrics: Path, step: int) -> bool:

@@ -58,3 +58,10 @@ def test_a_fault_of_ours_keeps_its_traceback(tmp_path: Path) -> None:
     )
     assert finished.returncode != 0
     assert "Traceback" in finished.stderr and "ValueError: a bug" in finished.stderr
+
+
+def test_an_argument_that_is_no_flag_is_one_line(tmp_path: Path) -> None:
+    finished = run_train(tmp_path, "configs/h20.py")
+    assert finished.returncode == 1
+    expected = "train.py: unknown argument 'configs/h20.py'; settings are given as --config.NAME=VALUE\n"
+    assert finished.stderr == expected
