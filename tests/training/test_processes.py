@@ -193,6 +193,27 @@ def test_folders_that_are_not_shared_are_an_error_of_the_start(tmp_path: Path) -
     assert not list((tmp_path / "a").iterdir())
 
 
+def test_a_preflight_goes_on_together_when_one_process_fails_a_try(tmp_path: Path) -> None:
+    quick = (
+        "from logvggt_jax.training import preflight as flight\n"
+        "from logvggt_jax.training.dry_run import StepCosts\n"
+        "flight.step_costs = lambda *_: StepCosts(1, 1, {}, 1.0)\n"
+        "flight.abstract_parameters = loop.abstract_parameters\n"
+    )
+    broken = (
+        "from logvggt_jax.errors import InputError\n"
+        "def fail(*_): raise InputError('scene0001: cannot be opened')\n"
+        "flight._read_clips = fail\n"
+    )
+    with PixelRuns(tmp_path, tmp_path, patches=(quick, quick + broken), flags=("--preflight",)) as runs:
+        outputs = [process.communicate(timeout=60) for process in runs.processes]
+        assert [process.returncode for process in runs.processes] == [1, 1], outputs
+    assert "rooms: FAILED on process 1: scene0001: cannot be opened" in outputs[1][0]
+    assert "checkpoint: " in outputs[0][0] and "checkpoint: " not in outputs[1][0]
+    assert "preflight: 1 of the tries failed: rooms; see the lines above" in outputs[0][1] + outputs[1][1]
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_process_that_never_joins_is_waited_for_as_long_as_stated(tmp_path: Path) -> None:
     with PixelRuns(tmp_path, tmp_path, patches=("", "sys.exit()"), flags=("--join_seconds=2",)) as runs:
         errors = runs.errors(0)
