@@ -120,11 +120,16 @@ def accept(server: socket.socket, secret: str, count: int) -> dict[int, socket.s
         connection, _ = server.accept()
         connection.settimeout(CONNECT_SECONDS)
         # Whoever else finds the port must not be able to end the run.
-        with contextlib.suppress(OSError):
+        try:
             # Unbuffered: what follows is for `Lifeline`.
-            number, _, given = connection.makefile("rb", buffering=0).readline(200).strip().partition(b" ")
-            if hmac.compare_digest(given, secret.encode()):
-                peers[int(number)] = connection
+            with connection.makefile("rb", buffering=0) as hello:
+                number, _, given = hello.readline(200).strip().partition(b" ")
+        except OSError:
+            given = b""
+        if hmac.compare_digest(given, secret.encode()):
+            peers[int(number)] = connection
+        else:
+            connection.close()
     return peers
 
 

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from absl import logging
 from jax.sharding import Mesh
@@ -252,7 +251,7 @@ class _Run:
         """Saves, so that the same command goes on past the clips that were named, and raises."""
         row = self.longest_skip
         zero = jax.device_put(np.int32(0), self.state.step.sharding)
-        self.state = self.state._replace(skipped_in_a_row=zero, longest_skip=jnp.copy(zero))
+        self.state = self.state._replace(skipped_in_a_row=zero, longest_skip=zero)
         self._save(position)
         self.checkpoints.wait()
         raise NonFiniteTraining(
