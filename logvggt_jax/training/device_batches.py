@@ -14,11 +14,12 @@ from logvggt_jax.training.step import Batch
 
 
 class _Ready(NamedTuple):
-    """A batch on the devices, the stream's state after it, and the broken clips so far."""
+    """A batch on the devices, the stream's state after it, the broken clips so far, and the names of its clips."""
 
     batch: Batch
     state: dict[str, Any]
     broken_clips: int
+    clips: list[str]
 
 
 class DeviceBatches(Iterator[Batch]):
@@ -29,18 +30,20 @@ class DeviceBatches(Iterator[Batch]):
 
     Attributes:
       broken_clips: clips of this process that were replaced, up to the last batch.
+      clips: names of this process's clips in the last batch, in its order.
     """
 
     def __init__(self, source: BatchIterator, mesh: Mesh) -> None:
         self._source, self._mesh = source, mesh
         self._state, self.broken_clips = source.get_state(), source.broken.count
+        self.clips: list[str] = []
         self._thread = ThreadPoolExecutor(1, "device-batches")
         self._next: Future[_Ready] | None = None
 
     def __next__(self) -> Batch:
         ready = (self._next or self._thread.submit(self._draw)).result()
         self._next = self._thread.submit(self._draw)
-        self._state, self.broken_clips = ready.state, ready.broken_clips
+        self._state, self.broken_clips, self.clips = ready.state, ready.broken_clips, ready.clips
         return ready.batch
 
     def __enter__(self) -> DeviceBatches:
@@ -55,4 +58,4 @@ class DeviceBatches(Iterator[Batch]):
 
     def _draw(self) -> _Ready:
         batch = put_batch(next(self._source), self._mesh)
-        return _Ready(batch, self._source.get_state(), self._source.broken.count)
+        return _Ready(batch, self._source.get_state(), self._source.broken.count, self._source.clips)

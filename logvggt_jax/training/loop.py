@@ -1,14 +1,13 @@
 """The training loop: stages, logging, validation, checkpoints, and a clean end whatever ends it."""
 
 import contextlib
-import functools
 import time
-from collections import deque
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jax.sharding import Mesh
 from rich.console import Console
 
@@ -18,7 +17,6 @@ from logvggt_jax.data.feeding.batches import BatchIterator
 from logvggt_jax.errors import InputError, one_line
 from logvggt_jax.interruption import StopRequest
 from logvggt_jax.model.logvggt import LogVGGT
-from logvggt_jax.model.parameters import stack_layers
 from logvggt_jax.training.batches import open_sources, stage_batches
 from logvggt_jax.training.checkpoint_files import Position
 from logvggt_jax.training.checkpoints import RunCheckpoints
@@ -29,8 +27,9 @@ from logvggt_jax.training.metrics_log import MetricsLog, read_metrics
 from logvggt_jax.training.processes import Vote, any_process, check_agreement, check_shared
 from logvggt_jax.training.program import abstract_parameters, make_program
 from logvggt_jax.training.progress import Speedometer, duration, progress_line
-from logvggt_jax.training.sharding import check_batch_size, replicated
-from logvggt_jax.training.state import TrainState, initial_state
+from logvggt_jax.training.sharding import check_batch_size
+from logvggt_jax.training.skipped import SkippedUpdates, described
+from logvggt_jax.training.state import TrainState
 from logvggt_jax.training.step import Batch, Metrics
 from logvggt_jax.training.validation import Validation
 
@@ -55,7 +54,7 @@ def train(config: TrainConfig, workdir: Path, *, mesh: Mesh, resume_step: int | 
     `config.max_skipped_in_a_row` updates in a row were not finite.
     """
     for stage in config.stages:
-        check_batch_size(stage, mesh)
+        check_batch_size(stage, mesh, accumulate=config.accumulate)
     check_shared(workdir)
     run = _Run(config, workdir, mesh)
     with run.checkpoints, StopRequest("SIGTERM", "SIGINT") as stop:
@@ -81,9 +80,11 @@ class _Run:
         model = LogVGGT(config.model)
         # Shapes alone: a run that goes on needs no initial weights.
         self.shapes = abstract_parameters(config.model)
-        self.optimizer, self.step = make_program(model, config, self.shapes, mesh)
+        self.program = make_program(model, config, self.shapes, mesh)
         self.programs: dict[tuple[int, ...], jax.stages.Compiled] = {}
-        self.validation = None if config.validation is None else Validation(model, config.validation, mesh)
+        self.validation = (
+            None if config.validation is None else Validation(model, config.validation, self.program.layout)
+        )
         self.checkpoints = RunCheckpoints(workdir, config)
         self.speed = Speedometer(config.stages)
         self.vote = Vote(mesh, delay=STEPS_IN_FLIGHT)
@@ -93,14 +94,13 @@ class _Run:
 
         Returns the number of steps done and where the data stand.
         """
-        config, everywhere = self.config, replicated(self.mesh)
+        config = self.config
         # The checkpoint of step 0 is there to show that one can be written: nothing is lost by beginning again.
         if resume_step is None and not any(self.checkpoints.steps):
             params = initial_parameters(config.model, seed=config.seed, weights=config.initial_weights)
-            self.state = jax.device_put(initial_state(stack_layers(params), self.optimizer), everywhere)
+            self.state = self.program.initial_state(params)
             return 0, None
-        like = jax.eval_shape(functools.partial(initial_state, optimizer=self.optimizer), self.shapes)
-        like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=everywhere), like)
+        like = self.program.abstract_state(self.shapes)
         self.state, position = self.checkpoints.restore(like, step=resume_step)
         return int(self.state.step), position
 
@@ -148,21 +148,21 @@ class _Run:
     ) -> tuple[int, bool]:
         """Steps up to `end`, or fewer if the run is to stop; the number of steps done, and whether it is to stop."""
         config = self.config
-        in_flight: deque[jax.Array] = deque()
+        skips = SkippedUpdates(int(self.state.skipped), in_flight=STEPS_IN_FLIGHT)
         self.speed.restart()
         while step < end:
             batch = next(batches)
-            self.state, metrics = self._program(stage, batch, log)(self.state, batch)
+            self.state, metrics, finite = self._program(stage, batch, log)(self.state, batch)
             step += 1
             self.speed.count()
-            in_flight.append(metrics["loss/total"])
-            if len(in_flight) > STEPS_IN_FLIGHT:
-                in_flight.popleft().block_until_ready()
+            skips.begun(step, metrics, finite, batches.clips)
 
             ending = self._reason_to_end(stop)
             last = step == end or ending is not None
             if step % config.log_every == 0 or step == 1 or last:
                 self._log(step, stage, metrics, batches.broken_clips, log)
+                skips.finish()
+                self._check_skips(step, skips, Position(index, batches.get_state()))
             self.checkpoints.check()
             if step % config.save_every == 0 or last:
                 self.checkpoints.save(self.state, Position(index, batches.get_state()))
@@ -179,7 +179,7 @@ class _Run:
         shape = batch["images"].shape
         if shape not in self.programs:
             started = time.perf_counter()
-            self.programs[shape] = self.step.lower(self.state, batch).compile()
+            self.programs[shape] = self.program.step.lower(self.state, batch).compile()
             log.say(f"{stage.name}: step compiled in {time.perf_counter() - started:.0f} s")
             self.speed.restart()
         return self.programs[shape]
@@ -214,12 +214,24 @@ class _Run:
         self.speed.read(stage)
         log.write(step, {**values, "frames_per_second": self.speed.frames_per_second})
         log.say(progress_line(step, self.config.total_steps, stage.name, values, self.speed))
-        if values["longest_skip"] >= self.config.max_skipped_in_a_row:
-            raise NonFiniteTraining(
-                f"step {step}: {values['longest_skip']:.0f} updates in a row had a non-finite loss or gradient "
-                f"(max_skipped_in_a_row={self.config.max_skipped_in_a_row}); start a new --workdir with a lower "
-                "optimizer.learning_rate, or resume from an earlier checkpoint with --resume_step"
-            )
+
+    def _check_skips(self, step: int, skips: SkippedUpdates, position: Position) -> None:
+        """Ends the run after too many skips in a row, with a checkpoint that lies past the clips that made them."""
+        longest, row = int(self.state.longest_skip), int(self.state.skipped_in_a_row)
+        if longest < self.config.max_skipped_in_a_row:
+            return
+        zero = jax.tree.map(jnp.zeros_like, self.state.longest_skip)
+        past = self.state._replace(skipped_in_a_row=zero, longest_skip=zero)
+        # A latest checkpoint with the very same parameters gives place, not the oldest: that may be the good one.
+        latest = self.checkpoints.steps[-1]
+        self.checkpoints.save(past, position, in_place_of=latest if step - latest <= row else None)
+        self.checkpoints.wait()
+        raise NonFiniteTraining(
+            f"step {step}: {longest} updates in a row had a non-finite loss or gradient "
+            f"(max_skipped_in_a_row={self.config.max_skipped_in_a_row}), with clips {described(skips.clips)}; the same "
+            "command goes on past them; if that ends like this again, start a new --workdir with a lower "
+            "optimizer.learning_rate, or go back to an earlier checkpoint with --resume_step"
+        )
 
     def _validation_is_due(self, step: int) -> bool:
         every = None if self.config.validation is None else self.config.validation.every
@@ -229,7 +241,7 @@ class _Run:
         if self.validation is None:
             return
         started = time.perf_counter()
-        values = self.validation(self.state.params)
+        values = self.validation(self.state.averaged)
         log.write(step, values)
         log.say(
             f"validation after step {step} ({duration(time.perf_counter() - started)}): "

@@ -19,7 +19,7 @@ from logvggt_jax.config import check_size
 from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.data.feeding.augmentation import ColourAugmentation
 from logvggt_jax.data.feeding.broken_clips import BrokenClips
-from logvggt_jax.data.feeding.clips import BROKEN, FIELDS, Size
+from logvggt_jax.data.feeding.clips import BROKEN, FIELDS, NAME, Size
 from logvggt_jax.data.feeding.mixture import mixture
 from logvggt_jax.data.feeding.sampling import sampler_for
 from logvggt_jax.errors import InputError
@@ -34,6 +34,7 @@ class BatchIterator(Iterator[Batch]):
 
     Attributes:
       broken: clips of this process that were replaced.
+      clips: names of this process's clips in the last batch, in its order.
     """
 
     def __init__(
@@ -49,6 +50,7 @@ class BatchIterator(Iterator[Batch]):
         num_threads: int,
     ) -> None:
         self.broken = broken
+        self.clips: list[str] = []
         self._examples, self._identity = examples, dict(identity)
         self._batch_size, self._worker_count, self._num_threads = batch_size, worker_count, num_threads
         self._process_index, self._process_count = process_index, process_count
@@ -66,6 +68,7 @@ class BatchIterator(Iterator[Batch]):
             self.close()
             raise
         self._consumed += self._batch_size
+        self.clips = [str(clip[NAME]) for clip in clips]
         messages = [message for clip in clips for message in clip.get(BROKEN, ())]
         self.broken.add(messages, clips=len(clips))
         return {name: np.stack([np.asarray(clip[name]) for clip in clips]) for name in FIELDS}

@@ -16,6 +16,7 @@ from logvggt_jax.errors import InputError
 Size = tuple[int, int]
 
 FIELDS = ("images", "depth", "intrinsics", "extrinsics")
+NAME = "name"  # field of a clip that says which it is: data set, sequence, frames
 BROKEN = "broken"  # field of a clip that took the place of a broken one: what was wrong with that
 # So many clips in a row are broken only if nearly all of those sequences are.
 _MOST_REPLACEMENTS = 16
@@ -38,7 +39,7 @@ class ClipReader:
         self.name, self.dataset, self.sampler, self.size, self.seed = name, dataset, sampler, size, seed
         self.augmentation, self.min_valid_depth = augmentation, min_valid_depth
 
-    def __call__(self, index: int, sequence: str) -> dict[str, np.ndarray]:
+    def __call__(self, index: int, sequence: str) -> dict[str, Any]:
         rng = example_rng(self.seed, index)
         indices = [int(i) for i in self.sampler.draw(self.dataset, sequence, rng)]
         # One frame at a time: a clip of large pictures would take a gigabyte.
@@ -53,7 +54,7 @@ class ClipReader:
             )
         if self.augmentation is not None:
             self.augmentation(clip.images, rng)
-        return {name: getattr(clip, name) for name in FIELDS}
+        return {NAME: where, **{name: getattr(clip, name) for name in FIELDS}}
 
 
 class ReplaceBroken:
