@@ -3,9 +3,9 @@
     python train.py --config=configs/tiny.py --workdir=runs/tiny
 
 Run the same command again to go on after an interruption. On several machines start it on each of them with
---distributed. With --dry_run nothing is trained: the step of every stage and size is compiled, and what it needs is
-printed. Any field of the configuration can be changed on the command line:
---config.optimizer.learning_rate=5e-4.
+--distributed (docs/clusters.md). With --dry_run nothing is trained: the step of every stage and size is compiled, and
+what it needs is printed. With --preflight the same command tries network, data, folder and step beforehand. Any field
+of the configuration can be changed on the command line: --config.optimizer.learning_rate=5e-4.
 """
 
 from __future__ import annotations
@@ -22,14 +22,16 @@ import jax
 from absl import app, flags, logging
 from ml_collections import config_flags
 
-from logvggt_jax.compile import check_devices, enable_compilation_cache
+from logvggt_jax.compile import check_devices, check_nccl, enable_compilation_cache
 from logvggt_jax.errors import InputError, one_line
 from logvggt_jax.terminal import forgiving_streams
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.dry_run import described_mesh, dry_run
 from logvggt_jax.training.lifeline import Lifeline
 from logvggt_jax.training.loop import NonFiniteTraining, train
+from logvggt_jax.training.preflight import preflight
 from logvggt_jax.training.processes import JOIN_SECONDS, LOSS_SECONDS, check_processes, join_processes
+from logvggt_jax.training.profile import ProfiledSteps
 from logvggt_jax.training.sharding import data_mesh, use_cpu_cores
 
 _CONFIG = config_flags.DEFINE_config_file("config", None, "File with the run's settings.", lock_config=True)
@@ -44,7 +46,12 @@ _COORDINATOR = flags.DEFINE_string("coordinator", None, "host:port of process 0,
 _NUM_PROCESSES = flags.DEFINE_integer("num_processes", None, "Processes of the run, where the cluster does not say.")
 _PROCESS_ID = flags.DEFINE_integer("process_id", None, "Of this process, from 0, where the cluster does not say.")
 _JOIN_SECONDS = flags.DEFINE_float("join_seconds", JOIN_SECONDS, "How long to wait for the others at the start.")
+_WATCHDOG = flags.DEFINE_float(
+    "watchdog", 30.0, "End the process, with all stacks, when no step ended in so many median steps; 0: never."
+)
+_PROFILE = flags.DEFINE_string("profile", None, "Steps to write a trace of to WORKDIR/profile, such as 20:25.")
 _DRY_RUN = flags.DEFINE_bool("dry_run", False, "Say what every step needs and how many clips fit; train nothing.")
+_PREFLIGHT = flags.DEFINE_bool("preflight", False, "Try network, data, folder and step in minutes; train nothing.")
 _DESCRIBED = flags.DEFINE_string(
     "described", None, "TPU slice to compile for instead of the devices at hand, such as v5p:2x2x4; with --dry_run."
 )
@@ -61,7 +68,9 @@ def main(arguments: Sequence[str]) -> None:
     watched: Lifeline | None = None
     try:
         config = TrainConfig.from_dict(_settings())
+        profile = ProfiledSteps.parse(_PROFILE.value) if _PROFILE.value else None
         use_cpu_cores(config, num_processes=_NUM_PROCESSES.value or 1)
+        check_nccl()
         if _DISTRIBUTED.value:
             watched = join_processes(
                 coordinator=_COORDINATOR.value,
@@ -73,8 +82,17 @@ def main(arguments: Sequence[str]) -> None:
         check_processes()
         if _DRY_RUN.value:
             dry_run(config, described_mesh(_DESCRIBED.value) if _DESCRIBED.value else data_mesh())
+        elif _PREFLIGHT.value:
+            preflight(config, Path(_WORKDIR.value), data_mesh())
         else:
-            train(config, Path(_WORKDIR.value), mesh=data_mesh(), resume_step=_RESUME_STEP.value)
+            train(
+                config,
+                Path(_WORKDIR.value),
+                mesh=data_mesh(),
+                resume_step=_RESUME_STEP.value,
+                watchdog=_WATCHDOG.value,
+                profile=profile,
+            )
     except BaseException as error:
         _fail(error, watched)
     if watched is not None:

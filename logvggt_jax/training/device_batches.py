@@ -19,7 +19,7 @@ class _Ready(NamedTuple):
     batch: Batch
     state: dict[str, Any]
     broken_clips: int
-    clips: list[str]
+    names: list[str]
 
 
 class DeviceBatches(Iterator[Batch]):
@@ -30,20 +30,20 @@ class DeviceBatches(Iterator[Batch]):
 
     Attributes:
       broken_clips: clips of this process that were replaced, up to the last batch.
-      clips: names of this process's clips in the last batch, in its order.
+      names: of this process's clips of the last batch.
     """
 
     def __init__(self, source: BatchIterator, mesh: Mesh) -> None:
         self._source, self._mesh = source, mesh
         self._state, self.broken_clips = source.get_state(), source.broken.count
-        self.clips: list[str] = []
+        self.names: list[str] = []
         self._thread = ThreadPoolExecutor(1, "device-batches")
         self._next: Future[_Ready] | None = None
 
     def __next__(self) -> Batch:
         ready = (self._next or self._thread.submit(self._draw)).result()
         self._next = self._thread.submit(self._draw)
-        self._state, self.broken_clips, self.clips = ready.state, ready.broken_clips, ready.clips
+        self._state, self.broken_clips, self.names = ready.state, ready.broken_clips, ready.names
         return ready.batch
 
     def __enter__(self) -> DeviceBatches:
@@ -58,4 +58,4 @@ class DeviceBatches(Iterator[Batch]):
 
     def _draw(self) -> _Ready:
         batch = put_batch(next(self._source), self._mesh)
-        return _Ready(batch, self._source.get_state(), self._source.broken.count, self._source.clips)
+        return _Ready(batch, self._source.get_state(), self._source.broken.count, self._source.names)

@@ -6,7 +6,6 @@ import json
 import os
 import platform
 import secrets
-import sys
 import threading
 import time
 from collections import deque
@@ -117,8 +116,9 @@ def _lifeline() -> Lifeline | None:
 
 def end_process(message: str) -> None:
     """Says one line and ends this process at once: its other threads may wait for another process for ever."""
-    with contextlib.suppress(OSError, ValueError):
-        print(f"train.py: {message}", file=sys.stderr, flush=True)
+    # In one piece, and without the locks of a stream that a thread may hold for ever.
+    with contextlib.suppress(OSError):
+        os.write(2, f"train.py: {message}\n".encode())
     os._exit(1)
 
 
@@ -127,10 +127,11 @@ def check_processes() -> None:
     if jax.process_count() > 1 and jax.default_backend() == "gpu" and jax.local_device_count() > 1:
         logging.warning(
             "process %d owns %d GPUs beside %d other processes, in which JAX 0.11.0 can wait for ever (a deadlock in "
-            "NCCL); start one process a GPU, for example with srun --ntasks-per-node=%d --gpus-per-task=1",
+            "NCCL); start one process a GPU, for example with srun --ntasks-per-node=%d --gpus-per-node=%d",
             jax.process_index(),
             jax.local_device_count(),
             jax.process_count() - 1,
+            jax.local_device_count(),
             jax.local_device_count(),
         )
 

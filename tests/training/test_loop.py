@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import re
 import shutil
 import signal
 from collections.abc import Callable
@@ -20,8 +21,10 @@ from logvggt_jax.training import loop
 from logvggt_jax.training.checkpoint_files import Position
 from logvggt_jax.training.checkpoints import RunCheckpoints
 from logvggt_jax.training.config import SourceConfig, TrainConfig, ValidationConfig
+from logvggt_jax.training.device_batches import DeviceBatches
 from logvggt_jax.training.loop import NonFiniteTraining, train
 from logvggt_jax.training.metrics_log import MetricsLog, read_metrics
+from logvggt_jax.training.profile import ProfiledSteps
 from logvggt_jax.training.sharding import data_mesh
 from logvggt_jax.training.state import TrainState
 from logvggt_jax.weights.checkpoints import digests, load_model, read_provenance
@@ -200,6 +203,68 @@ def test_endless_non_finite_updates_stop_the_run(
         train(run_config, tmp_path, mesh=data_mesh(1))
 
 
+def test_data_that_fail_leave_a_checkpoint(
+    run_config: TrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    draw = DeviceBatches.__next__
+    calls: list[int] = []
+
+    def fail(batches: DeviceBatches) -> Any:
+        calls.append(1)
+        if len(calls) == 3:
+            raise InputError("the disk is gone")
+        return draw(batches)
+
+    monkeypatch.setattr(DeviceBatches, "__next__", fail)
+    with pytest.raises(InputError, match="the disk is gone"):
+        train(run_config, tmp_path, mesh=data_mesh(1))
+    assert RunCheckpoints(tmp_path, run_config).steps[-1] == 2
+
+
+def test_a_line_shows_the_mean_of_its_interval(
+    run_config: TrainConfig, straight: tuple[TrainState, Path], tmp_path: Path
+) -> None:
+    train(dataclasses.replace(run_config, log_every=50), tmp_path, mesh=data_mesh(2))
+    each = {entry["step"]: entry for entry in _numbers(straight[1])}
+    lines = _numbers(tmp_path)
+    # The first step, saves, and the ends of the stages.
+    assert [line["step"] for line in lines] == [1, 3, 4, 6]
+    for name in ("loss/total", "train/abs_rel", "gradient_norm/depth_head"):
+        assert lines[1][name] == pytest.approx((each[2][name] + each[3][name]) / 2)
+    assert lines[1]["learning_rate"] == each[3]["learning_rate"]
+
+
+def test_goodput_counts_earlier_sessions(
+    run_config: TrainConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    train(dataclasses.replace(run_config, max_minutes=1e-9), tmp_path, mesh=data_mesh(1))
+    first = read_metrics(tmp_path / "times.jsonl")
+    train(run_config, tmp_path, mesh=data_mesh(1))
+    entries = read_metrics(tmp_path / "times.jsonl")
+    assert entries[: len(first)] == first and [entry["step"] for entry in first] == [0, 1]
+    productive = [entry["productive_seconds"] for entry in entries]
+    assert productive == sorted(productive) and productive[0] == 0 < productive[1] < productive[-1]
+    assert 0 <= entries[1]["data_share"] <= 1 and entries[-1]["run_seconds_left"] == 0
+    assert re.search(r"goodput \d+%: \S+ of training in \S+ since the first start", capsys.readouterr().out)
+
+
+def test_a_trace_of_some_steps_is_written(run_config: TrainConfig, tmp_path: Path) -> None:
+    train(run_config, tmp_path, mesh=data_mesh(1), profile=ProfiledSteps.parse("3:4"))
+    assert list((tmp_path / "profile").rglob("*.xplane.pb"))
+    with pytest.raises(InputError, match=r"--profile=4:3: expected the first and the last step, such as 20:25"):
+        ProfiledSteps.parse("4:3")
+
+
+def test_the_data_are_looked_for_before_the_weights_are_read(
+    run_config: TrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(loop, "initial_parameters", lambda *_, **__: pytest.fail("the weights were read"))
+    source = SourceConfig(name="scannet", root=str(tmp_path / "none"), split="train")
+    data = dataclasses.replace(run_config.data, sources=(source,))
+    with pytest.raises(InputError, match="scannet"):
+        train(dataclasses.replace(run_config, data=data), tmp_path / "run", mesh=data_mesh(1))
+
+
 @pytest.mark.parametrize("reason", ["RESOURCE_EXHAUSTED: Out of memory while trying to allocate", "INTERNAL: broken"])
 def test_a_step_that_does_not_fit_says_what_it_needs_and_what_lowers_it(
     reason: str, run_config: TrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -371,11 +436,9 @@ def test_clips_that_make_updates_useless_are_named_and_the_same_command_goes_pas
         return clip
 
     monkeypatch.setattr(ClipReader, "__call__", reading)
-    with pytest.raises(
-        NonFiniteTraining, match=r"step 3: 2 updates in a row .* with clips rooms, .*goes on past"
-    ) as end:
+    with pytest.raises(NonFiniteTraining, match=r"step 3: 2 updates in a row .* with rooms, .*goes on past") as end:
         train(run_config, tmp_path, mesh=data_mesh(2))
-    named = [line for line in caplog.messages if "update left out, not finite in" in line]
+    named = [line for line in caplog.messages if "update left out, loss was not finite in" in line]
     assert [line.split(":")[0] for line in named] == ["step 2", "step 3"]
     assert [line.count("rooms, ") for line in named] == [2, 1]
     assert str(end.value).count("rooms, ") == 3 and "frames" in str(end.value)

@@ -14,7 +14,7 @@ import pytest
 
 from logvggt_jax.training import processes
 from logvggt_jax.training.metrics_log import read_metrics
-from logvggt_jax.training.processes import any_process, check_agreement, join_processes
+from logvggt_jax.training.processes import any_process, check_agreement, check_processes, join_processes
 from logvggt_jax.weights.checkpoints import load_model
 
 ROOT = Path(__file__).parents[2]
@@ -70,6 +70,17 @@ def test_processes_that_differ_are_named(monkeypatch: pytest.MonkeyPatch) -> Non
     )
     with pytest.raises(ValueError, match=r"the data of the processes \[1\] differ from those of process 0"):
         check_agreement("the data", {"a": 1})
+
+
+@pytest.mark.parametrize(("gpus", "warned"), [(8, True), (1, False)])
+def test_several_gpus_of_one_process_draw_a_warning(
+    gpus: int, warned: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(jax, "process_count", lambda: 2)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(jax, "local_device_count", lambda: gpus)
+    check_processes()
+    assert warned == ("owns 8 GPUs beside 1 other processes" in caplog.text)
 
 
 def test_half_an_address_is_refused() -> None:
@@ -180,6 +191,27 @@ def test_folders_that_are_not_shared_are_an_error_of_the_start(tmp_path: Path) -
             assert re.search(r"of the processes \[1\] is another folder than that of process 0", errors), errors
             assert "Traceback" not in errors
     assert not list((tmp_path / "a").iterdir())
+
+
+def test_a_preflight_goes_on_together_when_one_process_fails_a_try(tmp_path: Path) -> None:
+    quick = (
+        "from logvggt_jax.training import preflight as flight\n"
+        "from logvggt_jax.training.dry_run import StepCosts\n"
+        "flight.step_costs = lambda *_: StepCosts(1, 1, {}, 1.0)\n"
+        "flight.abstract_parameters = loop.abstract_parameters\n"
+    )
+    broken = (
+        "from logvggt_jax.errors import InputError\n"
+        "def fail(*_): raise InputError('scene0001: cannot be opened')\n"
+        "flight._read_clips = fail\n"
+    )
+    with PixelRuns(tmp_path, tmp_path, patches=(quick, quick + broken), flags=("--preflight",)) as runs:
+        outputs = [process.communicate(timeout=60) for process in runs.processes]
+        assert [process.returncode for process in runs.processes] == [1, 1], outputs
+    assert "rooms: FAILED on process 1: scene0001: cannot be opened" in outputs[1][0]
+    assert "checkpoint: " in outputs[0][0] and "checkpoint: " not in outputs[1][0]
+    assert "preflight: 1 of the tries failed: rooms; see the lines above" in outputs[0][1] + outputs[1][1]
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_process_that_never_joins_is_waited_for_as_long_as_stated(tmp_path: Path) -> None:

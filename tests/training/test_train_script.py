@@ -36,7 +36,7 @@ def test_a_real_model_is_trained_validated_and_saved(tmp_path: Path) -> None:
     finished = run_train(tmp_path / "run")
     assert finished.returncode == 0, finished.stderr
     assert "step 2/2 stage_2" in finished.stdout and "validation after step 2" in finished.stdout
-    first, second, validation = read_metrics(tmp_path / "run" / "metrics.jsonl")
+    *_, first, second, validation = read_metrics(tmp_path / "run" / "metrics.jsonl")
     assert np.isfinite([first["loss/total"], second["loss/total"], validation["validation/abs_rel"]]).all()
     model, variables = load_model(tmp_path / "run" / "model")
     assert model.config.encoder.depth == 1

@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 import grain
 import numpy as np
-from absl import flags
+from absl import flags, logging
 
 from logvggt_jax.config import check_size
 from logvggt_jax.data.dataset import Dataset
@@ -22,9 +22,12 @@ from logvggt_jax.data.feeding.broken_clips import BrokenClips
 from logvggt_jax.data.feeding.clips import BROKEN, FIELDS, NAME, Size
 from logvggt_jax.data.feeding.mixture import mixture
 from logvggt_jax.data.feeding.sampling import sampler_for
-from logvggt_jax.errors import InputError
+from logvggt_jax.errors import InputError, one_line
 
 Batch = dict[str, np.ndarray]
+# Workers that are killed are started again so many times, unless batches enough came in between.
+_MOST_RESTARTS = 3
+_RECOVERED = 100
 
 
 class BatchIterator(Iterator[Batch]):
@@ -34,7 +37,7 @@ class BatchIterator(Iterator[Batch]):
 
     Attributes:
       broken: clips of this process that were replaced.
-      clips: names of this process's clips in the last batch, in its order.
+      names: of the last batch's clips: data set, sequence and frames.
     """
 
     def __init__(
@@ -50,28 +53,60 @@ class BatchIterator(Iterator[Batch]):
         num_threads: int,
     ) -> None:
         self.broken = broken
-        self.clips: list[str] = []
         self._examples, self._identity = examples, dict(identity)
         self._batch_size, self._worker_count, self._num_threads = batch_size, worker_count, num_threads
         self._process_index, self._process_count = process_index, process_count
         self._consumed = 0
+        self._restarts = self._since_restart = 0
+        self.names: list[str] = []
         self._clips: Iterator[dict[str, Any]] | None = None
 
     def __next__(self) -> Batch:
         """The next batch: this process's share of `batch_size` examples."""
-        if self._clips is None:
-            self._clips = self._open()
-        try:
-            clips = [next(self._clips) for _ in range(self._batch_size // self._process_count)]
-        except BaseException:
-            # What was read of this batch is lost with the stream; the next call starts at its first clip.
-            self.close()
-            raise
+        clips = self._read()
         self._consumed += self._batch_size
-        self.clips = [str(clip[NAME]) for clip in clips]
         messages = [message for clip in clips for message in clip.get(BROKEN, ())]
         self.broken.add(messages, clips=len(clips))
+        self.names = [clip[NAME] for clip in clips]
         return {name: np.stack([np.asarray(clip[name]) for clip in clips]) for name in FIELDS}
+
+    def _read(self) -> list[dict[str, Any]]:
+        """This process's clips of the next batch; workers that are killed are started again a few times."""
+        while True:
+            if self._clips is None:
+                self._clips = self._open()
+            try:
+                clips = [next(self._clips) for _ in range(self._batch_size // self._process_count)]
+            except BaseException as error:
+                # What was read of this batch is lost with the stream; the next call starts at its first clip.
+                self.close()
+                if not _is_killed_worker(error):
+                    raise
+                self._restart(error)
+                continue
+            self._since_restart += 1
+            if self._since_restart >= _RECOVERED:
+                self._restarts = 0
+            return clips
+
+    def _restart(self, error: BaseException) -> None:
+        self._restarts, self._since_restart = self._restarts + 1, 0
+        mend = (
+            "the system kills what takes too much memory, which fewer data.worker_count need less of; a container "
+            "needs /dev/shm for three clips a worker"
+        )
+        if self._restarts > _MOST_RESTARTS:
+            raise InputError(
+                f"reading workers were killed {self._restarts} times with less than {_RECOVERED} batches in between "
+                f"({one_line(error)}): {mend}"
+            ) from error
+        logging.warning(
+            "a reading worker was killed (%s), all are started again (%d of %d times): %s",
+            one_line(error),
+            self._restarts,
+            _MOST_RESTARTS,
+            mend,
+        )
 
     def __enter__(self) -> BatchIterator:
         return self
@@ -244,6 +279,11 @@ def training_batches(
         worker_count=worker_count,
         num_threads=num_threads,
     )
+
+
+def _is_killed_worker(error: BaseException) -> bool:
+    # Grain has no error of its own for this.
+    return isinstance(error, RuntimeError) and "Worker process was terminated unexpectedly" in str(error)
 
 
 def _start_worker(index: int, count: int) -> None:

@@ -16,7 +16,7 @@ from logvggt_jax.errors import InputError
 Size = tuple[int, int]
 
 FIELDS = ("images", "depth", "intrinsics", "extrinsics")
-NAME = "name"  # field of a clip that says which it is: data set, sequence, frames
+NAME = "name"  # field of a clip: its data set, sequence and frames
 BROKEN = "broken"  # field of a clip that took the place of a broken one: what was wrong with that
 # So many clips in a row are broken only if nearly all of those sequences are.
 _MOST_REPLACEMENTS = 16
@@ -54,7 +54,7 @@ class ClipReader:
             )
         if self.augmentation is not None:
             self.augmentation(clip.images, rng)
-        return {NAME: where, **{name: getattr(clip, name) for name in FIELDS}}
+        return {**{name: getattr(clip, name) for name in FIELDS}, NAME: where}
 
 
 class ReplaceBroken:
