@@ -27,7 +27,7 @@ from logvggt_jax.training.program import abstract_parameters, make_program
 from logvggt_jax.training.sharding import DATA_AXIS, check_batch_size, split
 
 _GIB = 2**30
-# Numbers of clips a device that are tried for the largest that fits: each is a compilation of minutes.
+# Numbers of clips that a device takes at once, tried for the largest that fits: each is a compilation of minutes.
 _TRIED_CLIPS = (1, 2, 4, 8)
 _COLLECTIVE = re.compile(
     r"= (.*?) (all-reduce|all-gather|reduce-scatter|all-to-all|collective-permute)(?:-start)?\(", re.MULTILINE
@@ -78,7 +78,7 @@ def dry_run(config: TrainConfig, mesh: Mesh, say: Callable[[str], None] = print)
             operations = step_flops(config.model, (stage.batch_size, stage.clip_length, *size))
             costs = costs_of(clips, stage.clip_length, size)
             say(f"{name}: {operations / 1e12:.4g} TFLOP in all without recomputation; {_described(costs, limit)}")
-        say(f"{stage.name}: {_largest_that_fits(costs_of, mesh, stage, limit)}")
+        say(f"{stage.name}: {_largest_that_fits(costs_of, mesh, stage, limit, config.accumulate)}")
 
 
 def described_mesh(topology: str) -> Mesh:
@@ -169,16 +169,18 @@ def _largest_that_fits(
     mesh: Mesh,
     stage: StageConfig,
     limit: int | None,
+    accumulate: int,
 ) -> str:
     if limit is None and mesh.devices.flat[0].platform != "tpu":  # a described TPU's compiler knows
         return "how many clips fit is not known, these devices do not say how much memory they have"
     size, fitting = max(stage.sizes, key=math.prod), 0
-    for clips in _TRIED_CLIPS:
+    numbers = [accumulate * clips for clips in _TRIED_CLIPS]
+    for clips in numbers:
         costs = costs_of(clips, stage.clip_length, size)
         if costs is None or not _fits(costs, limit):
             break
         fitting = clips
-    tried = f"of {', '.join(map(str, _TRIED_CLIPS))} clips a device at {size[0]}x{size[1]}"
+    tried = f"of {', '.join(map(str, numbers))} clips a device at {size[0]}x{size[1]}"
     if not fitting:
         return f"none {tried} fits: fewer frames (clip_length) or smaller images (sizes) do"
     return f"{fitting} is the largest {tried} that fits, batch_size={fitting * mesh.size}"
