@@ -24,11 +24,10 @@ from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.operations import count_flops
 from logvggt_jax.training.config import StageConfig, TrainConfig
 from logvggt_jax.training.program import abstract_parameters, make_program
-from logvggt_jax.training.sharding import DATA_AXIS, check_batch_size, replicated, split
-from logvggt_jax.training.state import initial_state
+from logvggt_jax.training.sharding import DATA_AXIS, check_batch_size, split
 
 _GIB = 2**30
-# Numbers of clips a device that are tried for the largest that fits: each is a compilation of minutes.
+# Numbers of clips that a device takes at once, tried for the largest that fits: each is a compilation of minutes.
 _TRIED_CLIPS = (1, 2, 4, 8)
 _COLLECTIVE = re.compile(
     r"= (.*?) (all-reduce|all-gather|reduce-scatter|all-to-all|collective-permute)(?:-start)?\(", re.MULTILINE
@@ -59,7 +58,7 @@ def dry_run(config: TrainConfig, mesh: Mesh, say: Callable[[str], None] = print)
     The devices may be described ones. Raises InputError where a stage's batches do not split over them.
     """
     for stage in config.stages:
-        check_batch_size(stage, mesh)
+        check_batch_size(stage, mesh, accumulate=config.accumulate)
     if mesh.devices.flat[0].platform == "tpu" and config.model.attention == "auto":
         # Chosen by the device at hand, which a described one is not.
         config = dataclasses.replace(config, model=dataclasses.replace(config.model, attention="tpu_flash"))
@@ -79,7 +78,7 @@ def dry_run(config: TrainConfig, mesh: Mesh, say: Callable[[str], None] = print)
             operations = step_flops(config.model, (stage.batch_size, stage.clip_length, *size))
             costs = costs_of(clips, stage.clip_length, size)
             say(f"{name}: {operations / 1e12:.4g} TFLOP in all without recomputation; {_described(costs, limit)}")
-        say(f"{stage.name}: {_largest_that_fits(costs_of, mesh, stage, limit)}")
+        say(f"{stage.name}: {_largest_that_fits(costs_of, mesh, stage, limit, config.accumulate)}")
 
 
 def described_mesh(topology: str) -> Mesh:
@@ -117,25 +116,23 @@ def step_costs(
 ) -> StepCosts | None:
     """Compiles the step for `clips` a device; None where the compiler finds that they do not fit."""
     params = abstract_parameters(config.model)
-    optimizer, step = make_program(LogVGGT(config.model), config, params, mesh)
-    state = jax.eval_shape(functools.partial(initial_state, optimizer=optimizer), params)
-    batch = abstract_clips(clips * mesh.size, clip_length, size)
-    arguments = [
-        jax.tree.map(lambda x, s=sharding: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=s), tree)
-        for tree, sharding in ((state, replicated(mesh)), (batch, split(mesh)))
-    ]
+    program = make_program(LogVGGT(config.model), config, params, mesh)
+    batch = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=split(mesh)),
+        abstract_clips(clips * mesh.size, clip_length, size),
+    )
     started = time.perf_counter()
     try:
-        program = step.lower(*arguments).compile()
+        compiled = program.step.lower(program.abstract_state(params), batch).compile()
     except jax.errors.JaxRuntimeError as error:
         if out_of_device_memory(error):
             return None
         raise
-    memory: Any = program.memory_analysis()
+    memory: Any = compiled.memory_analysis()
     return StepCosts(
         arguments=memory.argument_size_in_bytes,
         temporaries=memory.temp_size_in_bytes,
-        collectives=collectives(program.as_text() or ""),
+        collectives=collectives(compiled.as_text() or ""),
         compilation=time.perf_counter() - started,
     )
 
@@ -153,7 +150,8 @@ def abstract_clips(batch: int, frames: int, size: tuple[int, int]) -> dict[str, 
 def collectives(program: str) -> dict[str, tuple[int, int]]:
     """Number and bytes of the exchanges between devices in a compiled program's text, by name.
 
-    One in a loop counts once; the training step exchanges its sums outside of all loops.
+    One in a loop counts once. The training step exchanges its sums outside of all loops; parameters in parts are put
+    together within them.
     """
     found: dict[str, tuple[int, int]] = {}
     for shapes, name in _COLLECTIVE.findall(program):
@@ -171,16 +169,18 @@ def _largest_that_fits(
     mesh: Mesh,
     stage: StageConfig,
     limit: int | None,
+    accumulate: int,
 ) -> str:
     if limit is None and mesh.devices.flat[0].platform != "tpu":  # a described TPU's compiler knows
         return "how many clips fit is not known, these devices do not say how much memory they have"
     size, fitting = max(stage.sizes, key=math.prod), 0
-    for clips in _TRIED_CLIPS:
+    numbers = [accumulate * clips for clips in _TRIED_CLIPS]
+    for clips in numbers:
         costs = costs_of(clips, stage.clip_length, size)
         if costs is None or not _fits(costs, limit):
             break
         fitting = clips
-    tried = f"of {', '.join(map(str, _TRIED_CLIPS))} clips a device at {size[0]}x{size[1]}"
+    tried = f"of {', '.join(map(str, numbers))} clips a device at {size[0]}x{size[1]}"
     if not fitting:
         return f"none {tried} fits: fewer frames (clip_length) or smaller images (sizes) do"
     return f"{fitting} is the largest {tried} that fits, batch_size={fitting * mesh.size}"

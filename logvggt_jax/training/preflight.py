@@ -27,8 +27,8 @@ from logvggt_jax.training.config import SourceConfig, StageConfig, TrainConfig
 from logvggt_jax.training.dry_run import step_costs
 from logvggt_jax.training.processes import any_process, check_shared
 from logvggt_jax.training.program import abstract_parameters, make_program
-from logvggt_jax.training.sharding import DATA_AXIS, check_batch_size, replicated, split
-from logvggt_jax.training.state import initial_state
+from logvggt_jax.training.sharding import DATA_AXIS, check_batch_size, split
+from logvggt_jax.training.state import TrainState
 
 CLIPS = 20
 _EXCHANGED_BYTES = 2**26
@@ -42,7 +42,7 @@ def preflight(config: TrainConfig, workdir: Path, mesh: Mesh, say: Callable[[str
     the end where something failed on a process, and at once where the folder is not shared.
     """
     for stage in config.stages:
-        check_batch_size(stage, mesh)
+        check_batch_size(stage, mesh, accumulate=config.accumulate)
     check_shared(workdir)
     failed: list[str] = []
 
@@ -130,11 +130,11 @@ def _read_clips(dataset: Dataset, source: SourceConfig, config: TrainConfig) -> 
 
 def _checkpoint(config: TrainConfig, workdir: Path, mesh: Mesh) -> str:
     shapes = abstract_parameters(config.model)
-    optimizer, _ = make_program(LogVGGT(config.model), config, shapes, mesh)
+    like = make_program(LogVGGT(config.model), config, shapes, mesh).abstract_state(shapes)
 
-    @functools.partial(jax.jit, out_shardings=replicated(mesh))
-    def zeros() -> object:
-        return initial_state(jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes), optimizer)
+    @functools.partial(jax.jit, out_shardings=jax.tree.map(lambda leaf: leaf.sharding, like))
+    def zeros() -> TrainState:
+        return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), like)
 
     folder = workdir / "preflight"
     try:

@@ -83,6 +83,22 @@ def test_the_largest_that_fits_is_searched(
     assert ("which do not fit" in lines[1]) == (limit < 25)
 
 
+def test_clips_that_are_accumulated_are_tried_in_whole_parts(
+    config: TrainConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tried: list[int] = []
+
+    def costs(config: TrainConfig, mesh: object, clips: int, clip_length: int, size: object) -> StepCosts:
+        tried.append(clips)
+        return StepCosts(5, 10 * clips, {}, 0.0)
+
+    monkeypatch.setattr(module, "step_costs", costs)
+    monkeypatch.setattr(module, "device_bytes", lambda device: 65)
+    lines: list[str] = []
+    dry_run(dataclasses.replace(config, accumulate=2), data_mesh(2), lines.append)
+    assert tried == [2, 4, 8] and "4 is the largest of 2, 4, 8, 16 clips a device" in lines[-1]
+
+
 def test_what_the_compiler_refuses_does_not_fit(config: TrainConfig, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object, **__: object) -> None:
         raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Ran out of memory in memory space hbm")

@@ -1,0 +1,90 @@
+"""A run that is killed at any moment, in the middle of a save too, ends as one that was left alone."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from logvggt_jax.training.config import TrainConfig
+from logvggt_jax.training.metrics_log import read_metrics
+from logvggt_jax.weights.digests import digests
+
+# Starts the run with the quick model; says when it trains. A save takes its time, so that many kills fall into one.
+RUN = """
+import pickle, sys, time
+from pathlib import Path
+import jax
+jax.config.update("jax_num_cpu_devices", 2)
+sys.path.insert(0, sys.argv[3])
+from conftest import PixelModel
+from logvggt_jax.training import checkpoint_files, loop
+from logvggt_jax.training.config import TrainConfig
+from logvggt_jax.training.sharding import data_mesh
+settings, params = pickle.loads(Path(sys.argv[1]).read_bytes())
+config = TrainConfig.from_dict(settings)
+loop.LogVGGT = lambda _: PixelModel(config.model)
+loop.initial_parameters = lambda *_, **__: params
+loop.abstract_parameters = lambda _: jax.eval_shape(lambda: params)
+write = checkpoint_files.write_arrays
+checkpoint_files.write_arrays = lambda *given: (write(*given), time.sleep(0.1))
+print("begins", flush=True)
+state = loop.train(config, Path(sys.argv[2]), mesh=data_mesh(2))
+Path(sys.argv[2], "ended.pickle").write_bytes(pickle.dumps(jax.device_get(state)))
+"""
+
+
+@pytest.mark.slow
+def test_twelve_kills_change_nothing(run_config: TrainConfig, pixel_params: Any, tmp_path: Path) -> None:
+    stages = [{**stage, "steps": 30} for stage in run_config.to_dict()["stages"]]
+    validation = {
+        "source": {**run_config.to_dict()["data"]["sources"][0], "split": "val"},
+        "every": 4,
+        "num_clips": 2,
+        "clip_length": 3,
+        "stride": 2,
+        "size": [28, 42],
+    }
+    settings = {**run_config.to_dict(), "stages": stages, "validation": validation, "save_every": 2, "log_every": 2}
+    given = tmp_path / "run.pickle"
+    given.write_bytes(pickle.dumps((settings, pixel_params)))
+
+    def start(workdir: Path) -> subprocess.Popen[str]:
+        command = [sys.executable, "-c", RUN, str(given), str(workdir), str(Path(__file__).parent)]
+        environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
+        return subprocess.Popen(command, text=True, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+
+    def finish(run: subprocess.Popen[str]) -> None:
+        output = run.communicate(timeout=300)[0]
+        assert run.returncode == 0, output
+
+    started = time.monotonic()
+    finish(start(tmp_path / "alone"))
+    length, generator = time.monotonic() - started, random.Random(0)
+    for _ in range(int(os.environ.get("LOGVGGT_KILLS", "12"))):
+        run = start(tmp_path / "killed")
+        assert run.stdout is not None
+        while "begins" not in run.stdout.readline():
+            pass
+        time.sleep(generator.uniform(0.0, length / 2))
+        run.send_signal(signal.SIGKILL)
+        run.communicate()
+    finish(start(tmp_path / "killed"))
+    ends = [pickle.loads((tmp_path / name / "ended.pickle").read_bytes()) for name in ("alone", "killed")]
+    assert digests(ends[0]) == digests(ends[1])
+    lines = [
+        [json.dumps({k: v for k, v in line.items() if k not in ("time", "frames_per_second")}) for line in found]
+        for found in (read_metrics(tmp_path / name / "metrics.jsonl") for name in ("alone", "killed"))
+    ]
+    assert lines[0] == lines[1]
+    left = sorted(path.name for path in (tmp_path / "killed").iterdir())
+    assert not [name for name in left if name.endswith((".partial", ".old"))]
