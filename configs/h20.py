@@ -124,6 +124,9 @@ def get_config(data_root: str = "data") -> ConfigDict:
     config.keep_checkpoints = 3
     config.max_skipped_in_a_row = 20
     config.max_minutes = placeholder(float)
+    config.accumulate = 1
+    config.shard_parameters = False
+    config.average = placeholder(float)
     return config
 
 

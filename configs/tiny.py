@@ -109,6 +109,9 @@ def get_config() -> ConfigDict:
     config.keep_checkpoints = 2
     config.max_skipped_in_a_row = 20
     config.max_minutes = placeholder(float)
+    config.accumulate = 1
+    config.shard_parameters = False
+    config.average = placeholder(float)
     return config
 
 

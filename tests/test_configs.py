@@ -1,7 +1,6 @@
 """The files under `configs/`: each builds its run, and the largest one's whole step is checked on shapes."""
 
 import dataclasses
-import functools
 import importlib
 import math
 import subprocess
@@ -19,7 +18,7 @@ from logvggt_jax.training.dry_run import abstract_clips
 from logvggt_jax.training.optimizer import learning_rate_schedule
 from logvggt_jax.training.program import abstract_parameters, make_program
 from logvggt_jax.training.sharding import check_batch_size, data_mesh
-from logvggt_jax.training.state import TrainState, initial_state
+from logvggt_jax.training.state import TrainState
 
 ROOT = Path(__file__).parents[1]
 
@@ -71,8 +70,8 @@ def test_h20_is_the_papers_training(monkeypatch: pytest.MonkeyPatch) -> None:
 def _abstract_run(config: TrainConfig, num_devices: int) -> tuple[TrainState, jax.stages.Wrapped]:
     """A run's first state without values, and its step."""
     params = abstract_parameters(config.model)
-    optimizer, step = make_program(LogVGGT(config.model), config, params, data_mesh(num_devices))
-    return jax.eval_shape(functools.partial(initial_state, optimizer=optimizer), params), step
+    program = make_program(LogVGGT(config.model), config, params, data_mesh(num_devices))
+    return program.abstract_state(params), program.step
 
 
 def _shallow(config: TrainConfig) -> TrainConfig:

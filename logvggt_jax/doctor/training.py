@@ -18,7 +18,7 @@ from logvggt_jax.operations import matmul_flops_per_second
 from logvggt_jax.training.config import LossConfig, OptimizerConfig
 from logvggt_jax.training.dry_run import step_flops
 from logvggt_jax.training.optimizer import make_optimizer
-from logvggt_jax.training.sharding import data_mesh, replicated, split
+from logvggt_jax.training.sharding import data_mesh, parameter_layout, replicated, split
 from logvggt_jax.training.state import TrainState, initial_state
 from logvggt_jax.training.step import make_loss_terms, make_train_step
 
@@ -56,7 +56,8 @@ def examine(subject: Subject) -> Iterator[Finding]:
     # On the host: the device holds one state at a time.
     params = jax.tree.map(np.asarray, stack_layers(random_variables(model))["params"])
     optimizer = make_optimizer(_OPTIMIZER, params, frozen=("encoder",))
-    step = make_train_step(make_loss_terms(model, _LOSS), _LOSS, optimizer, lambda _: 1e-6, mesh)
+    layout = parameter_layout(params, mesh, shard=False)
+    step = make_train_step(make_loss_terms(model, _LOSS), _LOSS, optimizer, lambda _: 1e-6, layout)
     peak = matmul_flops_per_second("bfloat16", size=256 if subject.tiny else None)
     begun = time.perf_counter()
     for clips in (1,) if subject.tiny or subject.quick else (4, 1, 2, 3):
@@ -88,11 +89,11 @@ def _measured(
     memory: Any = program.memory_analysis()
     yield Finding("training", f"{name}: arguments", memory.argument_size_in_bytes / 2**30, "GiB")
     yield Finding("training", f"{name}: temporaries", memory.temp_size_in_bytes / 2**30, "GiB")
-    state, metrics = program(state, batch)
+    state, metrics, _ = program(state, batch)
     jax.block_until_ready(metrics)
     started, rounds = time.perf_counter(), 1 if subject.tiny else 3
     for _ in range(rounds):
-        state, metrics = program(state, batch)
+        state, metrics, _ = program(state, batch)
     jax.block_until_ready(metrics)
     seconds, loss = (time.perf_counter() - started) / rounds, float(metrics["loss/total"])
     clips, length = batch["images"].shape[:2]

@@ -1,7 +1,8 @@
 """Parameters of the parts, {"params": {part: …}}: the parts as functions of their own, and other forms of the same.
 
 Files and `LogVGGT.init` hold float32 parameters, layer by layer. Streams want the large ones in the compute type;
-training wants the layers of deep stacks stacked, so that one loop body is compiled for all of them.
+training wants the layers of deep stacks stacked, so that one loop body is compiled for all of them, and may hold a part
+of each on every device.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from typing import Any
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from flax import struct
 
 from logvggt_jax.config import ModelConfig
 
@@ -24,9 +26,42 @@ _STACK = re.compile(r"(.*_)?blocks")
 _COMPUTE_TYPE_PARTS = ("encoder", "aggregator", "depth_head", "point_head", "gccr")
 
 
+@struct.dataclass
+class Part:
+    """One device's part of a parameter; a pytree node in the parameter's place, for use within `shard_map`.
+
+    Attributes:
+      value: the part.
+      axis: of the parameter, that is split; counted from the end, so that a layer of a stack is split as the stack is.
+      mesh_axis: over which it is split.
+    """
+
+    value: jax.Array
+    axis: int = struct.field(pytree_node=False)
+    mesh_axis: str = struct.field(pytree_node=False)
+
+    def whole(self) -> jax.Array:
+        """The parameter; its gradient goes back to the devices as the sum's parts."""
+        return jax.lax.all_gather(self.value, self.mesh_axis, axis=self.value.ndim + self.axis, tiled=True)
+
+
 def run(module: nn.Module, params: Any, *inputs: Any, **options: Any) -> Any:
-    """A linen module as a pure function of its own parameters."""
-    return module.apply({"params": params}, *inputs, **options)
+    """A linen module as a pure function of its own parameters.
+
+    Those that come in parts are put together here, where they are used; stacks stay in parts for the loop over them,
+    whose body runs one layer with this function.
+    """
+    return module.apply({"params": whole(params)}, *inputs, **options)
+
+
+def whole(params: Any) -> Any:
+    """Parameters with every `Part` put together, but for those of stacks."""
+
+    def put_together(path: Any, leaf: Any) -> Any:
+        stacked = any(is_stack(entry.key) for entry in path)
+        return leaf.whole() if isinstance(leaf, Part) and not stacked else leaf
+
+    return jax.tree_util.tree_map_with_path(put_together, params, is_leaf=lambda node: isinstance(node, Part))
 
 
 def stack_layers(tree: Any) -> Any:
@@ -73,6 +108,11 @@ def unstack_layers(tree: Any, config: ModelConfig, take: Callable[[Any, int], An
         return layers
 
     return jax.tree.map(unstack, tree, is_leaf=_is_stacked)
+
+
+def is_stack(name: str) -> bool:
+    """Whether leaves under this name in a tree of parameters have a leading axis of layers."""
+    return _STACK.fullmatch(name) is not None
 
 
 def _has_layers(node: Any) -> bool:

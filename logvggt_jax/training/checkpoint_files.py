@@ -146,6 +146,8 @@ def _to_disk(folder: Path) -> None:
 
 def _parts(state: TrainState) -> tuple[Any, dict[str, Any]]:
     rest = state._asdict()
+    if state.average is None:  # Runs without one have checkpoints that older versions read.
+        rest.pop("average")
     return rest.pop("params"), rest
 
 

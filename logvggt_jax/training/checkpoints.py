@@ -169,7 +169,7 @@ class RunCheckpoints:
 
     def _write(self, state: TrainState, position: Position, in_place_of: int | None) -> None:
         # First, so that a run that is killed in between goes on from an older checkpoint and writes both again.
-        layers = unstack_layers(state.params, self.config.model)
+        layers = unstack_layers(state.averaged, self.config.model)
         save_model(self.model_folder, self.config.model, layers, self._provenance())
         step = int(state.step)
         write_checkpoint(self.folder / str(step), state, position, self.config)
@@ -218,7 +218,7 @@ class RunCheckpoints:
 
     def _check_configuration(self, stored: StoredCheckpoint) -> None:
         ours = self.config.to_dict()
-        for part in ("model", "stages", "data", "loss", "optimizer", "seed"):
+        for part in ("model", "stages", "data", "loss", "optimizer", "seed", "average"):
             theirs = stored.config.get(part)
             if part == "data" and theirs is not None:
                 theirs, ours[part] = _what_decides_clips(theirs), _what_decides_clips(ours[part])

@@ -193,6 +193,12 @@ class TrainConfig:
     The run stops in good order after `max_minutes`, and with an error after `max_skipped_in_a_row` updates in a
     row that were not finite. `save_every` steps, and at the end, it writes a checkpoint and keeps the latest
     `keep_checkpoints`.
+
+    Each device takes its share of a batch in `accumulate` parts, one after the other, for the gradient of
+    `accumulate` times as many devices. With `shard_parameters` a device holds its part of parameters, gradients and
+    moments, and puts the parameters together layer by layer. `average`, such as 0.999, is the decay in a step of a
+    moving average of the parameters, which validation and the model folder then have; None keeps none. The first two
+    may change when a run goes on.
     """
 
     model: ModelConfig
@@ -208,11 +214,15 @@ class TrainConfig:
     keep_checkpoints: int
     max_skipped_in_a_row: int
     max_minutes: float | None
+    accumulate: int = 1
+    shard_parameters: bool = False
+    average: float | None = None
 
     def __post_init__(self) -> None:
         if not self.stages:
             raise InputError("TrainConfig.stages is empty: a run needs at least one")
-        require_counts(self, "log_every", "save_every", "keep_checkpoints", "max_skipped_in_a_row")
+        require_counts(self, "log_every", "save_every", "keep_checkpoints", "max_skipped_in_a_row", "accumulate")
+        require_within(self, "[0, 1)", "average")
         require_within(self, "(0, inf)", "max_minutes")
 
     @property

@@ -24,8 +24,7 @@ from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.operations import count_flops
 from logvggt_jax.training.config import StageConfig, TrainConfig
 from logvggt_jax.training.program import abstract_parameters, make_program
-from logvggt_jax.training.sharding import DATA_AXIS, check_batch_size, replicated, split
-from logvggt_jax.training.state import initial_state
+from logvggt_jax.training.sharding import DATA_AXIS, check_batch_size, split
 
 _GIB = 2**30
 # Numbers of clips a device that are tried for the largest that fits: each is a compilation of minutes.
@@ -59,7 +58,7 @@ def dry_run(config: TrainConfig, mesh: Mesh, say: Callable[[str], None] = print)
     The devices may be described ones. Raises InputError where a stage's batches do not split over them.
     """
     for stage in config.stages:
-        check_batch_size(stage, mesh)
+        check_batch_size(stage, mesh, accumulate=config.accumulate)
     if mesh.devices.flat[0].platform == "tpu" and config.model.attention == "auto":
         # Chosen by the device at hand, which a described one is not.
         config = dataclasses.replace(config, model=dataclasses.replace(config.model, attention="tpu_flash"))
@@ -117,25 +116,23 @@ def step_costs(
 ) -> StepCosts | None:
     """Compiles the step for `clips` a device; None where the compiler finds that they do not fit."""
     params = abstract_parameters(config.model)
-    optimizer, step = make_program(LogVGGT(config.model), config, params, mesh)
-    state = jax.eval_shape(functools.partial(initial_state, optimizer=optimizer), params)
-    batch = abstract_clips(clips * mesh.size, clip_length, size)
-    arguments = [
-        jax.tree.map(lambda x, s=sharding: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=s), tree)
-        for tree, sharding in ((state, replicated(mesh)), (batch, split(mesh)))
-    ]
+    program = make_program(LogVGGT(config.model), config, params, mesh)
+    batch = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=split(mesh)),
+        abstract_clips(clips * mesh.size, clip_length, size),
+    )
     started = time.perf_counter()
     try:
-        program = step.lower(*arguments).compile()
+        compiled = program.step.lower(program.abstract_state(params), batch).compile()
     except jax.errors.JaxRuntimeError as error:
         if out_of_device_memory(error):
             return None
         raise
-    memory: Any = program.memory_analysis()
+    memory: Any = compiled.memory_analysis()
     return StepCosts(
         arguments=memory.argument_size_in_bytes,
         temporaries=memory.temp_size_in_bytes,
-        collectives=collectives(program.as_text() or ""),
+        collectives=collectives(compiled.as_text() or ""),
         compilation=time.perf_counter() - started,
     )
 
@@ -153,7 +150,8 @@ def abstract_clips(batch: int, frames: int, size: tuple[int, int]) -> dict[str, 
 def collectives(program: str) -> dict[str, tuple[int, int]]:
     """Number and bytes of the exchanges between devices in a compiled program's text, by name.
 
-    One in a loop counts once; the training step exchanges its sums outside of all loops.
+    One in a loop counts once. The training step exchanges its sums outside of all loops; parameters in parts are put
+    together within them.
     """
     found: dict[str, tuple[int, int]] = {}
     for shapes, name in _COLLECTIVE.findall(program):

@@ -1,5 +1,6 @@
 """The parameters that a run starts from."""
 
+import contextlib
 from typing import Any
 
 import jax
@@ -8,20 +9,31 @@ import jax.numpy as jnp
 from logvggt_jax.config import ModelConfig
 from logvggt_jax.errors import InputError
 from logvggt_jax.model.logvggt import LogVGGT
+from logvggt_jax.model.parameters import stack_layers
 from logvggt_jax.weights.checkpoints import first_misfit, from_pretrained
 from logvggt_jax.weights.vggt import parameter_shapes
 
 
 def initial_parameters(config: ModelConfig, *, seed: int, weights: str | None = None) -> Any:
-    """Random parameters, or those of `weights` (a path or hub repository that `from_pretrained` reads).
+    """Random parameters, or those of `weights` (a path or hub repository that `from_pretrained` reads); deep stacks as
+    one, see `stack_layers`.
 
-    Raises what that does, and InputError naming the first leaf in which they do not fit `config`.
+    They are made on the host, where JAX has it as a device: devices are for the state alone. Raises what
+    `from_pretrained` does, and InputError naming the first leaf in which they do not fit `config`.
     """
-    model = LogVGGT(config)
-    if weights is None:
-        patch = config.encoder.patch_size
-        return model.init(jax.random.key(seed), jnp.zeros((1, 1, patch, patch, 3)))["params"]
-    params = from_pretrained(weights, point_head=config.point_head is not None)[1]["params"]
-    if wrong := first_misfit(params, parameter_shapes(config), "config.model"):
-        raise InputError(f"initial_weights={weights}: {wrong}; give config.model the sizes of the checkpoint")
-    return params
+    with _on_host():
+        if weights is None:
+            patch = config.encoder.patch_size
+            model, images = LogVGGT(config), jnp.zeros((1, 1, patch, patch, 3))
+            return jax.device_get(stack_layers(model.init(jax.random.key(seed), images)["params"]))
+        params = from_pretrained(weights, point_head=config.point_head is not None)[1]["params"]
+        if wrong := first_misfit(params, parameter_shapes(config), "config.model"):
+            raise InputError(f"initial_weights={weights}: {wrong}; give config.model the sizes of the checkpoint")
+        return jax.device_get(stack_layers(params))
+
+
+def _on_host() -> contextlib.AbstractContextManager[Any]:
+    try:
+        return jax.default_device(jax.local_devices(backend="cpu")[0])
+    except RuntimeError:  # JAX was told to use the accelerators alone.
+        return contextlib.nullcontext()

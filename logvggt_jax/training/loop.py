@@ -1,7 +1,6 @@
 """The training loop: stages, logging, validation, checkpoints, and a clean end whatever ends it."""
 
 import contextlib
-import functools
 import time
 from collections import deque
 from collections.abc import Iterator, Mapping
@@ -17,10 +16,9 @@ from rich.console import Console
 from logvggt_jax.compile import device_bytes, most_device_bytes, out_of_device_memory
 from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.data.feeding.batches import BatchIterator
-from logvggt_jax.errors import InputError, one_line, printable
+from logvggt_jax.errors import InputError, one_line
 from logvggt_jax.interruption import StopRequest
 from logvggt_jax.model.logvggt import LogVGGT
-from logvggt_jax.model.parameters import stack_layers
 from logvggt_jax.operations import matmul_flops_per_second
 from logvggt_jax.training.batches import open_sources, stage_batches
 from logvggt_jax.training.checkpoint_files import Position
@@ -34,8 +32,9 @@ from logvggt_jax.training.processes import Vote, any_process, check_agreement, c
 from logvggt_jax.training.profile import ProfiledSteps, Profiler
 from logvggt_jax.training.program import abstract_parameters, make_program
 from logvggt_jax.training.progress import IntervalMeans, RunTimes, duration, progress_line
-from logvggt_jax.training.sharding import check_batch_size, replicated
-from logvggt_jax.training.state import TrainState, initial_state
+from logvggt_jax.training.sharding import check_batch_size
+from logvggt_jax.training.skipped import clips_to_blame, described
+from logvggt_jax.training.state import TrainState
 from logvggt_jax.training.step import Batch, Metrics
 from logvggt_jax.training.validation import Validation
 from logvggt_jax.training.watchdog import Watchdog
@@ -71,7 +70,7 @@ def train(
     `config.max_skipped_in_a_row` updates in a row were not finite; a run that is started again goes on past them.
     """
     for stage in config.stages:
-        check_batch_size(stage, mesh)
+        check_batch_size(stage, mesh, accumulate=config.accumulate)
     check_shared(workdir)
     with contextlib.ExitStack() as stack:
         watched = stack.enter_context(Watchdog(watchdog))
@@ -103,16 +102,20 @@ class _Run:
         model = LogVGGT(config.model)
         # Shapes alone: a run that goes on needs no initial weights.
         self.shapes = abstract_parameters(config.model)
-        self.optimizer, self.step = make_program(model, config, self.shapes, mesh)
+        self.program = make_program(model, config, self.shapes, mesh)
         self.programs: dict[tuple[int, ...], jax.stages.Compiled] = {}
         self.operations: dict[tuple[int, ...], float] = {}
-        self.validation = None if config.validation is None else Validation(model, config.validation, mesh)
+        layout = self.program.layout
+        self.validation = None if config.validation is None else Validation(model, config.validation, layout)
         self.checkpoints = RunCheckpoints(workdir, config)
         self.peak = None
         if mesh.devices.flat[0].platform != "cpu":  # whose cores share one peak
             self.peak = mesh.size * matmul_flops_per_second(config.model.dtype)
         self.means = IntervalMeans()
         self.skipped = self.longest_skip = 0.0
+        # Clips of the latest updates left out in a row, and its last step.
+        self.blamed: list[str] = []
+        self.last_skip = -1
         self.vote = Vote(mesh, delay=STEPS_IN_FLIGHT)
 
     def start(self, resume_step: int | None) -> tuple[int, Position | None]:
@@ -120,14 +123,13 @@ class _Run:
 
         Returns the number of steps done and where the data stand.
         """
-        config, everywhere = self.config, replicated(self.mesh)
+        config = self.config
         # The checkpoint of step 0 is there to show that one can be written: nothing is lost by beginning again.
         if resume_step is None and not any(self.checkpoints.steps):
             params = initial_parameters(config.model, seed=config.seed, weights=config.initial_weights)
-            self.state = jax.device_put(initial_state(stack_layers(params), self.optimizer), everywhere)
+            self.state = self.program.initial_state(params)
             return 0, None
-        like = jax.eval_shape(functools.partial(initial_state, optimizer=self.optimizer), self.shapes)
-        like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=everywhere), like)
+        like = self.program.abstract_state(self.shapes)
         self.state, position = self.checkpoints.restore(like, step=resume_step)
         return int(self.state.step), position
 
@@ -182,7 +184,7 @@ class _Run:
     ) -> tuple[int, bool]:
         """Steps up to `end`, or fewer if the run is to stop; the number of steps done, and whether it is to stop."""
         config = self.config
-        in_flight: deque[tuple[int, Metrics, list[str]]] = deque()
+        in_flight: deque[tuple[int, Metrics, jax.Array, list[str]]] = deque()
         logged = saved = step
         self.times.begin()
         while step < end:
@@ -199,10 +201,10 @@ class _Run:
                 raise
             program = self._program(stage, batch, log)
             self.profiler.before(step + 1)
-            self.state, metrics = program(self.state, batch)
+            self.state, metrics, finite = program(self.state, batch)
             step += 1
             self.times.count(self.operations.get(batch["images"].shape, 0.0))
-            in_flight.append((step, metrics, batches.names))
+            in_flight.append((step, metrics, finite, batches.names))
             self._finish(in_flight, STEPS_IN_FLIGHT)
             if self.profiler.is_last(step):
                 self._finish(in_flight)
@@ -229,41 +231,46 @@ class _Run:
                 return step, True
         return step, False
 
-    def _finish(self, in_flight: deque[tuple[int, Metrics, list[str]]], allowed: int = 0) -> None:
+    def _finish(self, in_flight: deque[tuple[int, Metrics, jax.Array, list[str]]], allowed: int = 0) -> None:
         """Waits until no more than `allowed` steps are unfinished, and takes down what the finished ones say."""
         while len(in_flight) > allowed:
-            step, metrics, names = in_flight.popleft()
+            step, metrics, finite, names = in_flight.popleft()
             values = {name: float(value) for name, value in jax.device_get(metrics).items()}
             self.watchdog.step_ended()
             self.means.add(values)
             if values["skipped"] > self.skipped:
-                logging.warning(
-                    "step %d: loss or gradient was not finite and the update is left out; clips: %s",
-                    step,
-                    printable("; ".join(names)),
-                )
+                self._blame(step, *clips_to_blame(finite, names))
             self.skipped, self.longest_skip = values["skipped"], values["longest_skip"]
+
+    def _blame(self, step: int, clips: list[str], reason: str) -> None:
+        if step != self.last_skip + 1:
+            self.blamed.clear()
+        self.last_skip = step
+        self.blamed += [name for name in clips if name not in self.blamed]
+        logging.warning("step %d: update left out, %s %s", step, reason, described(clips))
 
     def _failing(self) -> bool:
         return self.longest_skip >= self.config.max_skipped_in_a_row
 
     def _fail(self, step: int, position: Position) -> None:
         """Saves, so that the same command goes on past the clips that were named, and raises."""
-        row = self.longest_skip
+        longest, row = self.longest_skip, int(self.state.skipped_in_a_row)
         zero = jax.device_put(np.int32(0), self.state.step.sharding)
         self.state = self.state._replace(skipped_in_a_row=zero, longest_skip=zero)
-        self._save(position)
+        # A latest checkpoint with the very same parameters gives place, not the oldest: that may be the good one.
+        latest = self.checkpoints.steps[-1]
+        self._save(position, in_place_of=latest if step - latest <= row else None)
         self.checkpoints.wait()
         raise NonFiniteTraining(
-            f"step {step}: {row:.0f} updates in a row had a non-finite loss or gradient "
-            f"(max_skipped_in_a_row={self.config.max_skipped_in_a_row}; their clips are named above): the same command "
-            "goes on past them; if that does not help start a new --workdir with a lower optimizer.learning_rate, or "
-            "resume from an earlier checkpoint with --resume_step"
+            f"step {step}: {longest:.0f} updates in a row had a non-finite loss or gradient "
+            f"(max_skipped_in_a_row={self.config.max_skipped_in_a_row}), with {described(self.blamed)}; the same "
+            "command goes on past them; if that does not help start a new --workdir with a lower "
+            "optimizer.learning_rate, or resume from an earlier checkpoint with --resume_step"
         )
 
-    def _save(self, position: Position) -> None:
+    def _save(self, position: Position, *, in_place_of: int | None = None) -> None:
         with self.times.other("save"), self.watchdog.other("the save"):
-            self.checkpoints.save(self.state, position)
+            self.checkpoints.save(self.state, position, in_place_of=in_place_of)
 
     def _program(self, stage: StageConfig, batch: Batch, log: MetricsLog) -> jax.stages.Compiled:
         """The step compiled ahead of time for clips of this shape: a call cannot cost another compilation unseen."""
@@ -271,7 +278,7 @@ class _Run:
         if shape not in self.programs:
             started = time.perf_counter()
             with self.times.other("compilation"), self.watchdog.other("the compilation"):
-                self.programs[shape] = self.step.lower(self.state, batch).compile()
+                self.programs[shape] = self.program.step.lower(self.state, batch).compile()
                 if self.peak is not None:
                     self.operations[shape] = step_flops(self.config.model, shape[:4])
             log.say(f"{stage.name}: step compiled in {time.perf_counter() - started:.0f} s")
@@ -345,7 +352,7 @@ class _Run:
             return
         started = time.perf_counter()
         with self.times.other("validation"), self.watchdog.other("the validation"):
-            values = self.validation(self.state.params)
+            values = self.validation(self.state.averaged)
         log.write(step, values)
         log.say(
             f"validation after step {step} ({duration(time.perf_counter() - started)}): "

@@ -1,11 +1,15 @@
 """AdamW with gradients clipped in each module by itself, and the schedule of its learning rate."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import optax
 
 from logvggt_jax.training.config import OptimizerConfig, StageConfig
+
+Norm = Callable[[Any], jax.Array]
 
 
 def learning_rate_schedule(config: OptimizerConfig, stages: tuple[StageConfig, ...]) -> optax.Schedule:
@@ -17,12 +21,15 @@ def learning_rate_schedule(config: OptimizerConfig, stages: tuple[StageConfig, .
     return optax.join_schedules([_schedule(config, length) for length in lengths], boundaries)
 
 
-def make_optimizer(config: OptimizerConfig, params: Any, *, frozen: tuple[str, ...]) -> optax.GradientTransformation:
+def make_optimizer(
+    config: OptimizerConfig, params: Any, *, frozen: tuple[str, ...], norm: Norm = optax.tree.norm
+) -> optax.GradientTransformation:
     """AdamW without the learning rate: the training step multiplies what it returns with the rate of that step.
 
     `params` is a dict of modules (encoder, aggregator, heads). The gradient of each module is clipped to
     `config.clip_norm` by itself, so that one head with an exploding gradient does not slow down the others. Modules
-    named in `frozen` do not move, and no moments are kept for them.
+    named in `frozen` do not move, and no moments are kept for them. `norm` is that of a tree of gradients, of which a
+    device may hold a part.
 
     Weight decay applies to the kernels of linear layers and convolutions: not to biases, norms, gains of residual
     branches, special tokens and the position embedding, unless `config.decay_all`.
@@ -30,7 +37,7 @@ def make_optimizer(config: OptimizerConfig, params: Any, *, frozen: tuple[str, .
     Source: clipping by module as in VGGT's released trainer.
     """
     labels = {module: jax.tree.map(lambda _, m=module: m, tree) for module, tree in params.items()}
-    groups = {module: optax.set_to_zero() if module in frozen else _module_optimizer(config) for module in params}
+    groups = {module: optax.set_to_zero() if module in frozen else _module_optimizer(config, norm) for module in params}
     return optax.partition(groups, labels)
 
 
@@ -39,9 +46,19 @@ def apply_updates(params: Any, directions: Any, learning_rate: jax.Array) -> Any
     return jax.tree.map(lambda p, u: (p - learning_rate * u).astype(p.dtype), params, directions)
 
 
-def module_norms(gradients: Any) -> dict[str, jax.Array]:
+def moving_average(average: Any, params: Any, decay: float | None) -> Any:
+    """decay * average + (1 - decay) * params for the modules in `average`; None where none is kept."""
+    if average is None or decay is None:
+        return average
+    return {
+        module: jax.tree.map(lambda a, p: (a + (1 - decay) * (p - a)).astype(a.dtype), tree, params[module])
+        for module, tree in average.items()
+    }
+
+
+def module_norms(gradients: Any, norm: Norm = optax.tree.norm) -> dict[str, jax.Array]:
     """l2 norm of each module's gradient."""
-    return {module: optax.tree.norm(tree) for module, tree in gradients.items()}
+    return {module: norm({module: tree}) for module, tree in gradients.items()}
 
 
 def _schedule(config: OptimizerConfig, steps: int) -> optax.Schedule:
@@ -61,12 +78,23 @@ def _schedule(config: OptimizerConfig, steps: int) -> optax.Schedule:
     )
 
 
-def _module_optimizer(config: OptimizerConfig) -> optax.GradientTransformation:
+def _clip(limit: float, norm: Norm) -> optax.GradientTransformation:
+    """`optax.clip_by_global_norm` with a norm that knows where the gradients lie."""
+
+    def update(updates: Any, state: optax.EmptyState, params: Any = None) -> tuple[Any, optax.EmptyState]:
+        del params
+        length = norm(updates)
+        return jax.tree.map(lambda x: jnp.where(length < limit, x, x / length.astype(x.dtype) * limit), updates), state
+
+    return optax.GradientTransformation(lambda _: optax.EmptyState(), update)
+
+
+def _module_optimizer(config: OptimizerConfig, norm: Norm) -> optax.GradientTransformation:
     def decayed(tree: Any) -> Any:
         return jax.tree_util.tree_map_with_path(lambda path, _: config.decay_all or path[-1].key == "kernel", tree)
 
     return optax.chain(
-        optax.clip_by_global_norm(config.clip_norm),
+        _clip(config.clip_norm, norm),
         optax.scale_by_adam(config.b1, config.b2),
         optax.add_decayed_weights(config.weight_decay, decayed),
     )

@@ -27,8 +27,7 @@ from logvggt_jax.training.config import SourceConfig, StageConfig, TrainConfig
 from logvggt_jax.training.dry_run import step_costs
 from logvggt_jax.training.processes import any_process, check_shared
 from logvggt_jax.training.program import abstract_parameters, make_program
-from logvggt_jax.training.sharding import DATA_AXIS, check_batch_size, replicated, split
-from logvggt_jax.training.state import initial_state
+from logvggt_jax.training.sharding import DATA_AXIS, check_batch_size, split
 
 CLIPS = 20
 _EXCHANGED_BYTES = 2**26
@@ -42,7 +41,7 @@ def preflight(config: TrainConfig, workdir: Path, mesh: Mesh, say: Callable[[str
     the end where something failed on a process, and at once where the folder is not shared.
     """
     for stage in config.stages:
-        check_batch_size(stage, mesh)
+        check_batch_size(stage, mesh, accumulate=config.accumulate)
     check_shared(workdir)
     failed: list[str] = []
 
@@ -130,17 +129,13 @@ def _read_clips(dataset: Dataset, source: SourceConfig, config: TrainConfig) -> 
 
 def _checkpoint(config: TrainConfig, workdir: Path, mesh: Mesh) -> str:
     shapes = abstract_parameters(config.model)
-    optimizer, _ = make_program(LogVGGT(config.model), config, shapes, mesh)
-
-    @functools.partial(jax.jit, out_shardings=replicated(mesh))
-    def zeros() -> object:
-        return initial_state(jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes), optimizer)
-
+    program = make_program(LogVGGT(config.model), config, shapes, mesh)
+    state = program.initial_state(jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes))
     folder = workdir / "preflight"
     try:
         with RunCheckpoints(folder, config) as checkpoints:
             started = time.perf_counter()
-            checkpoints.save(zeros(), Position(0, {}))
+            checkpoints.save(state, Position(0, {}))
             checkpoints.wait()
             seconds = time.perf_counter() - started
         size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())

@@ -1,6 +1,7 @@
 """The step that a run's settings ask for; training runs it, a dry run compiles it alone."""
 
-from typing import Any
+import functools
+from typing import Any, NamedTuple
 
 import jax
 import optax
@@ -11,6 +12,8 @@ from logvggt_jax.model.logvggt import LogVGGT, variable_shapes
 from logvggt_jax.model.parameters import stack_layers
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.optimizer import learning_rate_schedule, make_optimizer
+from logvggt_jax.training.sharding import Layout, parameter_layout
+from logvggt_jax.training.state import TrainState, initial_state
 from logvggt_jax.training.step import make_loss_terms, make_train_step
 
 
@@ -19,12 +22,46 @@ def abstract_parameters(config: ModelConfig) -> Any:
     return jax.eval_shape(stack_layers, variable_shapes(config)["params"])
 
 
-def make_program(
-    model: LogVGGT, config: TrainConfig, params: Any, mesh: Mesh
-) -> tuple[optax.GradientTransformation, jax.stages.Wrapped]:
-    """The optimiser for such parameters, shapes or values, and the jitted step."""
+class Program(NamedTuple):
+    """What a run's settings ask for on a mesh."""
+
+    layout: Layout
+    optimizer: optax.GradientTransformation
+    step: jax.stages.Wrapped  # of `make_train_step`
+    averaged: tuple[str, ...]  # modules of which a moving average is kept
+
+    def initial_state(self, params: Any) -> TrainState:
+        """The state before the first step, of parameters on the host, in its place: no device holds a second copy."""
+        placed = self.layout.put(params)
+        made = functools.partial(initial_state, optimizer=self.optimizer, averaged=self.averaged)
+        shardings = self.layout.shardings(jax.eval_shape(made, placed))
+
+        def rest(params: Any) -> TrainState:
+            return made(params)._replace(params=None)
+
+        return jax.jit(rest, out_shardings=shardings._replace(params=None))(placed)._replace(params=placed)
+
+    def abstract_state(self, params: Any) -> TrainState:
+        """Shapes and places of the state for parameters of these shapes."""
+        made = functools.partial(initial_state, optimizer=self.optimizer, averaged=self.averaged)
+        state: TrainState = self.layout.abstract(jax.eval_shape(made, params))
+        return state
+
+
+def make_program(model: LogVGGT, config: TrainConfig, params: Any, mesh: Mesh) -> Program:
+    """The program for parameters of such shapes."""
     frozen = ("encoder",) if config.model.encoder.frozen else ()
-    optimizer = make_optimizer(config.optimizer, params, frozen=frozen)
+    layout = parameter_layout(params, mesh, shard=config.shard_parameters)
+    optimizer = make_optimizer(config.optimizer, params, frozen=frozen, norm=layout.norm)
     schedule = learning_rate_schedule(config.optimizer, config.stages)
-    terms = make_loss_terms(model, config.loss)
-    return optimizer, make_train_step(terms, config.loss, optimizer, schedule, mesh)
+    step = make_train_step(
+        make_loss_terms(model, config.loss),
+        config.loss,
+        optimizer,
+        schedule,
+        layout,
+        accumulate=config.accumulate,
+        average=config.average,
+    )
+    averaged = () if config.average is None else tuple(module for module in params if module not in frozen)
+    return Program(layout, optimizer, step, averaged)

@@ -16,10 +16,19 @@ class TrainState(NamedTuple):
     skipped: jax.Array  # int32 scalar, updates left out for a non-finite loss or gradient
     skipped_in_a_row: jax.Array  # int32 scalar
     longest_skip: jax.Array  # int32 scalar, the longest row so far
+    # The moving average of the modules that are trained, {module: parameters}; None where none is kept.
+    average: Any = None
+
+    @property
+    def averaged(self) -> Any:
+        """The parameters to be used after training: averages where they are kept."""
+        return self.params if self.average is None else {**self.params, **self.average}
 
 
-def initial_state(params: Any, optimizer: optax.GradientTransformation) -> TrainState:
-    """The state before the first step."""
+def initial_state(
+    params: Any, optimizer: optax.GradientTransformation, *, averaged: tuple[str, ...] = ()
+) -> TrainState:
+    """The state before the first step; a moving average is kept of the modules `averaged`, none where empty."""
     return TrainState(
         step=jnp.zeros((), jnp.int32),
         params=params,
@@ -27,4 +36,6 @@ def initial_state(params: Any, optimizer: optax.GradientTransformation) -> Train
         skipped=jnp.zeros((), jnp.int32),
         skipped_in_a_row=jnp.zeros((), jnp.int32),
         longest_skip=jnp.zeros((), jnp.int32),
+        # Copies: a step is given both to overwrite.
+        average={module: jax.tree.map(jnp.copy, params[module]) for module in averaged} or None,
     )

@@ -4,7 +4,6 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 
 from logvggt_jax.data.feeding.transforms import fit
@@ -14,7 +13,7 @@ from logvggt_jax.metrics.pose import pose_accuracy, relative_pose_errors
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.training.batches import open_source
 from logvggt_jax.training.config import ValidationConfig
-from logvggt_jax.training.sharding import DATA_AXIS, replicated, split
+from logvggt_jax.training.sharding import DATA_AXIS, Layout, replicated, split
 from logvggt_jax.types import Frames
 
 
@@ -24,35 +23,37 @@ class Validation:
     Clip i shows frames 0, stride, 2 stride, … of the i-th sequence that is long enough.
     """
 
-    def __init__(self, model: LogVGGT, config: ValidationConfig, mesh: Mesh) -> None:
-        if config.num_clips % mesh.size:
-            raise InputError(
-                f"validation.num_clips={config.num_clips} does not split over {mesh.size} devices; "
-                f"use a multiple of {mesh.size}"
-            )
+    def __init__(self, model: LogVGGT, config: ValidationConfig, layout: Layout) -> None:
+        mesh = layout.mesh
         self._clips = _read_clips(config)
         self._without_learning = [_baselines(clip) for clip in self._clips]
-        images = np.stack([clip.images for clip in self._clips])
+        # The last clip again, as often as the devices need it for equal shares.
+        shown = [*self._clips, *self._clips[-1:] * (-len(self._clips) % mesh.size)]
+        images = np.stack([clip.images for clip in shown])
         self._images = jax.make_array_from_callback(images.shape, split(mesh), lambda index: images[index])
 
         def predict(params: Any, images: jax.Array) -> tuple[jax.Array, jax.Array]:
-            predictions = model.apply({"params": params}, images)
+            predictions = model.apply({"params": layout.in_parts(params)}, images)
             return predictions.depth, predictions.extrinsics
 
-        sharded = jax.shard_map(
-            predict, mesh=mesh, in_specs=(P(), P(DATA_AXIS)), out_specs=P(DATA_AXIS), check_vma=False
-        )
-        self._predict = jax.jit(sharded, out_shardings=replicated(mesh))
+        def on_all_devices(params: Any, images: jax.Array) -> tuple[jax.Array, jax.Array]:
+            specs = (layout.specs(params), P(DATA_AXIS))
+            return jax.shard_map(predict, mesh=mesh, in_specs=specs, out_specs=P(DATA_AXIS), check_vma=False)(
+                params, images
+            )
+
+        self._predict = jax.jit(on_all_devices, out_shardings=replicated(mesh))
 
     def __call__(self, params: Any) -> dict[str, float]:
         """Means over the clips: depth after median alignment, pose errors over all pairs in degrees.
 
         `constant_abs_rel` and `identity_rotation` are what a constant depth and a motionless camera get.
         """
+        count = len(self._clips)
         depth, extrinsics = jax.device_get(self._predict(params, self._images))
         results = [
             {**_clip_metrics(*each), **known}
-            for *each, known in zip(depth, extrinsics, self._clips, self._without_learning, strict=True)
+            for *each, known in zip(depth[:count], extrinsics[:count], self._clips, self._without_learning, strict=True)
         ]
         means = {name: float(np.mean([result[name] for result in results])) for name in results[0]}
         means["rotation_over_identity"] = means["rotation"] / max(means["identity_rotation"], 1e-6)

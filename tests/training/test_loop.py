@@ -14,9 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from logvggt_jax.data.feeding.clips import ClipReader
 from logvggt_jax.errors import InputError
 from logvggt_jax.interruption import StopRequest
-from logvggt_jax.training import device_batches, loop
+from logvggt_jax.training import loop
 from logvggt_jax.training.checkpoint_files import Position
 from logvggt_jax.training.checkpoints import RunCheckpoints
 from logvggt_jax.training.config import SourceConfig, TrainConfig, ValidationConfig
@@ -200,40 +201,6 @@ def test_endless_non_finite_updates_stop_the_run(
     monkeypatch.setattr(loop, "initial_parameters", lambda *_, **__: jax.tree.map(jnp.array, broken))
     with pytest.raises(NonFiniteTraining, match="step 2: 2 updates in a row had a non-finite loss or gradient"):
         train(run_config, tmp_path, mesh=data_mesh(1))
-
-
-def test_a_run_goes_on_past_the_clips_that_ended_it(
-    run_config: TrainConfig,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-    pixel_model: Any,
-) -> None:
-    """Two batches in a row without a number in them end the run; the same command does not meet them again."""
-    config = dataclasses.replace(run_config, stages=run_config.stages[:1])
-    put = device_batches.put_batch
-    drawn: list[str] = []
-
-    def poisoned(batch: Any, mesh: Any) -> Any:
-        drawn.append(batch["images"].tobytes().hex())
-        white = {"images": np.full_like(batch["images"], 255)} if len(drawn) in (2, 3) else {}
-        return put({**batch, **white}, mesh)
-
-    class NoNumberOfWhite(type(pixel_model)):  # type: ignore[misc]
-        def apply(self, variables: Any, images: Any, *arguments: Any, **options: Any) -> Any:
-            found = super().apply(variables, images, *arguments, **options)
-            return found.replace(depth=jnp.where(images.min() == 255, jnp.nan, found.depth))
-
-    monkeypatch.setattr(device_batches, "put_batch", poisoned)
-    monkeypatch.setattr(loop, "LogVGGT", NoNumberOfWhite)
-    with pytest.raises(NonFiniteTraining, match=r"step 3: 2 updates in a row .* the same command goes on past them"):
-        train(config, tmp_path, mesh=data_mesh(1))
-    named = [record.getMessage() for record in caplog.records if "clips: rooms, " in record.getMessage()]
-    assert [message.split(":")[0] for message in named] == ["step 2", "step 3"]
-    before = drawn[:3]
-    state = train(config, tmp_path, mesh=data_mesh(1))
-    assert int(state.step) == 4 and int(state.skipped) == 2
-    assert not set(before) & set(drawn[4:])
 
 
 def test_data_that_fail_leave_a_checkpoint(
@@ -435,3 +402,71 @@ def test_workers_may_change_when_a_run_goes_on(
     backwards = dataclasses.replace(run_config, data=dataclasses.replace(run_config.data, reverse=1.0))
     with pytest.raises(ValueError, match=r"was written with data\.reverse=0\.5, the configuration says 1\.0"):
         train(backwards, finished, mesh=data_mesh(2))
+
+
+@dataclasses.dataclass(frozen=True)
+class DazzledModel:
+    """The quick model, which a black picture drives to infinity."""
+
+    config: Any
+    model: Any
+
+    def apply(self, variables: Any, images: jax.Array, *given: Any, **options: Any) -> Any:
+        predictions = self.model.apply(variables, images, *given, **options)
+        dark = images.astype(jnp.float32).sum((1, 2, 3, 4)) == 0
+        depth = jnp.where(dark[:, None, None, None], jnp.inf, predictions.depth)
+        return dataclasses.replace(predictions, depth=depth)
+
+
+def test_clips_that_make_updates_useless_are_named_and_the_same_command_goes_past_them(
+    run_config: TrainConfig,
+    pixel_model: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.setattr(loop, "LogVGGT", lambda _: DazzledModel(pixel_model.config, pixel_model))
+    # Both clips of the second batch, one of the third: the steps 2 and 3 of four.
+    read = ClipReader.__call__
+
+    def reading(reader: ClipReader, index: int, sequence: str) -> dict[str, Any]:
+        clip = read(reader, index, sequence)
+        if reader.sampler.length == 2 and index in (2, 3, 4):
+            clip["images"] = np.zeros_like(clip["images"])
+        return clip
+
+    monkeypatch.setattr(ClipReader, "__call__", reading)
+    with pytest.raises(NonFiniteTraining, match=r"step 3: 2 updates in a row .* with rooms, .*goes on past") as end:
+        train(run_config, tmp_path, mesh=data_mesh(2))
+    named = [line for line in caplog.messages if "update left out, loss was not finite in" in line]
+    assert [line.split(":")[0] for line in named] == ["step 2", "step 3"]
+    assert [line.count("rooms, ") for line in named] == [2, 1]
+    assert str(end.value).count("rooms, ") == 3 and "frames" in str(end.value)
+    # What the run before had learned is there, and so is the good checkpoint.
+    with RunCheckpoints(tmp_path, run_config) as checkpoints:
+        assert checkpoints.steps == [0, 3]
+    state = train(run_config, tmp_path, mesh=data_mesh(2))
+    assert int(state.step) == 6 and int(state.skipped) == 2
+    assert [entry["step"] for entry in _numbers(tmp_path)] == [1, 2, 3, 4, 5, 6]
+
+
+def test_useless_restarts_do_not_push_good_checkpoints_out(
+    run_config: TrainConfig, pixel_model: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = dataclasses.replace(run_config, max_skipped_in_a_row=1)
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyError, match="crash"):
+        _at_step(patch, 4, _crash)
+        train(config, tmp_path, mesh=data_mesh(1))
+    monkeypatch.setattr(loop, "LogVGGT", lambda _: DazzledModel(pixel_model.config, pixel_model))
+    read = ClipReader.__call__
+    monkeypatch.setattr(
+        ClipReader,
+        "__call__",
+        lambda reader, *given: {**(clip := read(reader, *given)), "images": np.zeros_like(clip["images"])},
+    )
+    for step in (4, 5, 6):
+        with pytest.raises(NonFiniteTraining, match=f"step {step}: 1 updates in a row"):
+            train(config, tmp_path, mesh=data_mesh(1))
+        with RunCheckpoints(tmp_path, config) as checkpoints:
+            # Of the same parameters one is kept, the newest.
+            assert checkpoints.steps == [0, step]

@@ -13,7 +13,7 @@ from jax.sharding import PartitionSpec as P
 from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.training.config import LossConfig, OptimizerConfig, StageConfig
 from logvggt_jax.training.optimizer import learning_rate_schedule, make_optimizer
-from logvggt_jax.training.sharding import check_batch_size, data_mesh, put_batch, replicated
+from logvggt_jax.training.sharding import check_batch_size, data_mesh, parameter_layout, put_batch, replicated
 from logvggt_jax.training.state import initial_state
 from logvggt_jax.training.step import loss_and_gradients, make_loss_terms, make_train_step
 
@@ -21,16 +21,27 @@ Clips = dict[str, np.ndarray]
 STAGES = (StageConfig("only", 8, 5, 8, 1, 1, ((28, 42),)),)
 
 
-def _gradients(model: Any, config: LossConfig, mesh: Mesh, params: Any, clips: Clips) -> tuple[Any, Any]:
-    terms = make_loss_terms(model, config)
+def _gradients(
+    model: Any,
+    config: LossConfig,
+    mesh: Mesh,
+    params: Any,
+    clips: Clips,
+    *,
+    shard: bool = False,
+    accumulate: int = 1,
+) -> tuple[Any, Any]:
+    terms, layout = make_loss_terms(model, config), parameter_layout(params, mesh, shard=shard)
+    assert bool(layout.axes) == shard
 
     def logged_and_gradients(params: Any, batch: Any) -> Any:
-        return loss_and_gradients(terms, config, params, batch)[1:]
+        return loss_and_gradients(terms, config, params, batch, layout, accumulate=accumulate)[1:3]
 
+    specs = layout.specs(params)
     sharded = jax.shard_map(
-        logged_and_gradients, mesh=mesh, in_specs=(P(), P("data")), out_specs=(P(), P()), check_vma=False
+        logged_and_gradients, mesh=mesh, in_specs=(specs, P("data")), out_specs=(P(), specs), check_vma=False
     )
-    return jax.device_get(jax.jit(sharded)(jax.device_put(params, replicated(mesh)), put_batch(clips, mesh)))
+    return jax.device_get(jax.jit(sharded)(layout.put(params), put_batch(clips, mesh)))
 
 
 def test_gradient_on_many_devices_is_that_on_one(
@@ -90,6 +101,7 @@ def test_steps_learn_and_are_traced_once(
     pixel_model: Any, loss_config: LossConfig, optimizer_config: OptimizerConfig, pixel_params: Any, clips: Clips
 ) -> None:
     mesh = data_mesh(4)
+    layout = parameter_layout(pixel_params, mesh, shard=False)
     traces = 0
     terms = make_loss_terms(pixel_model, loss_config)
 
@@ -99,11 +111,11 @@ def test_steps_learn_and_are_traced_once(
         return terms(params, batch)
 
     optimizer = make_optimizer(optimizer_config, pixel_params, frozen=("encoder",))
-    step = make_train_step(counted, loss_config, optimizer, learning_rate_schedule(optimizer_config, STAGES), mesh)
+    step = make_train_step(counted, loss_config, optimizer, learning_rate_schedule(optimizer_config, STAGES), layout)
     state = jax.device_put(initial_state(jax.tree.map(jnp.array, pixel_params), optimizer), replicated(mesh))
     losses, kinds = [], jax.tree.map(lambda x: (x.shape, x.dtype, x.weak_type), state)
     for _ in range(6):
-        state, metrics = step(state, put_batch(clips, mesh))
+        state, metrics, _ = step(state, put_batch(clips, mesh))
         losses.append(float(metrics["loss/total"]))
     assert traces == 1
     assert jax.tree.map(lambda x: (x.shape, x.dtype, x.weak_type), state) == kinds
@@ -121,34 +133,35 @@ def test_non_finite_updates_are_skipped_and_counted(
     broken: str,
 ) -> None:
     mesh = data_mesh(2)
+    layout = parameter_layout(pixel_params, mesh, shard=False)
     terms = make_loss_terms(pixel_model, loss_config)
 
     def breakable(params: Any, batch: Any) -> Any:
         """Black pictures make the loss NaN, or leave it finite and make its gradient NaN."""
-        means, figures = terms(params, batch)
+        means, figures, finite = terms(params, batch)
         light = jnp.where(batch["images"].astype(jnp.float32).sum() > 0, 1.0, 0.0)
         if broken == "loss":
             added = jnp.where(light > 0, 0.0, jnp.nan)
         else:
             added = jnp.sqrt(light * params["camera_head"]["bias"].sum() ** 2)
         camera = means["camera"]
-        return {**means, "camera": camera._replace(numerator=camera.numerator + added)}, figures
+        return {**means, "camera": camera._replace(numerator=camera.numerator + added)}, figures, finite
 
     optimizer = make_optimizer(optimizer_config, pixel_params, frozen=())
     schedule = learning_rate_schedule(optimizer_config, STAGES)
-    step = make_train_step(breakable, loss_config, optimizer, schedule, mesh)
+    step = make_train_step(breakable, loss_config, optimizer, schedule, layout)
     state = jax.device_put(initial_state(jax.tree.map(jnp.array, pixel_params), optimizer), replicated(mesh))
     good = put_batch(clips, mesh)
     bad = put_batch({**clips, "images": np.zeros_like(clips["images"])}, mesh)
     for _ in range(2):
-        state, _ = step(state, good)
+        state, *_ = step(state, good)
     before = jax.device_get(state)
     for _ in range(3):
-        state, metrics = step(state, bad)
+        state, metrics, _ = step(state, bad)
     after = jax.device_get(state)
     jax.tree.map(np.testing.assert_array_equal, (after.params, after.opt_state), (before.params, before.opt_state))
     assert float(metrics["skipped"]) == 3 and int(after.skipped_in_a_row) == 3
-    state, metrics = step(state, good)
+    state, metrics, _ = step(state, good)
     assert int(state.skipped_in_a_row) == 0 and float(metrics["longest_skip"]) == 3
     bias = np.asarray(state.params["camera_head"]["bias"])
     assert np.isfinite(bias).all()

@@ -7,7 +7,7 @@ import pytest
 
 from logvggt_jax.training import validation as module
 from logvggt_jax.training.config import SourceConfig, ValidationConfig
-from logvggt_jax.training.sharding import data_mesh
+from logvggt_jax.training.sharding import data_mesh, parameter_layout
 from logvggt_jax.training.validation import Validation
 
 ROOMS = (("height", 28), ("num_frames", 8), ("num_rooms", 2), ("width", 42))
@@ -27,10 +27,29 @@ def test_baselines_are_judged_once_and_depth_and_cameras_alone_are_fetched(
         monkeypatch.setattr(module, name, counted)
     source = SourceConfig("rooms", None, "val", options=ROOMS)
     config = ValidationConfig(source, every=1, num_clips=2, clip_length=3, stride=2, size=(28, 42))
-    validation = Validation(pixel_model, config, data_mesh(2))
+    validation = Validation(pixel_model, config, parameter_layout(pixel_params, data_mesh(2), shard=False))
     assert len(calls) == 2 * 2
     first, second = validation(pixel_params), validation(pixel_params)
     assert len(calls) == 3 * 2 * 2 and first == second
     assert first["validation/constant_abs_rel"] > 0 and first["validation/identity_rotation"] > 0
     depth, extrinsics = jax.eval_shape(validation._predict, pixel_params, validation._images)
     assert depth.shape == (2, 3, 28, 42) and extrinsics.shape == (2, 3, 3, 4)
+
+
+def test_any_number_of_clips_is_judged_on_any_number_of_devices(pixel_model: Any, pixel_params: dict[str, Any]) -> None:
+    config = ValidationConfig(
+        SourceConfig("rooms", None, "val", options=(*ROOMS[:2], ("num_rooms", 5), ROOMS[3])),
+        every=1,
+        num_clips=5,
+        clip_length=3,
+        stride=2,
+        size=(28, 42),
+    )
+
+    def judged(devices: int) -> dict[str, float]:
+        layout = parameter_layout(pixel_params, data_mesh(devices), shard=False)
+        return Validation(pixel_model, config, layout)(pixel_params)
+
+    one = judged(1)
+    for devices in (2, 8):
+        assert judged(devices) == pytest.approx(one, rel=1e-5)

@@ -1,0 +1,250 @@
+"""Parameters in parts and clips one after the other: the numbers of one device with everything, and less memory."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.sharding import PartitionSpec as P
+
+from logvggt_jax import LogVGGT, ModelConfig, Predictions
+from logvggt_jax.model.parameters import stack_layers, whole
+from logvggt_jax.training import loop
+from logvggt_jax.training.config import LossConfig, TrainConfig
+from logvggt_jax.training.loop import train
+from logvggt_jax.training.program import make_program
+from logvggt_jax.training.sharding import check_batch_size, data_mesh, parameter_layout, put_batch
+from logvggt_jax.training.step import loss_and_gradients, make_loss_terms
+
+Clips = dict[str, np.ndarray]
+WIDTH = 16
+
+
+@dataclasses.dataclass(frozen=True)
+class LayeredModel:
+    """A loop over stacked layers before the pixels' model, which compiles at once; the interface of `LogVGGT`."""
+
+    config: ModelConfig
+    pixels: Any
+
+    def apply(
+        self, variables: Any, images: jax.Array, frame_mask: jax.Array | None = None, *, remat: bool = False
+    ) -> Predictions:
+        params = whole(variables["params"])
+
+        @jax.checkpoint
+        def layer(x: jax.Array, one: Any) -> tuple[jax.Array, None]:
+            one = whole(one)
+            return x + jnp.tanh(x @ one["kernel"] + one["bias"]), None
+
+        x = images.astype(jnp.float32) @ params["aggregator"]["embed"]["kernel"] / 255.0
+        x, _ = jax.lax.scan(layer, x, params["aggregator"]["frame_blocks"])
+        heads = {name: params[name] for name in ("depth_head", "camera_head")}
+        return self.pixels.apply({"params": heads}, 255.0 * x[..., :3], frame_mask)
+
+
+@pytest.fixture(scope="module")
+def layered(small_config: ModelConfig, pixel_model: Any) -> LayeredModel:
+    return LayeredModel(small_config, pixel_model)
+
+
+@pytest.fixture(scope="module")
+def layered_params(pixel_params: Any) -> Any:
+    generator = np.random.default_rng(3)
+
+    def normal(*shape: int) -> np.ndarray:
+        return (0.2 * generator.standard_normal(shape)).astype(np.float32)
+
+    blocks = {"kernel": normal(4, WIDTH, WIDTH), "bias": normal(4, WIDTH)}
+    return {**pixel_params, "aggregator": {"embed": {"kernel": normal(3, WIDTH)}, "frame_blocks": blocks}}
+
+
+@pytest.fixture(scope="module")
+def sixteen(clips: Clips) -> Clips:
+    """Sixteen clips with uneven masks."""
+    return {name: np.concatenate([value, value[::-1]]) for name, value in clips.items()}
+
+
+def _gradients(
+    model: Any, config: LossConfig, params: Any, clips: Clips, devices: int, *, shard: bool, accumulate: int
+) -> Any:
+    mesh = data_mesh(devices)
+    terms, layout = make_loss_terms(model, config), parameter_layout(params, mesh, shard=shard)
+    specs = layout.specs(params)
+
+    def run(params: Any, batch: Any) -> Any:
+        total, metrics, gradients, _ = loss_and_gradients(terms, config, params, batch, layout, accumulate=accumulate)
+        return total, metrics, gradients, layout.norm(gradients)
+
+    sharded = jax.shard_map(
+        run, mesh=mesh, in_specs=(specs, P("data")), out_specs=(P(), P(), specs, P()), check_vma=False
+    )
+    return jax.device_get(jax.jit(sharded)(layout.put(params), put_batch(clips, mesh)))
+
+
+@pytest.fixture(scope="module")
+def alone(layered: LayeredModel, loss_config: LossConfig, layered_params: Any, sixteen: Clips) -> Any:
+    return _gradients(layered, loss_config, layered_params, sixteen, 1, shard=False, accumulate=1)
+
+
+@pytest.mark.parametrize(
+    ("devices", "shard", "accumulate"),
+    [(1, False, 4), (4, False, 1), (4, True, 1), (4, True, 2), (4, False, 4), (16, False, 1), (16, True, 1)],
+)
+def test_first_gradient_is_that_of_one_device(
+    devices: int,
+    shard: bool,
+    accumulate: int,
+    layered: LayeredModel,
+    loss_config: LossConfig,
+    layered_params: Any,
+    sixteen: Clips,
+    alone: Any,
+) -> None:
+    found = _gradients(layered, loss_config, layered_params, sixteen, devices, shard=shard, accumulate=accumulate)
+    _agree(found, alone, rel=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("devices", "shard", "accumulate"), [(4, True, 2), (16, True, 1)])
+def test_first_gradient_of_the_real_model_is_that_of_one_device(
+    devices: int, shard: bool, accumulate: int, small_config: ModelConfig, loss_config: LossConfig, sixteen: Clips
+) -> None:
+    # All of it trained, with layers that run as loops in encoder and aggregator.
+    encoder = dataclasses.replace(small_config.encoder, frozen=False, depth=2)
+    aggregator = dataclasses.replace(small_config.aggregator, depth=6, key_layers=(0, 1, 2, 5))
+    model = LogVGGT(dataclasses.replace(small_config, encoder=encoder, aggregator=aggregator))
+    variables = model.init(jax.random.key(0), np.zeros((1, 1, 28, 42, 3), np.float32))
+    params = jax.device_get(stack_layers(variables["params"]))
+    generator = np.random.default_rng(0)
+    # No gate is zero.
+    params = jax.tree.map(lambda x: x + 0.1 * generator.standard_normal(x.shape).astype(np.float32), params)
+    short = {name: value[:, :3] for name, value in sixteen.items() if name != "frame_mask"}
+    one = _gradients(model, loss_config, params, short, 1, shard=False, accumulate=1)
+    _agree(_gradients(model, loss_config, params, short, devices, shard=shard, accumulate=accumulate), one, rel=1e-5)
+
+
+def _agree(found: Any, expected: Any, *, rel: float) -> None:
+    """Objective, what is logged, and the gradient of every module and of all."""
+    assert found[0] == pytest.approx(expected[0], rel=rel)
+    for name, value in expected[1].items():
+        assert found[1][name] == pytest.approx(value, rel=1e-4, abs=1e-5), name
+    for module, gradients in expected[2].items():
+        difference = _norm(jax.tree.map(np.subtract, found[2][module], gradients))
+        assert difference <= rel * _norm(gradients), module
+    assert found[3] == pytest.approx(_norm(expected[2]), rel=rel)
+
+
+def _norm(tree: Any) -> float:
+    return float(np.sqrt(sum((leaf.astype(np.float64) ** 2).sum() for leaf in jax.tree.leaves(tree))))
+
+
+def test_matrices_are_split_along_no_axis_of_layers_and_vectors_stay_whole(layered_params: Any) -> None:
+    specs = parameter_layout(layered_params, data_mesh(4), shard=True).specs(layered_params)
+    assert specs["aggregator"] == {
+        "embed": {"kernel": P(None, "data")},
+        "frame_blocks": {"kernel": P(None, "data", None), "bias": P()},
+    }
+    assert specs["camera_head"] == {"kernel": P(), "bias": P()}, "four does not divide 3 x 9"
+    assert not parameter_layout(layered_params, data_mesh(4), shard=False).axes
+
+
+def test_the_state_lies_in_its_place_from_the_start(
+    run_config: TrainConfig, layered: LayeredModel, layered_params: Any
+) -> None:
+    config = dataclasses.replace(run_config, shard_parameters=True, average=0.9)
+    shapes = jax.eval_shape(lambda: layered_params)
+    program = make_program(layered, config, shapes, data_mesh(4))
+    state = program.initial_state(layered_params)
+    kernel = state.params["aggregator"]["frame_blocks"]["kernel"]
+    assert kernel.addressable_shards[0].data.size == kernel.size // 4
+    like = [leaf for leaf in jax.tree.leaves(state) if leaf.shape == kernel.shape]
+    assert len(like) == 4, "the parameter, two moments, the average"
+    assert {leaf.sharding for leaf in like} == {kernel.sharding}
+    jax.tree.map(np.testing.assert_array_equal, jax.device_get(state.params), layered_params)
+    for leaf, expected in zip(*map(jax.tree.leaves, (state, program.abstract_state(shapes))), strict=True):
+        assert (leaf.shape, leaf.dtype, leaf.sharding.spec) == (expected.shape, expected.dtype, expected.sharding.spec)
+    # No two of them share memory, which a step is given to overwrite.
+    places = [
+        shard.data.unsafe_buffer_pointer() for leaf in jax.tree.leaves(state) for shard in leaf.addressable_shards
+    ]
+    assert len(set(places)) == len(places)
+
+
+def test_steps_in_parts_are_those_of_whole_parameters(
+    run_config: TrainConfig, layered: LayeredModel, layered_params: Any, sixteen: Clips
+) -> None:
+    states = []
+    for devices, shard, accumulate in ((1, False, 1), (4, True, 2)):
+        config = dataclasses.replace(run_config, shard_parameters=shard, accumulate=accumulate, average=0.5)
+        mesh = data_mesh(devices)
+        program = make_program(layered, config, jax.eval_shape(lambda: layered_params), mesh)
+        state, batch = program.initial_state(layered_params), put_batch(sixteen, mesh)
+        compiled = program.step.lower(state, batch).compile()
+        for _ in range(3):
+            state, metrics, finite = compiled(state, batch)
+        assert finite.shape == (16,) and np.asarray(finite).all()
+        # Clipping by module has to know the whole gradient.
+        assert float(metrics["gradient_norm/aggregator"]) > config.optimizer.clip_norm / 100
+        states.append(jax.device_get(state))
+    one, many = states
+    for name in ("params", "average"):
+        jax.tree.map(
+            lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=2e-5), getattr(one, name), getattr(many, name)
+        )
+
+
+def test_the_average_follows_the_parameters(
+    run_config: TrainConfig, layered: LayeredModel, layered_params: Any, sixteen: Clips
+) -> None:
+    config, mesh = dataclasses.replace(run_config, average=0.75), data_mesh(1)
+    program = make_program(layered, config, jax.eval_shape(lambda: layered_params), mesh)
+    state, batch = program.initial_state(layered_params), put_batch(sixteen, mesh)
+    assert set(state.average) == set(layered_params) - {"encoder"}, "what is frozen is its own average"
+    expected = {name: tree for name, tree in layered_params.items() if name != "encoder"}
+    for _ in range(3):
+        state, *_ = program.step(state, batch)
+        expected = jax.tree.map(
+            lambda a, p: 0.75 * a + 0.25 * p, expected, {name: jax.device_get(state.params[name]) for name in expected}
+        )
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7), state.average, expected)
+    moved = np.abs(np.asarray(state.averaged["camera_head"]["bias"] - state.params["camera_head"]["bias"])).max()
+    assert moved > 1e-4
+
+
+def test_a_sharded_run_is_saved_on_sixteen_devices_and_goes_on_with_eight(
+    run_config: TrainConfig,
+    layered: LayeredModel,
+    layered_params: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(loop, "LogVGGT", lambda _: layered)
+    monkeypatch.setattr(loop, "initial_parameters", lambda *_, **__: layered_params)
+    monkeypatch.setattr(loop, "abstract_parameters", lambda _: jax.eval_shape(lambda: layered_params))
+    monkeypatch.setattr("logvggt_jax.training.checkpoints.save_model", lambda *_: None)
+    stage = dataclasses.replace(run_config.stages[0], batch_size=16, steps=3)
+    config = dataclasses.replace(run_config, stages=(stage,), average=0.5)
+    sharded = dataclasses.replace(config, shard_parameters=True)
+    straight = train(config, tmp_path / "straight", mesh=data_mesh(1))
+    saved = train(dataclasses.replace(sharded, max_minutes=1e-9), tmp_path / "run", mesh=data_mesh(16))
+    assert int(saved.step) == 1
+    ended = train(dataclasses.replace(sharded, accumulate=2), tmp_path / "run", mesh=data_mesh(8))
+    assert int(ended.step) == 3
+    for name in ("params", "average"):
+        jax.tree.map(
+            lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4),
+            *(jax.device_get(getattr(state, name)) for state in (ended, straight)),
+        )
+
+
+def test_batches_have_to_split_into_the_parts(run_config: TrainConfig) -> None:
+    stage = dataclasses.replace(run_config.stages[0], batch_size=8)
+    check_batch_size(stage, data_mesh(4), accumulate=2)
+    with pytest.raises(ValueError, match=r"over 4 devices in accumulate=4 parts each; use a multiple of 16"):
+        check_batch_size(stage, data_mesh(4), accumulate=4)
