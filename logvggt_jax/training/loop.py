@@ -256,7 +256,7 @@ class _Run:
         """Saves, so that the same command goes on past the clips that were named, and raises."""
         longest, row = self.longest_skip, int(self.state.skipped_in_a_row)
         zero = jax.device_put(np.int32(0), self.state.step.sharding)
-        self.state = self.state._replace(skipped_in_a_row=zero, longest_skip=jnp.copy(zero))
+        self.state = self.state._replace(skipped_in_a_row=zero, longest_skip=zero)
         # A latest checkpoint with the very same parameters gives place, not the oldest: that may be the good one.
         latest = self.checkpoints.steps[-1]
         self._save(position, in_place_of=latest if step - latest <= row else None)

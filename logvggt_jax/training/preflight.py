@@ -28,7 +28,6 @@ from logvggt_jax.training.dry_run import step_costs
 from logvggt_jax.training.processes import any_process, check_shared
 from logvggt_jax.training.program import abstract_parameters, make_program
 from logvggt_jax.training.sharding import DATA_AXIS, check_batch_size, split
-from logvggt_jax.training.state import TrainState
 
 CLIPS = 20
 _EXCHANGED_BYTES = 2**26
@@ -130,17 +129,13 @@ def _read_clips(dataset: Dataset, source: SourceConfig, config: TrainConfig) -> 
 
 def _checkpoint(config: TrainConfig, workdir: Path, mesh: Mesh) -> str:
     shapes = abstract_parameters(config.model)
-    like = make_program(LogVGGT(config.model), config, shapes, mesh).abstract_state(shapes)
-
-    @functools.partial(jax.jit, out_shardings=jax.tree.map(lambda leaf: leaf.sharding, like))
-    def zeros() -> TrainState:
-        return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), like)
-
+    program = make_program(LogVGGT(config.model), config, shapes, mesh)
+    state = program.initial_state(jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes))
     folder = workdir / "preflight"
     try:
         with RunCheckpoints(folder, config) as checkpoints:
             started = time.perf_counter()
-            checkpoints.save(zeros(), Position(0, {}))
+            checkpoints.save(state, Position(0, {}))
             checkpoints.wait()
             seconds = time.perf_counter() - started
         size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
