@@ -3,9 +3,9 @@
     python train.py --config=configs/tiny.py --workdir=runs/tiny
 
 Run the same command again to go on after an interruption. On several machines start it on each of them with
---distributed. With --dry_run nothing is trained: the step of every stage and size is compiled, and what it needs is
-printed. Any field of the configuration can be changed on the command line:
---config.optimizer.learning_rate=5e-4.
+--distributed (docs/clusters.md). With --dry_run nothing is trained: the step of every stage and size is compiled, and
+what it needs is printed. With --preflight the same command tries network, data, folder and step beforehand. Any field
+of the configuration can be changed on the command line: --config.optimizer.learning_rate=5e-4.
 """
 
 from __future__ import annotations
@@ -16,25 +16,28 @@ import sys
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import jax
 from absl import app, flags, logging
 from ml_collections import config_flags
 
-from logvggt_jax.compile import check_devices, enable_compilation_cache
+from logvggt_jax.compile import check_devices, check_nccl, enable_compilation_cache
 from logvggt_jax.errors import InputError, one_line
 from logvggt_jax.terminal import forgiving_streams
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.dry_run import described_mesh, dry_run
+from logvggt_jax.training.lifeline import Lifeline
 from logvggt_jax.training.loop import NonFiniteTraining, train
-from logvggt_jax.training.processes import join_processes
+from logvggt_jax.training.preflight import preflight
+from logvggt_jax.training.processes import JOIN_SECONDS, LOSS_SECONDS, check_processes, join_processes
+from logvggt_jax.training.profile import ProfiledSteps
 from logvggt_jax.training.sharding import data_mesh, use_cpu_cores
 
 _CONFIG = config_flags.DEFINE_config_file("config", None, "File with the run's settings.", lock_config=True)
 _WORKDIR = flags.DEFINE_string("workdir", None, "Folder for checkpoints, the model and logs.")
 _RESUME_STEP = flags.DEFINE_integer(
-    "resume_step", None, "Checkpoint to go on from, dropping later ones; by default the latest."
+    "resume_step", None, "Checkpoint to go back to, once; later ones are moved aside. By default the latest."
 )
 _DISTRIBUTED = flags.DEFINE_bool(
     "distributed", False, "This is one of several processes; start the same command once on every machine."
@@ -42,7 +45,13 @@ _DISTRIBUTED = flags.DEFINE_bool(
 _COORDINATOR = flags.DEFINE_string("coordinator", None, "host:port of process 0, where the cluster does not say.")
 _NUM_PROCESSES = flags.DEFINE_integer("num_processes", None, "Processes of the run, where the cluster does not say.")
 _PROCESS_ID = flags.DEFINE_integer("process_id", None, "Of this process, from 0, where the cluster does not say.")
+_JOIN_SECONDS = flags.DEFINE_float("join_seconds", JOIN_SECONDS, "How long to wait for the others at the start.")
+_WATCHDOG = flags.DEFINE_float(
+    "watchdog", 30.0, "End the process, with all stacks, when no step ended in so many median steps; 0: never."
+)
+_PROFILE = flags.DEFINE_string("profile", None, "Steps to write a trace of to WORKDIR/profile, such as 20:25.")
 _DRY_RUN = flags.DEFINE_bool("dry_run", False, "Say what every step needs and how many clips fit; train nothing.")
+_PREFLIGHT = flags.DEFINE_bool("preflight", False, "Try network, data, folder and step in minutes; train nothing.")
 _DESCRIBED = flags.DEFINE_string(
     "described", None, "TPU slice to compile for instead of the devices at hand, such as v5p:2x2x4; with --dry_run."
 )
@@ -54,35 +63,62 @@ _CACHE = flags.DEFINE_string(
 def main(arguments: Sequence[str]) -> None:
     """Settings, devices, training."""
     if len(arguments) > 1:
-        raise app.UsageError(f"unknown argument {arguments[1]!r}; settings are given as --config.NAME=VALUE")
+        sys.exit(f"train.py: unknown argument {arguments[1]!r}; settings are given as --config.NAME=VALUE")
     enable_compilation_cache(_CACHE.value)
+    watched: Lifeline | None = None
     try:
         config = TrainConfig.from_dict(_settings())
+        profile = ProfiledSteps.parse(_PROFILE.value) if _PROFILE.value else None
         use_cpu_cores(config, num_processes=_NUM_PROCESSES.value or 1)
+        check_nccl()
         if _DISTRIBUTED.value:
-            join_processes(
-                coordinator=_COORDINATOR.value, num_processes=_NUM_PROCESSES.value, process_id=_PROCESS_ID.value
+            watched = join_processes(
+                coordinator=_COORDINATOR.value,
+                num_processes=_NUM_PROCESSES.value,
+                process_id=_PROCESS_ID.value,
+                join_seconds=_JOIN_SECONDS.value,
             )
         check_devices()
+        check_processes()
         if _DRY_RUN.value:
             dry_run(config, described_mesh(_DESCRIBED.value) if _DESCRIBED.value else data_mesh())
-            return
-        train(config, Path(_WORKDIR.value), mesh=data_mesh(), resume_step=_RESUME_STEP.value)
-    except Exception as error:
-        # JAX counts processes with the help of a back end, which may be what does not start.
-        several = jax.distributed.is_initialized()
-        # What a user can mend is one line (-v 1 shows where it arose); anything else is a fault of ours.
-        if isinstance(error, InputError | NonFiniteTraining) and flags.FLAGS.verbosity <= 0:
-            message = f"train.py: {one_line(error)}"
-        elif several:
-            message = traceback.format_exc()
+        elif _PREFLIGHT.value:
+            preflight(config, Path(_WORKDIR.value), data_mesh())
         else:
-            raise
-        if several:
-            # At once: the others wait for this process's share of a step, and it would wait for them at the exit.
-            print(f"process {os.getpid()} on {platform.node()}: {message}", file=sys.stderr, flush=True)
-            os._exit(1)
-        sys.exit(message)
+            train(
+                config,
+                Path(_WORKDIR.value),
+                mesh=data_mesh(),
+                resume_step=_RESUME_STEP.value,
+                watchdog=_WATCHDOG.value,
+                profile=profile,
+            )
+    except BaseException as error:
+        _fail(error, watched)
+    if watched is not None:
+        watched.close()
+
+
+def _fail(error: BaseException, watched: Lifeline | None) -> NoReturn:
+    """Ends this process with what a user can mend in one line (-v 1 shows where it arose), else with a traceback."""
+    # JAX counts processes with the help of a back end, which may be what does not start.
+    several = jax.distributed.is_initialized()
+    if isinstance(error, InputError | NonFiniteTraining) and flags.FLAGS.verbosity <= 0:
+        message = f"train.py: {one_line(error)}"
+    elif several:
+        message = "".join(traceback.format_exception(error))
+    else:
+        raise error
+    if several:
+        if watched is not None:
+            if isinstance(error, jax.errors.JaxRuntimeError):
+                # Most often because another process is gone, which the lifeline then says in a line.
+                watched.wait(LOSS_SECONDS)
+            watched.fail(f"{type(error).__name__}: {one_line(error):.500}")
+        # At once: the others wait for this process's share of a step, and it would wait for them at the exit.
+        print(f"process {os.getpid()} on {platform.node()}: {message}", file=sys.stderr, flush=True)
+        os._exit(1)
+    sys.exit(message)
 
 
 def _settings() -> dict[str, Any]:

@@ -1,8 +1,11 @@
 """Before anything compiles: the devices that were asked for, and a cache of compiled programs."""
 
+import importlib.metadata
 import os
+import re
 import shutil
 import warnings
+from collections.abc import Iterable
 from pathlib import Path
 
 import jax
@@ -10,10 +13,40 @@ import jax
 from logvggt_jax.errors import InputError, install_line, one_line
 from logvggt_jax.files import user_cache_folder
 
+# Of each of these one build may be installed, for one version of CUDA; JAX loads whichever it finds first.
+_BUILD = re.compile(r"(nvidia-(?:nccl|cudnn|cublas)-cu|jax-cuda)\d+(-plugin|-pjrt)?")
+
 
 def nvidia_gpu_present() -> bool:
     """Whether this machine has an NVIDIA GPU and its driver, whatever JAX sees."""
     return Path("/dev/nvidia0").exists() or shutil.which("nvidia-smi") is not None
+
+
+def installed_packages() -> dict[str, str]:
+    """Versions of what is installed, by name in small letters."""
+    return {each.metadata["Name"].lower(): each.version for each in importlib.metadata.distributions() if each.metadata}
+
+
+def builds_side_by_side(installed: Iterable[str]) -> dict[str, list[str]]:
+    """The libraries of which more than one build is installed, and those builds."""
+    families: dict[str, list[str]] = {}
+    for name in sorted(installed):
+        if match := _BUILD.fullmatch(name):
+            families.setdefault(f"{match[1]}*{match[2] or ''}", []).append(name)
+    return {family: builds for family, builds in families.items() if len(builds) > 1}
+
+
+def check_nccl() -> None:
+    """Raises InputError where two builds of NCCL are installed: processes may load different ones, and then hang."""
+    asked = getattr(jax.config, "jax_platforms", None) or "cuda"
+    if not nvidia_gpu_present() or not {"cuda", "gpu"} & set(asked.split(",")):
+        return
+    for family, builds in builds_side_by_side(installed_packages()).items():
+        if "nccl" in family:
+            raise InputError(
+                f"{' and '.join(builds)} are both installed, and JAX loads whichever it finds first: pip uninstall all "
+                f"of them, then {install_line('cuda')}"
+            )
 
 
 def check_devices() -> None:
@@ -50,6 +83,12 @@ def device_bytes(device: jax.Device) -> int | None:
     except jax.errors.JaxRuntimeError:
         return None
     return (statistics or {}).get("bytes_limit")
+
+
+def most_device_bytes(devices: Iterable[jax.Device]) -> int | None:
+    """The most bytes that one of these devices has held so far; None where none says (CPUs)."""
+    found = [(device.memory_stats() or {}).get("peak_bytes_in_use") for device in devices]
+    return max((size for size in found if size is not None), default=None)
 
 
 def default_cache_folder() -> Path:

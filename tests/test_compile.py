@@ -25,6 +25,19 @@ def test_a_platform_that_does_not_start_is_one_line(monkeypatch: pytest.MonkeyPa
         module.check_devices()
 
 
+@pytest.mark.parametrize(("asked", "refused"), [(None, True), ("cuda,cpu", True), ("cpu", False)])
+def test_two_builds_of_nccl_are_refused(monkeypatch: pytest.MonkeyPatch, asked: str | None, refused: bool) -> None:
+    names = {"nvidia-nccl-cu12": "2", "nvidia-nccl-cu13": "2", "nvidia-cudnn-cu13": "9"}
+    monkeypatch.setattr(module, "nvidia_gpu_present", lambda: True)
+    monkeypatch.setattr(module, "installed_packages", lambda: names)
+    monkeypatch.setattr(type(jax.config), "jax_platforms", asked, raising=False)
+    if refused:
+        with pytest.raises(InputError, match=r"nvidia-nccl-cu12 and nvidia-nccl-cu13 are both installed, .*uninstall"):
+            module.check_nccl()
+    del names["nvidia-nccl-cu12" if refused else "nvidia-cudnn-cu13"]
+    module.check_nccl()
+
+
 @pytest.mark.parametrize(("asked", "warned"), [(None, True), ("cpu", False)])
 def test_an_idle_gpu_draws_a_warning(monkeypatch: pytest.MonkeyPatch, asked: str | None, warned: bool) -> None:
     monkeypatch.setattr(module, "nvidia_gpu_present", lambda: True)

@@ -2,36 +2,25 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import platform
-import re
 from collections.abc import Iterator
 
-from logvggt_jax.compile import nvidia_gpu_present
+from logvggt_jax.compile import builds_side_by_side, installed_packages, nvidia_gpu_present
 from logvggt_jax.doctor.finding import Finding
 from logvggt_jax.errors import install_line, one_line
 
 _LIBRARIES = ("logvggt-jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
-# Of each of these one build may be installed, for one version of CUDA; JAX loads whichever it finds first.
-_BUILD = re.compile(r"(nvidia-(?:nccl|cudnn|cublas)-cu|jax-cuda)\d+(-plugin|-pjrt)?")
 
 
 def examine() -> Iterator[Finding]:
     """Finds libraries, devices, and builds that do not belong together."""
     yield Finding("environment", "Python", platform.python_version())
-    installed = {
-        each.metadata["Name"].lower(): each.version for each in importlib.metadata.distributions() if each.metadata
-    }
+    installed = installed_packages()
     for name in _LIBRARIES:
         yield Finding("environment", name, installed.get(name), ok=None if name in installed else False)
-    families: dict[str, list[str]] = {}
-    for name in sorted(installed):
-        if match := _BUILD.fullmatch(name):
-            families.setdefault(f"{match[1]}*{match[2] or ''}", []).append(name)
-    for family, builds in families.items():
-        if len(builds) > 1:
-            note = f"pip uninstall all but one, then {install_line('cuda')}"
-            yield Finding("environment", f"builds of {family}", ", ".join(builds), ok=False, note=note)
+    for family, builds in builds_side_by_side(installed).items():
+        note = f"pip uninstall all but one, then {install_line('cuda')}"
+        yield Finding("environment", f"builds of {family}", ", ".join(builds), ok=False, note=note)
     yield from _devices()
 
 

@@ -2,109 +2,200 @@
 
 from __future__ import annotations
 
-import importlib.metadata
+import json
+import shutil
 from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
-import orbax.checkpoint as ocp
+import numpy as np
+from absl import logging
 
-from logvggt_jax.errors import InputError, OutputExists
-from logvggt_jax.model.parameters import stack_layers, unstack_layers
+from logvggt_jax.errors import DiskError, InputError, OutputExists, disk_errors, one_line
+from logvggt_jax.files import write_text
+from logvggt_jax.model.parameters import unstack_layers
+from logvggt_jax.training.checkpoint_files import DamagedCheckpoint, Position, StoredCheckpoint, write_checkpoint
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.processes import any_process
 from logvggt_jax.training.state import TrainState
-from logvggt_jax.weights.checkpoints import (
-    check_destination,
-    read_provenance,
-    read_with_orbax,
-    save_model,
-    writing_with_orbax,
-)
-from logvggt_jax.weights.digests import digests, json_digest, verify_digests
+from logvggt_jax.training.work_folder import FolderLock, remove_scratch
+from logvggt_jax.weights.checkpoints import check_destination, read_provenance, save_model
+from logvggt_jax.weights.digests import whole_array
 from logvggt_jax.weights.folder import is_model_folder
 from logvggt_jax.weights.provenance import Provenance
 
 # How fast, from where and with how many broken clips the data come; the data stream checks that they are the same.
 FREE_DATA_SETTINGS = ("worker_count", "num_threads", "cache_dir", "max_broken")
-LIBRARIES = ("logvggt-jax", "jax", "flax", "optax", "orbax-checkpoint", "grain")
-
-
-class Position(NamedTuple):
-    """Where a run stands: its stage (by number) and the state of that stage's data stream (JSON types)."""
-
-    stage: int
-    data: dict[str, Any]
 
 
 class RunCheckpoints:
     """The checkpoints `<workdir>/checkpoints/<step>` and the model folder `<workdir>/model`; a context manager.
 
-    A checkpoint holds parameters, the rest of the state, the data stream's state, and the configuration, with a
-    digest of every leaf and of the other two, since Orbax does not notice flipped bytes. It appears under its name only
-    when complete. A model folder that another run or a conversion wrote is never replaced: OutputExists.
+    While entered, the folder is this run's alone. Saves are written in the background, by process 0. A checkpoint
+    appears under its name only when complete, see `checkpoint_files`. What `restore` passes over stays, under the name
+    `<step>.aside`. A model folder that another run or a conversion wrote is never replaced: OutputExists.
     """
 
     def __init__(self, workdir: Path, config: TrainConfig) -> None:
         self.config = config
         self.folder = workdir.expanduser().absolute() / "checkpoints"
         self.model_folder = self.folder.parent / "model"
+        self._honoured = self.folder / "resumed.json"
+        self._lock: FolderLock | None = None
+        self._writer = ThreadPoolExecutor(1, "checkpoints")
+        self._pending: Future[None] | None = None
         # Now rather than after the steps before the first save.
         check_destination(self.model_folder)
         self._check_own()
-        # Saving is synchronous: the next step is given the state's buffers to overwrite.
-        options = ocp.CheckpointManagerOptions(
-            max_to_keep=config.keep_checkpoints, create=True, enable_async_checkpointing=False
-        )
-        self._manager = ocp.CheckpointManager(self.folder, options=options)
 
     def __enter__(self) -> RunCheckpoints:
+        """Raises InputError where another run uses the folder."""
+        if jax.process_index() == 0:
+            self._lock = FolderLock(self.folder.parent)
+            remove_scratch(self.folder.parent)
         return self
 
     def __exit__(self, *_: Any) -> None:
-        self._manager.close()
+        """Ends after the last save; whoever must know how it went calls `wait` before."""
+        self._writer.shutdown(wait=True)
+        if self._pending is not None and (failure := self._pending.exception()) is not None:
+            logging.error("the last save failed: %s", one_line(failure))
+        if self._lock is not None:
+            self._lock.release()
 
     @property
     def steps(self) -> list[int]:
         """Steps that have a complete checkpoint, oldest first."""
-        return sorted(self._manager.all_steps())
+        return sorted(int(entry.name) for entry in self.folder.glob("*") if entry.name.isdecimal())
 
-    def save(self, state: TrainState, position: Position) -> None:
-        """Replaces the model folder and writes the checkpoint of `state.step`."""
-        step = int(state.step)
-        params, rest = _parts(state)
-        # First, so that a run that is killed in between goes on from an older checkpoint and writes both again.
-        failure: Exception | None = None
-        if jax.process_index() == 0:
-            try:
-                layers = unstack_layers(jax.device_get(params), self.config.model)
-                save_model(self.model_folder, self.config.model, layers, self._provenance())
-            except Exception as error:
-                failure = error
-        # The others would wait for the first one in the checkpoint below.
+    def save(self, state: TrainState, position: Position, *, in_place_of: int | None = None) -> None:
+        """Begins to replace the model folder and to write the checkpoint of `state.step`, and returns.
+
+        The state may be donated as soon as this returns: copies are on the host of process 0, once. Raises what kept
+        the save before from being written, see `wait`. The checkpoint `in_place_of` goes when this one is complete.
+        """
+        self.wait()
+        first = jax.process_index() == 0
+
+        def copied(leaf: Any) -> np.ndarray | None:
+            whole = whole_array(leaf)
+            # Always a copy: on a CPU it could be the very memory that the next step writes to.
+            return np.array(whole) if first else None
+
+        copies = jax.tree.map(copied, state)
+        if first:
+            self._pending = self._writer.submit(self._write, copies, position, in_place_of)
+
+    def check(self) -> None:
+        """Raises on process 0 what kept a save from being written, as soon as that is known; waits for nothing."""
+        if self._pending is not None and self._pending.done() and self._pending.exception() is not None:
+            self._pending.result()
+
+    def wait(self) -> None:
+        """Returns when the last save is complete; raises on every process what kept process 0 from writing it.
+
+        All processes have to call this at the same point.
+        """
+        pending, self._pending = self._pending, None
+        failure = None if pending is None else pending.exception()
         if any_process(failure is not None):
-            raise failure or OSError(f"process 0 could not write {self.model_folder}; its output says why")
-        meta: dict[str, Any] = {
-            "step": step,
-            "stage": position.stage,
-            "layers": "stacked",
-            "config": self.config.to_dict(),
-            "digests": {"params": digests(params), "state": digests(rest)},
-            "libraries": {name: importlib.metadata.version(name) for name in LIBRARIES},
-        }
-        meta["digest"] = json_digest([meta, position.data])
-        with writing_with_orbax(self.folder / str(step)):
-            self._manager.save(
+            raise failure or DiskError(f"process 0 could not save to {self.folder}; its output says why")
+
+    def restore(self, like: TrainState, *, step: int | None = None) -> tuple[TrainState, Position]:
+        """The state at `step` (None: the latest that is not damaged), with the shapes and placement of `like`.
+
+        A `step` is gone back to once: the same request of a command that is started again goes on from the latest.
+        Checkpoints of later steps, and damaged ones, are moved aside, and a warning says so.
+
+        Raises InputError naming step, path and the other steps there are: no such checkpoint, one of another
+        configuration, or DamagedCheckpoint where `step` is damaged or all are.
+        """
+        steps = self.steps
+        if step is not None and step == self._went_back_to() and steps:
+            logging.warning(
+                "--resume_step=%d was honoured before: going on from the latest; to go back once more, remove %s",
                 step,
-                args=ocp.args.Composite(
-                    params=ocp.args.StandardSave(params),
-                    state=ocp.args.StandardSave(rest),
-                    data=ocp.args.JsonSave(position.data),
-                    meta=ocp.args.JsonSave(meta),
-                ),
-                force=True,
+                self._honoured,
             )
+            step = None
+        if not steps or (step is not None and step not in steps):
+            raise InputError(f"{self.folder}: no checkpoint of step {step}; there are {steps or 'none'}")
+        candidates = list(reversed(steps)) if step is None else [step]
+        for chosen in candidates:
+            try:
+                state, position = self._restore(chosen, like)
+            except DamagedCheckpoint as error:
+                others = [other for other in steps if other != chosen] if step is not None else []
+                mend = (
+                    f"resume from another with --resume_step (there are {others})"
+                    if others
+                    else "start a new --workdir"
+                )
+                if chosen == candidates[-1]:
+                    raise DamagedCheckpoint(f"{error}; {mend if others else 'start a new --workdir'}") from error
+                logging.error("%s; going on from the checkpoint before it", one_line(error))
+            else:
+                break
+        if jax.process_index() == 0:
+            with disk_errors(self.folder):
+                for later in (other for other in steps if other > chosen):
+                    logging.warning("step %d goes on from %d; moved to %s", later, chosen, self._set_aside(later))
+                if step is not None:
+                    write_text(self._honoured, json.dumps({"resume_step": step}))
+        return state, position
+
+    def _restore(self, step: int, like: TrainState) -> tuple[TrainState, Position]:
+        """Raises DamagedCheckpoint on every process where one of them finds damage."""
+        problem: DamagedCheckpoint | None = None
+        stored, state = None, like
+        try:
+            stored = StoredCheckpoint(self.folder / str(step))
+            self._check_configuration(stored)
+            state = stored.read(like, self.config)
+        except DamagedCheckpoint as error:
+            problem = error
+        # Comparison needs all of them.
+        if any_process(problem is not None) or stored is None:
+            raise problem or DamagedCheckpoint(f"checkpoint of step {step} cannot be read by another process")
+        try:
+            state = stored.verified(state)
+        except DamagedCheckpoint as error:
+            problem = error
+        if any_process(problem is not None):
+            raise problem or DamagedCheckpoint(f"{stored.where} is damaged, as another process finds")
+        return state, stored.position
+
+    def _write(self, state: TrainState, position: Position, in_place_of: int | None) -> None:
+        # First, so that a run that is killed in between goes on from an older checkpoint and writes both again.
+        layers = unstack_layers(state.params, self.config.model)
+        save_model(self.model_folder, self.config.model, layers, self._provenance())
+        step = int(state.step)
+        write_checkpoint(self.folder / str(step), state, position, self.config)
+        newest = [kept for kept in self.steps if kept != in_place_of][-self.config.keep_checkpoints :]
+        for old in {*self.steps} - {step, *newest}:
+            # Under another name first: what is deleted by half must not look like a checkpoint.
+            leaving = self.folder / f".{old}.old"
+            (self.folder / str(old)).rename(leaving)
+            shutil.rmtree(leaving, ignore_errors=True)
+
+    def _set_aside(self, step: int) -> Path:
+        """Gives a checkpoint a name that no other has, under which it is none."""
+        path, number = self.folder / f"{step}.aside", 1
+        while path.exists():
+            number += 1
+            path = self.folder / f"{step}.aside{number}"
+        (self.folder / str(step)).rename(path)
+        return path
+
+    def _went_back_to(self) -> int | None:
+        """The step that an earlier start of this run was told to go back to, and did."""
+        try:
+            found: int | None = json.loads(self._honoured.read_text())["resume_step"]
+        except (OSError, ValueError, KeyError, TypeError):
+            return None
+        return found
 
     def _check_own(self) -> None:
         """A model without checkpoints is this run's if it was killed before its first one was complete."""
@@ -125,79 +216,19 @@ class RunCheckpoints:
         start = self.config.initial_weights or "random parameters"
         return Provenance("windows", longer_edge, source=f"trained from {start}{self._here()}")
 
-    def restore(self, like: TrainState, *, step: int | None = None) -> tuple[TrainState, Position]:
-        """The state at `step` (None: the latest), with the shapes and placement of `like`.
-
-        Checkpoints of later steps are removed: the run that goes on from here will write its own. Raises InputError
-        naming step, path and the other steps there are: no such checkpoint, one of another configuration, or a damaged
-        one.
-        """
-        steps = self.steps
-        chosen = step if step is not None else (steps[-1] if steps else None)
-        if chosen is None or chosen not in steps:
-            raise InputError(f"{self.folder}: no checkpoint of step {chosen}; there are {steps or 'none'}")
-        where = f"checkpoint of step {chosen} in {self.folder / str(chosen)}"
-        others = [other for other in steps if other != chosen]
-        mend = f"resume from another with --resume_step (there are {others})" if others else "start a new --workdir"
-        described = ocp.args.Composite(meta=ocp.args.JsonRestore(), data=ocp.args.JsonRestore())
-        stored = self._read(chosen, described, where, mend)
-        meta, data = stored["meta"], stored["data"]
-        _check_description(meta, data, where, mend)
-        self._check_configuration(meta["config"], where)
-        # Earlier versions kept every layer's parameters and moments by themselves.
-        layer_by_layer = meta.get("layers") != "stacked"
-        if layer_by_layer:
-            like = unstack_layers(like, self.config.model, _one_layer)
-        params, rest = _parts(like)
-        restored = self._read(
-            chosen,
-            ocp.args.Composite(
-                params=ocp.args.StandardRestore(_abstract(params)),
-                state=ocp.args.StandardRestore(_abstract(rest)),
-            ),
-            where,
-            mend,
-        )
-        try:
-            for part in ("params", "state"):
-                verify_digests(restored[part], meta["digests"][part], where)
-        except ValueError as error:
-            raise InputError(f"{error}; {mend}") from error
-        for later in steps:
-            if later > chosen:
-                self._manager.delete(later)
-        state = TrainState(params=restored["params"], **restored["state"])
-        return stack_layers(state) if layer_by_layer else state, Position(meta["stage"], data)
-
-    def _read(self, step: int, args: Any, where: str, mend: str) -> Mapping[str, Any]:
-        return read_with_orbax(lambda: self._manager.restore(step, args=args), where, mend)
-
-    def _check_configuration(self, stored: Mapping[str, Any], where: str) -> None:
+    def _check_configuration(self, stored: StoredCheckpoint) -> None:
         ours = self.config.to_dict()
         for part in ("model", "stages", "data", "loss", "optimizer", "seed"):
-            theirs = stored.get(part)
+            theirs = stored.config.get(part)
             if part == "data" and theirs is not None:
                 theirs, ours[part] = _what_decides_clips(theirs), _what_decides_clips(ours[part])
             difference = _first_difference(theirs, ours[part], part)
             if difference is not None:
                 name, theirs, mine = difference
                 raise InputError(
-                    f"{where} was written with {name}={theirs!r}, the configuration says {mine!r}; "
+                    f"{stored.where} was written with {name}={theirs!r}, the configuration says {mine!r}; "
                     "set it back or start a new --workdir"
                 )
-
-
-def _check_description(meta: Any, data: Any, where: str, mend: str) -> None:
-    """Compares position and settings with their digest; checkpoints of before there was one pass as they are."""
-    known = {"step", "stage", "layers", "config", "digests", "libraries", "digest"}
-    # An entry of another name may have been `digest` before a bit of it was flipped.
-    names = set(meta) if isinstance(meta, dict) else set()
-    if not known - {"layers", "digest"} <= names <= known:
-        raise InputError(f"{where} is damaged: it holds {sorted(names)}, expected {sorted(known)}; {mend}")
-    if "digest" in names:
-        found = json_digest([{name: value for name, value in meta.items() if name != "digest"}, data])
-        if found != meta["digest"]:
-            raise InputError(f"{where} is damaged: position and settings differ from their digest; {mend}")
 
 
 def _what_decides_clips(data: Mapping[str, Any]) -> dict[str, Any]:
@@ -205,20 +236,6 @@ def _what_decides_clips(data: Mapping[str, Any]) -> dict[str, Any]:
     kept = {name: value for name, value in data.items() if name not in FREE_DATA_SETTINGS}
     kept["sources"] = [{name: value for name, value in source.items() if name != "root"} for source in data["sources"]]
     return kept
-
-
-def _parts(state: TrainState) -> tuple[Any, dict[str, Any]]:
-    rest = state._asdict()
-    return rest.pop("params"), rest
-
-
-def _one_layer(stack: jax.ShapeDtypeStruct, layer: int) -> jax.ShapeDtypeStruct:
-    del layer
-    return jax.ShapeDtypeStruct(stack.shape[1:], stack.dtype, sharding=stack.sharding)
-
-
-def _abstract(tree: Any) -> Any:
-    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding), tree)
 
 
 def _first_difference(theirs: Any, ours: Any, name: str) -> tuple[str, Any, Any] | None:

@@ -9,29 +9,36 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
+from absl import logging
 from jax.sharding import Mesh
 from rich.console import Console
 
-from logvggt_jax.compile import device_bytes, out_of_device_memory
+from logvggt_jax.compile import device_bytes, most_device_bytes, out_of_device_memory
 from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.data.feeding.batches import BatchIterator
-from logvggt_jax.errors import InputError, one_line
+from logvggt_jax.errors import InputError, one_line, printable
 from logvggt_jax.interruption import StopRequest
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.model.parameters import stack_layers
+from logvggt_jax.operations import matmul_flops_per_second
 from logvggt_jax.training.batches import open_sources, stage_batches
-from logvggt_jax.training.checkpoints import Position, RunCheckpoints
+from logvggt_jax.training.checkpoint_files import Position
+from logvggt_jax.training.checkpoints import RunCheckpoints
 from logvggt_jax.training.config import StageConfig, TrainConfig
 from logvggt_jax.training.device_batches import DeviceBatches
+from logvggt_jax.training.dry_run import step_flops
 from logvggt_jax.training.initialization import initial_parameters
-from logvggt_jax.training.metrics_log import MetricsLog
-from logvggt_jax.training.processes import ASK_EVERY, any_process, check_agreement
+from logvggt_jax.training.metrics_log import MetricsLog, read_metrics
+from logvggt_jax.training.processes import Vote, any_process, check_agreement, check_shared
+from logvggt_jax.training.profile import ProfiledSteps, Profiler
 from logvggt_jax.training.program import abstract_parameters, make_program
-from logvggt_jax.training.progress import Speedometer, duration, progress_line
+from logvggt_jax.training.progress import IntervalMeans, RunTimes, duration, progress_line
 from logvggt_jax.training.sharding import check_batch_size, replicated
 from logvggt_jax.training.state import TrainState, initial_state
 from logvggt_jax.training.step import Batch, Metrics
 from logvggt_jax.training.validation import Validation
+from logvggt_jax.training.watchdog import Watchdog
 
 # Steps handed to the device before the oldest has to be finished: enough to hide the host's work.
 STEPS_IN_FLIGHT = 2
@@ -42,25 +49,40 @@ class NonFiniteTraining(RuntimeError):
     """Too many updates in a row had a non-finite loss or gradient."""
 
 
-def train(config: TrainConfig, workdir: Path, *, mesh: Mesh, resume_step: int | None = None) -> TrainState:
+def train(
+    config: TrainConfig,
+    workdir: Path,
+    *,
+    mesh: Mesh,
+    resume_step: int | None = None,
+    watchdog: float = 0.0,
+    profile: ProfiledSteps | None = None,
+) -> TrainState:
     """Runs the stages of `config` on `mesh`, or what is left of them if `workdir` holds a checkpoint; the state at the
     end.
 
-    Leaves `checkpoints/`, `model/` (for `load_model`), `metrics.jsonl` and `tensorboard/` in `workdir`. SIGTERM, Ctrl-C
+    Leaves `checkpoints/`, `model/` (for `load_model`), `metrics.jsonl`, `times.jsonl`, `tensorboard/` and a `profile/`
+    that was asked for in `workdir`. SIGTERM, Ctrl-C
     and `config.max_minutes` end the run after the current step with a checkpoint; `resume_step` is the one to go on
-    from, None takes the latest.
+    from, once, None takes the latest. A run begins with a save and a validation, so that either fails at once.
+    When no step has ended for `watchdog` times the median step the process ends, see `Watchdog`.
 
     Raises InputError for settings, data or a checkpoint that do not fit, in one line, and NonFiniteTraining where
-    `config.max_skipped_in_a_row` updates in a row were not finite.
+    `config.max_skipped_in_a_row` updates in a row were not finite; a run that is started again goes on past them.
     """
     for stage in config.stages:
         check_batch_size(stage, mesh)
-    run = _Run(config, workdir, mesh)
-    with run.checkpoints, StopRequest("SIGTERM", "SIGINT") as stop:
+    check_shared(workdir)
+    with contextlib.ExitStack() as stack:
+        watched = stack.enter_context(Watchdog(watchdog))
+        # Before gigabytes of weights are read.
+        datasets = open_sources(config.data, None if config.validation is None else config.validation.source)
+        run = _Run(config, workdir, mesh, watched)
+        run.profiler = stack.enter_context(Profiler(profile, workdir / "profile"))
+        stack.enter_context(run.checkpoints)
+        stop = stack.enter_context(StopRequest("SIGTERM", "SIGINT"))
         first, position = run.start(resume_step)
         check_agreement("the checkpoints", first)
-        validation = None if config.validation is None else config.validation.source
-        datasets = open_sources(config.data, validation)
         silent = jax.process_index() != 0
         with MetricsLog(workdir, first_step=first, console=Console(), silent=silent) as log:
             log.say(f"{mesh.size} devices, {first}/{config.total_steps} steps done, results in {workdir}")
@@ -72,18 +94,26 @@ class _Run:
     """The parts of one run and its current state."""
 
     state: TrainState
+    times: RunTimes
+    profiler: Profiler
 
-    def __init__(self, config: TrainConfig, workdir: Path, mesh: Mesh) -> None:
-        self.config, self.mesh = config, mesh
+    def __init__(self, config: TrainConfig, workdir: Path, mesh: Mesh, watchdog: Watchdog) -> None:
+        self.config, self.mesh, self.watchdog = config, mesh, watchdog
         self.deadline = None if config.max_minutes is None else time.monotonic() + 60 * config.max_minutes
         model = LogVGGT(config.model)
         # Shapes alone: a run that goes on needs no initial weights.
         self.shapes = abstract_parameters(config.model)
         self.optimizer, self.step = make_program(model, config, self.shapes, mesh)
         self.programs: dict[tuple[int, ...], jax.stages.Compiled] = {}
+        self.operations: dict[tuple[int, ...], float] = {}
         self.validation = None if config.validation is None else Validation(model, config.validation, mesh)
         self.checkpoints = RunCheckpoints(workdir, config)
-        self.speed = Speedometer(config.stages)
+        self.peak = None
+        if mesh.devices.flat[0].platform != "cpu":  # whose cores share one peak
+            self.peak = mesh.size * matmul_flops_per_second(config.model.dtype)
+        self.means = IntervalMeans()
+        self.skipped = self.longest_skip = 0.0
+        self.vote = Vote(mesh, delay=STEPS_IN_FLIGHT)
 
     def start(self, resume_step: int | None) -> tuple[int, Position | None]:
         """Takes up a checkpoint, or the initial weights if there is none.
@@ -91,7 +121,8 @@ class _Run:
         Returns the number of steps done and where the data stand.
         """
         config, everywhere = self.config, replicated(self.mesh)
-        if resume_step is None and not self.checkpoints.steps:
+        # The checkpoint of step 0 is there to show that one can be written: nothing is lost by beginning again.
+        if resume_step is None and not any(self.checkpoints.steps):
             params = initial_parameters(config.model, seed=config.seed, weights=config.initial_weights)
             self.state = jax.device_put(initial_state(stack_layers(params), self.optimizer), everywhere)
             return 0, None
@@ -105,6 +136,8 @@ class _Run:
     ) -> None:
         """All stages that are not finished."""
         step, end = int(self.state.step), 0
+        self.skipped = float(self.state.skipped)
+        self.times = RunTimes(self.config, productive=log.productive_seconds, peak=self.peak)
         left: list[tuple[int, StageConfig, int, BatchIterator]] = []
         # All of them at once: data that do not fit the last stage are an error of the first minute.
         for index, stage in enumerate(self.config.stages):
@@ -118,12 +151,24 @@ class _Run:
             # Otherwise they would wait for one another in different programs.
             check_agreement(f"stage {stage.name!r}: the data", {**source.get_state(), "broken": None})
             left.append((index, stage, end, source))
+        if step == 0:
+            self._save(Position(0, left[0][3].get_state()))
+            self.checkpoints.wait()
+        # After a save, and again where the run was killed between the two.
+        if self._validation_is_due(step) and any_process(not log.silent and not _is_validated(log.path, step)):
+            self._validate(step, log)
         for index, stage, end, source in left:
             with source, DeviceBatches(source, self.mesh) as batches, self._device_memory(stage):
                 step, ended = self._train_stage(index, stage, batches, step, end, log, stop)
             if ended:
                 break
-        log.say(f"{step}/{self.config.total_steps} steps done; model in {self.checkpoints.model_folder}")
+        self.checkpoints.wait()
+        wall = max(time.time() - log.started, 1e-9)
+        log.say(
+            f"{step}/{self.config.total_steps} steps done; model in {self.checkpoints.model_folder}; goodput "
+            f"{min(self.times.productive / wall, 1.0):.0%}: {duration(self.times.productive)} of training in "
+            f"{duration(wall)} since the first start"
+        )
 
     def _train_stage(
         self,
@@ -137,39 +182,99 @@ class _Run:
     ) -> tuple[int, bool]:
         """Steps up to `end`, or fewer if the run is to stop; the number of steps done, and whether it is to stop."""
         config = self.config
-        in_flight: deque[jax.Array] = deque()
-        self.speed.restart()
+        in_flight: deque[tuple[int, Metrics, list[str]]] = deque()
+        logged = saved = step
+        self.times.begin()
         while step < end:
-            batch = next(batches)
-            self.state, metrics = self._program(stage, batch, log)(self.state, batch)
+            try:
+                with self.times.waiting():
+                    batch = next(batches)
+            except Exception:
+                # Of several processes the others wait in a step that this one has no share for.
+                if jax.process_count() == 1 and step > saved:
+                    self._finish(in_flight)
+                    if step > logged:
+                        self._log(step, end, stage, batches.broken_clips, log)
+                    self._save(Position(index, batches.get_state()))
+                raise
+            program = self._program(stage, batch, log)
+            self.profiler.before(step + 1)
+            self.state, metrics = program(self.state, batch)
             step += 1
-            self.speed.count()
-            in_flight.append(metrics["loss/total"])
-            if len(in_flight) > STEPS_IN_FLIGHT:
-                in_flight.popleft().block_until_ready()
+            self.times.count(self.operations.get(batch["images"].shape, 0.0))
+            in_flight.append((step, metrics, batches.names))
+            self._finish(in_flight, STEPS_IN_FLIGHT)
+            if self.profiler.is_last(step):
+                self._finish(in_flight)
+                self.profiler.stop()
 
-            ending = self._reason_to_end(stop, step)
-            last = step == end or ending is not None
-            if step % config.log_every == 0 or step == 1 or last:
-                self._log(step, stage, metrics, batches.broken_clips, log)
-            if config.validation is not None and (step % config.validation.every == 0 or step == config.total_steps):
+            ending = self._reason_to_end(stop)
+            saving = step % config.save_every == 0 or step == end or ending is not None
+            # Intervals begin anew after a save, where a run that is killed goes on.
+            if step % config.log_every == 0 or step == 1 or saving or self._failing():
+                self._finish(in_flight)
+                self._log(step, end, stage, batches.broken_clips, log)
+                logged = step
+            self.checkpoints.check()
+            position = Position(index, batches.get_state())
+            if self._failing():
+                self._fail(step, position)
+            if saving:
+                self._save(position)
+                saved = step
+            if self._validation_is_due(step):
                 self._validate(step, log)
-            if step % config.save_every == 0 or last:
-                self.checkpoints.save(self.state, Position(index, batches.get_state()))
-                self.speed.restart()
             if ending is not None:
                 log.say(f"stopping after step {step}: {ending}; run the same command to go on")
                 return step, True
         return step, False
+
+    def _finish(self, in_flight: deque[tuple[int, Metrics, list[str]]], allowed: int = 0) -> None:
+        """Waits until no more than `allowed` steps are unfinished, and takes down what the finished ones say."""
+        while len(in_flight) > allowed:
+            step, metrics, names = in_flight.popleft()
+            values = {name: float(value) for name, value in jax.device_get(metrics).items()}
+            self.watchdog.step_ended()
+            self.means.add(values)
+            if values["skipped"] > self.skipped:
+                logging.warning(
+                    "step %d: loss or gradient was not finite and the update is left out; clips: %s",
+                    step,
+                    printable("; ".join(names)),
+                )
+            self.skipped, self.longest_skip = values["skipped"], values["longest_skip"]
+
+    def _failing(self) -> bool:
+        return self.longest_skip >= self.config.max_skipped_in_a_row
+
+    def _fail(self, step: int, position: Position) -> None:
+        """Saves, so that the same command goes on past the clips that were named, and raises."""
+        row = self.longest_skip
+        zero = jax.device_put(np.int32(0), self.state.step.sharding)
+        self.state = self.state._replace(skipped_in_a_row=zero, longest_skip=zero)
+        self._save(position)
+        self.checkpoints.wait()
+        raise NonFiniteTraining(
+            f"step {step}: {row:.0f} updates in a row had a non-finite loss or gradient "
+            f"(max_skipped_in_a_row={self.config.max_skipped_in_a_row}; their clips are named above): the same command "
+            "goes on past them; if that does not help start a new --workdir with a lower optimizer.learning_rate, or "
+            "resume from an earlier checkpoint with --resume_step"
+        )
+
+    def _save(self, position: Position) -> None:
+        with self.times.other("save"), self.watchdog.other("the save"):
+            self.checkpoints.save(self.state, position)
 
     def _program(self, stage: StageConfig, batch: Batch, log: MetricsLog) -> jax.stages.Compiled:
         """The step compiled ahead of time for clips of this shape: a call cannot cost another compilation unseen."""
         shape = batch["images"].shape
         if shape not in self.programs:
             started = time.perf_counter()
-            self.programs[shape] = self.step.lower(self.state, batch).compile()
+            with self.times.other("compilation"), self.watchdog.other("the compilation"):
+                self.programs[shape] = self.step.lower(self.state, batch).compile()
+                if self.peak is not None:
+                    self.operations[shape] = step_flops(self.config.model, shape[:4])
             log.say(f"{stage.name}: step compiled in {time.perf_counter() - started:.0f} s")
-            self.speed.restart()
         return self.programs[shape]
 
     @contextlib.contextmanager
@@ -196,24 +301,51 @@ class _Run:
         needs = [memory.argument_size_in_bytes + memory.temp_size_in_bytes for memory in known if memory is not None]
         return text + (f", where the largest step needs {max(needs) / GIB:.1f} GiB" if needs else "")
 
-    def _log(self, step: int, stage: StageConfig, metrics: Metrics, broken_clips: int, log: MetricsLog) -> None:
-        values = {name: float(value) for name, value in jax.device_get(metrics).items()}
-        values["broken_clips"] = float(broken_clips)
-        self.speed.read(stage)
-        log.write(step, {**values, "frames_per_second": self.speed.frames_per_second})
-        log.say(progress_line(step, self.config.total_steps, stage.name, values, self.speed))
-        if values["longest_skip"] >= self.config.max_skipped_in_a_row:
-            raise NonFiniteTraining(
-                f"step {step}: {values['longest_skip']:.0f} updates in a row had a non-finite loss or gradient "
-                f"(max_skipped_in_a_row={self.config.max_skipped_in_a_row}); start a new --workdir with a lower "
-                "optimizer.learning_rate, or resume from an earlier checkpoint with --resume_step"
+    def _log(self, step: int, end: int, stage: StageConfig, broken_clips: int, log: MetricsLog) -> None:
+        """One line about the steps since the last one, all of which have finished."""
+        values = {**self.means.read(), "broken_clips": float(broken_clips)}
+        speed = self.times.read(stage)
+        log.write(step, {**values, "frames_per_second": speed.frames_per_second})
+        memory = most_device_bytes(self.mesh.local_devices)
+        shapes = {(s.name, size) for s in self.config.stages for size in s.sizes}
+        missing = max(len(shapes) - len(self.programs), 0)
+        here = min(missing, max(len(stage.sizes) - len(self.programs), 0))
+        stage_seconds = self.times.remaining_seconds(step, end, compilations=here)
+        run_seconds = self.times.remaining_seconds(step, compilations=missing)
+        log.write_times(
+            step,
+            {
+                "productive_seconds": self.times.productive,
+                "data_share": speed.data_share,
+                "stage_seconds_left": stage_seconds,
+                "run_seconds_left": run_seconds,
+                **({} if speed.utilisation is None else {"utilisation": speed.utilisation}),
+                **({} if memory is None else {"device_gib": memory / GIB}),
+            },
+        )
+        log.say(
+            progress_line(
+                step,
+                self.config.total_steps,
+                stage.name,
+                values,
+                speed,
+                memory=memory,
+                stage_seconds=stage_seconds,
+                run_seconds=run_seconds,
             )
+        )
+
+    def _validation_is_due(self, step: int) -> bool:
+        every = None if self.config.validation is None else self.config.validation.every
+        return every is not None and (step % every == 0 or step == self.config.total_steps)
 
     def _validate(self, step: int, log: MetricsLog) -> None:
         if self.validation is None:
             return
         started = time.perf_counter()
-        values = self.validation(self.state.params)
+        with self.times.other("validation"), self.watchdog.other("the validation"):
+            values = self.validation(self.state.params)
         log.write(step, values)
         log.say(
             f"validation after step {step} ({duration(time.perf_counter() - started)}): "
@@ -222,17 +354,16 @@ class _Run:
             f"rotation {values['validation/rotation']:.2f}° (identity {values['validation/identity_rotation']:.2f}°), "
             f"direction {values['validation/translation_direction']:.1f}°"
         )
-        self.speed.restart()
 
-    def _reason_to_end(self, stop: StopRequest, step: int) -> str | None:
+    def _reason_to_end(self, stop: StopRequest) -> str | None:
         reason = None
         if stop.reason is not None:
             reason = f"received {stop.reason}"
         elif self.deadline is not None and time.monotonic() > self.deadline:
             reason = f"max_minutes={self.config.max_minutes} are over"
-        if jax.process_count() == 1:
-            return reason
         # A process that left alone would let the others wait for its share of the next step for ever.
-        if step % ASK_EVERY or not any_process(reason is not None):
-            return None
-        return reason or "another process is to stop"
+        return (reason or "another process is to stop") if self.vote(reason is not None) else None
+
+
+def _is_validated(metrics: Path, step: int) -> bool:
+    return any(entry["step"] == step and "validation/abs_rel" in entry for entry in read_metrics(metrics))

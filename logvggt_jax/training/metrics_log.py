@@ -6,7 +6,7 @@ import json
 import math
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from rich.console import Console
 from tensorboardX import SummaryWriter
@@ -14,10 +14,16 @@ from tensorboardX import SummaryWriter
 from logvggt_jax.files import write_text
 
 FILE_NAME = "metrics.jsonl"
+# Beside the metrics, which are the same however often a run was interrupted.
+TIMES_NAME = "times.jsonl"
 
 
 class MetricsLog:
-    """Appends to `<workdir>/metrics.jsonl` and `<workdir>/tensorboard`; a context manager.
+    """Appends to `metrics.jsonl`, `times.jsonl` and `tensorboard/` of a work folder; a context manager.
+
+    Attributes:
+      started: when the run began for the first time, seconds since 1970.
+      productive_seconds: what earlier sessions spent on the steps that are left of them.
 
     On a run that resumes at `first_step`, lines of later steps (of the run that was interrupted) are dropped, so
     that the file reads like one uninterrupted run.
@@ -28,12 +34,21 @@ class MetricsLog:
         self.path = workdir / FILE_NAME
         self.console = console
         self.silent = silent
+        self.started, self.productive_seconds = time.time(), 0.0
         if silent:
             return
         workdir.mkdir(parents=True, exist_ok=True)
-        _drop_later_lines(self.path, first_step)
-        self._file = self.path.open("a")
+        times = workdir / TIMES_NAME
+        for path in (self.path, times):
+            _drop_later_lines(path, first_step)
+        self._file, self._times = self.path.open("a"), times.open("a")
         self._tensorboard = SummaryWriter(str(workdir / "tensorboard"), purge_step=first_step + 1)
+        known = read_metrics(times)
+        if known:
+            self.started = known[0]["time"]
+            self.productive_seconds = known[-1]["productive_seconds"]
+        else:
+            self.write_times(first_step, {"productive_seconds": 0.0})
 
     def __enter__(self) -> MetricsLog:
         return self
@@ -41,17 +56,29 @@ class MetricsLog:
     def __exit__(self, *_: Any) -> None:
         if not self.silent:
             self._file.close()
+            self._times.close()
             self._tensorboard.close()
 
     def write(self, step: int, values: dict[str, float]) -> None:
         """Appends one line {"step", "time" (seconds since 1970), …}; non-finite values become null."""
-        if self.silent:
-            return
+        if not self.silent:
+            self._append(self._file, step, values)
+            self._draw(step, values)
+
+    def write_times(self, step: int, values: dict[str, float]) -> None:
+        """The same for what differs from one machine and session to the next, in a file of its own."""
+        if not self.silent:
+            self._append(self._times, step, values)
+            self._draw(step, {f"times/{name}": value for name, value in values.items()})
+
+    def _append(self, file: TextIO, step: int, values: dict[str, float]) -> None:
         finite = {name: value if math.isfinite(value) else None for name, value in values.items()}
-        self._file.write(json.dumps({"step": step, "time": round(time.time(), 3), **finite}) + "\n")
-        self._file.flush()
-        for name, value in finite.items():
-            if value is not None:
+        file.write(json.dumps({"step": step, "time": round(time.time(), 3), **finite}) + "\n")
+        file.flush()
+
+    def _draw(self, step: int, values: dict[str, float]) -> None:
+        for name, value in values.items():
+            if math.isfinite(value):
                 self._tensorboard.add_scalar(name, value, step)
 
     def say(self, message: str) -> None:

@@ -67,10 +67,24 @@ def save_model(
         },
     }
     with atomic_folder(path, replace=replace) as fresh, writing_with_orbax(path):
-        with _checkpointer() as checkpointer:
-            checkpointer.save(fresh / "params", jax.device_get(params))
-            checkpointer.wait_until_finished()
+        write_arrays(fresh / "params", params)
         write_description(fresh, description)
+
+
+def write_arrays(path: Path, tree: Any) -> None:
+    """Writes a pytree of arrays, which this process holds whole, as a new folder in Orbax's format."""
+    with _checkpointer() as checkpointer:
+        checkpointer.save(path, jax.device_get(tree))
+        checkpointer.wait_until_finished()
+
+
+def read_arrays(path: Path, target: Any) -> Any:
+    """A folder of `write_arrays` in the shapes and placement of `target`.
+
+    Of several processes each reads its own part. What Orbax raises passes through, see `read_with_orbax`.
+    """
+    with _checkpointer() as checkpointer:
+        return checkpointer.restore(path, target)
 
 
 def check_destination(path: Path) -> None:
@@ -249,11 +263,11 @@ def _restore(path: Path, target: Any) -> Any:
     def read() -> Any:
         with _checkpointer() as checkpointer:
             stored = checkpointer.metadata(path).item_metadata
-            if stored is None:
-                raise FileNotFoundError("Orbax's description of the parameters is missing")
-            if wrong := first_misfit(stored.tree, target, "the configuration in config.json"):
-                raise InputError(f"{path}: {wrong}; the two belong to different models")
-            return checkpointer.restore(path, target)
+        if stored is None:
+            raise FileNotFoundError("Orbax's description of the parameters is missing")
+        if wrong := first_misfit(stored.tree, target, "the configuration in config.json"):
+            raise InputError(f"{path}: {wrong}; the two belong to different models")
+        return read_arrays(path, target)
 
     return read_with_orbax(read, f"{path}:", MEND)
 

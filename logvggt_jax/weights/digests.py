@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental import multihost_utils
 
 from logvggt_jax.errors import InputError
 
@@ -18,7 +19,8 @@ _SIZE = 16  # bytes
 def digests(tree: Any) -> dict[str, str]:
     """BLAKE2b of dtype, shape and bytes of every leaf of a pytree, under its path (`encoder/norm/scale`).
 
-    Leaves are arrays, Python numbers or typed random keys; arrays of several processes have to be replicated.
+    Leaves are arrays, Python numbers or typed random keys. Where several processes hold parts of an array, all of them
+    have to ask at the same point (`whole_array`).
     """
     return {name: _digest(leaf) for name, leaf in named_leaves(tree)}
 
@@ -67,10 +69,17 @@ def named_leaves(tree: Any) -> Iterator[tuple[str, Any]]:
         yield jax.tree_util.keystr(path, simple=True, separator="/"), leaf
 
 
+def whole_array(leaf: Any) -> np.ndarray:
+    """A leaf on this process's host, perhaps without a copy; where several processes hold parts, all have to ask."""
+    if isinstance(leaf, jax.Array) and not (leaf.is_fully_addressable or leaf.is_fully_replicated):
+        return np.asarray(multihost_utils.process_allgather(leaf, tiled=True))
+    return np.asarray(leaf)
+
+
 def _digest(leaf: Any) -> str:
     if isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
         leaf = jax.random.key_data(leaf)
-    array = np.asarray(leaf)
+    array = whole_array(leaf)
     digest = hashlib.blake2b(f"{array.dtype.name}{array.shape}".encode(), digest_size=_SIZE)
     digest.update(array.tobytes())
     return digest.hexdigest()

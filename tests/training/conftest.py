@@ -47,8 +47,8 @@ def pixel_model(small_config: ModelConfig) -> PixelModel:
     return PixelModel(small_config)
 
 
-@pytest.fixture(scope="session")
-def pixel_params() -> dict[str, Any]:
+def pixel_parameters() -> dict[str, Any]:
+    """Parameters of `PixelModel`."""
     generator = np.random.default_rng(1)
 
     def normal(*shape: int) -> np.ndarray:
@@ -60,6 +60,19 @@ def pixel_params() -> dict[str, Any]:
         "camera_head": {"kernel": normal(3, 9), "bias": pose},
         "depth_head": {"kernel": normal(3, 2), "bias": normal(2)},
     }
+
+
+def use_pixel_model(loop: Any) -> None:
+    """Gives a process's `training.loop` the model that compiles at once, whatever its settings say."""
+    params = pixel_parameters()
+    loop.LogVGGT = PixelModel
+    loop.initial_parameters = lambda *_, **__: jax.tree.map(jnp.array, params)
+    loop.abstract_parameters = lambda _: jax.eval_shape(lambda: params)
+
+
+@pytest.fixture(scope="session")
+def pixel_params() -> dict[str, Any]:
+    return pixel_parameters()
 
 
 @pytest.fixture(scope="session")

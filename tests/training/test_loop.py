@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import re
 import shutil
 import signal
 from collections.abc import Callable
@@ -15,11 +16,14 @@ import pytest
 
 from logvggt_jax.errors import InputError
 from logvggt_jax.interruption import StopRequest
-from logvggt_jax.training import loop
-from logvggt_jax.training.checkpoints import Position, RunCheckpoints
+from logvggt_jax.training import device_batches, loop
+from logvggt_jax.training.checkpoint_files import Position
+from logvggt_jax.training.checkpoints import RunCheckpoints
 from logvggt_jax.training.config import SourceConfig, TrainConfig, ValidationConfig
+from logvggt_jax.training.device_batches import DeviceBatches
 from logvggt_jax.training.loop import NonFiniteTraining, train
 from logvggt_jax.training.metrics_log import MetricsLog, read_metrics
+from logvggt_jax.training.profile import ProfiledSteps
 from logvggt_jax.training.sharding import data_mesh
 from logvggt_jax.training.state import TrainState
 from logvggt_jax.weights.checkpoints import digests, load_model, read_provenance
@@ -95,6 +99,22 @@ def test_killed_run_goes_on_to_the_same_numbers(
     assert [entry["step"] for entry in _numbers(tmp_path)] == [1, 2, 3, 4, 5, 6]
 
 
+def test_a_killed_run_on_rooms_drawn_on_the_device_goes_on_to_the_same_numbers(
+    run_config: TrainConfig, straight: tuple[TrainState, Path], tmp_path: Path
+) -> None:
+    (rooms,) = run_config.data.sources
+    drawn = dataclasses.replace(rooms, options=(*rooms.options, ("renderer", "device")))
+    config = dataclasses.replace(run_config, data=dataclasses.replace(run_config.data, sources=(drawn,)))
+    whole = train(config, tmp_path / "whole", mesh=data_mesh(2))
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyError, match="crash"):
+        _at_step(patch, 5, _crash)
+        train(config, tmp_path / "killed", mesh=data_mesh(2))
+    _same(train(config, tmp_path / "killed", mesh=data_mesh(2)), whole)
+    assert _numbers(tmp_path / "killed") == _numbers(tmp_path / "whole")
+    # Pictures are equal to a grey level, and so are runs on them.
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=5e-3), whole.params, straight[0].params)
+
+
 def test_sigterm_saves_ends_cleanly_and_can_be_resumed(
     run_config: TrainConfig, straight: tuple[TrainState, Path], tmp_path: Path
 ) -> None:
@@ -104,7 +124,7 @@ def test_sigterm_saves_ends_cleanly_and_can_be_resumed(
         stopped = train(run_config, tmp_path, mesh=data_mesh(2))
     assert 1 <= int(stopped.step) <= 2 and signal.getsignal(signal.SIGTERM) == before
     with RunCheckpoints(tmp_path, run_config) as checkpoints:
-        assert checkpoints.steps == [int(stopped.step)]
+        assert checkpoints.steps == [0, int(stopped.step)]
     _same(train(run_config, tmp_path, mesh=data_mesh(2)), straight[0])
 
 
@@ -152,16 +172,15 @@ def test_finished_run_is_left_alone(run_config: TrainConfig, straight: tuple[Tra
 
 
 @pytest.mark.usefixtures("abandoned_reads")
-def test_damaged_checkpoint_is_named_with_the_way_out(
+def test_run_whose_newest_checkpoint_is_damaged_ends_the_same(
     run_config: TrainConfig, straight: tuple[TrainState, Path], finished: Path
 ) -> None:
     files = [path for path in (finished / "checkpoints" / "6" / "params").rglob("*") if path.is_file()]
     largest = max(files, key=lambda path: path.stat().st_size)
     largest.write_bytes(largest.read_bytes()[: largest.stat().st_size // 2])
-    with pytest.raises(ValueError, match=r"step 6 in .*checkpoints/6.*--resume_step \(there are \[4\]\)") as error:
-        train(run_config, finished, mesh=data_mesh(2))
-    assert "\n" not in str(error.value)
-    _same(train(run_config, finished, mesh=data_mesh(2), resume_step=4), straight[0])
+    _same(train(run_config, finished, mesh=data_mesh(2)), straight[0])
+    assert _numbers(finished) == _numbers(straight[1])
+    assert (finished / "checkpoints" / "6.aside").is_dir()
 
 
 def test_changed_leaf_is_refused_by_its_digest(
@@ -171,9 +190,10 @@ def test_changed_leaf_is_refused_by_its_digest(
     true = digests(state.params)
     with RunCheckpoints(tmp_path, run_config) as checkpoints, pytest.MonkeyPatch.context() as patch:
         # What Orbax stores differs from what was digested, as after a flipped byte.
-        patch.setattr("logvggt_jax.training.checkpoints.digests", lambda tree: true)
+        patch.setattr("logvggt_jax.training.checkpoint_files.digests", lambda tree: true)
         wrong = {**state.params, "camera_head": jax.tree.map(lambda x: x + 1, state.params["camera_head"])}
         checkpoints.save(state._replace(params=wrong), Position(1, {}))
+        checkpoints.wait()
         with pytest.raises(ValueError, match=r"step 6 .*leaf camera_head/bias differs from its digest"):
             checkpoints.restore(state)
 
@@ -196,6 +216,102 @@ def test_endless_non_finite_updates_stop_the_run(
     monkeypatch.setattr(loop, "initial_parameters", lambda *_, **__: jax.tree.map(jnp.array, broken))
     with pytest.raises(NonFiniteTraining, match="step 2: 2 updates in a row had a non-finite loss or gradient"):
         train(run_config, tmp_path, mesh=data_mesh(1))
+
+
+def test_a_run_goes_on_past_the_clips_that_ended_it(
+    run_config: TrainConfig,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    pixel_model: Any,
+) -> None:
+    """Two batches in a row without a number in them end the run; the same command does not meet them again."""
+    config = dataclasses.replace(run_config, stages=run_config.stages[:1])
+    put = device_batches.put_batch
+    drawn: list[str] = []
+
+    def poisoned(batch: Any, mesh: Any) -> Any:
+        drawn.append(batch["images"].tobytes().hex())
+        white = {"images": np.full_like(batch["images"], 255)} if len(drawn) in (2, 3) else {}
+        return put({**batch, **white}, mesh)
+
+    class NoNumberOfWhite(type(pixel_model)):  # type: ignore[misc]
+        def apply(self, variables: Any, images: Any, *arguments: Any, **options: Any) -> Any:
+            found = super().apply(variables, images, *arguments, **options)
+            return found.replace(depth=jnp.where(images.min() == 255, jnp.nan, found.depth))
+
+    monkeypatch.setattr(device_batches, "put_batch", poisoned)
+    monkeypatch.setattr(loop, "LogVGGT", NoNumberOfWhite)
+    with pytest.raises(NonFiniteTraining, match=r"step 3: 2 updates in a row .* the same command goes on past them"):
+        train(config, tmp_path, mesh=data_mesh(1))
+    named = [record.getMessage() for record in caplog.records if "clips: rooms, " in record.getMessage()]
+    assert [message.split(":")[0] for message in named] == ["step 2", "step 3"]
+    before = drawn[:3]
+    state = train(config, tmp_path, mesh=data_mesh(1))
+    assert int(state.step) == 4 and int(state.skipped) == 2
+    assert not set(before) & set(drawn[4:])
+
+
+def test_data_that_fail_leave_a_checkpoint(
+    run_config: TrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    draw = DeviceBatches.__next__
+    calls: list[int] = []
+
+    def fail(batches: DeviceBatches) -> Any:
+        calls.append(1)
+        if len(calls) == 3:
+            raise InputError("the disk is gone")
+        return draw(batches)
+
+    monkeypatch.setattr(DeviceBatches, "__next__", fail)
+    with pytest.raises(InputError, match="the disk is gone"):
+        train(run_config, tmp_path, mesh=data_mesh(1))
+    assert RunCheckpoints(tmp_path, run_config).steps[-1] == 2
+
+
+def test_a_line_shows_the_mean_of_its_interval(
+    run_config: TrainConfig, straight: tuple[TrainState, Path], tmp_path: Path
+) -> None:
+    train(dataclasses.replace(run_config, log_every=50), tmp_path, mesh=data_mesh(2))
+    each = {entry["step"]: entry for entry in _numbers(straight[1])}
+    lines = _numbers(tmp_path)
+    # The first step, saves, and the ends of the stages.
+    assert [line["step"] for line in lines] == [1, 3, 4, 6]
+    for name in ("loss/total", "train/abs_rel", "gradient_norm/depth_head"):
+        assert lines[1][name] == pytest.approx((each[2][name] + each[3][name]) / 2)
+    assert lines[1]["learning_rate"] == each[3]["learning_rate"]
+
+
+def test_goodput_counts_earlier_sessions(
+    run_config: TrainConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    train(dataclasses.replace(run_config, max_minutes=1e-9), tmp_path, mesh=data_mesh(1))
+    first = read_metrics(tmp_path / "times.jsonl")
+    train(run_config, tmp_path, mesh=data_mesh(1))
+    entries = read_metrics(tmp_path / "times.jsonl")
+    assert entries[: len(first)] == first and [entry["step"] for entry in first] == [0, 1]
+    productive = [entry["productive_seconds"] for entry in entries]
+    assert productive == sorted(productive) and productive[0] == 0 < productive[1] < productive[-1]
+    assert 0 <= entries[1]["data_share"] <= 1 and entries[-1]["run_seconds_left"] == 0
+    assert re.search(r"goodput \d+%: \S+ of training in \S+ since the first start", capsys.readouterr().out)
+
+
+def test_a_trace_of_some_steps_is_written(run_config: TrainConfig, tmp_path: Path) -> None:
+    train(run_config, tmp_path, mesh=data_mesh(1), profile=ProfiledSteps.parse("3:4"))
+    assert list((tmp_path / "profile").rglob("*.xplane.pb"))
+    with pytest.raises(InputError, match=r"--profile=4:3: expected the first and the last step, such as 20:25"):
+        ProfiledSteps.parse("4:3")
+
+
+def test_the_data_are_looked_for_before_the_weights_are_read(
+    run_config: TrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(loop, "initial_parameters", lambda *_, **__: pytest.fail("the weights were read"))
+    source = SourceConfig(name="scannet", root=str(tmp_path / "none"), split="train")
+    data = dataclasses.replace(run_config.data, sources=(source,))
+    with pytest.raises(InputError, match="scannet"):
+        train(dataclasses.replace(run_config, data=data), tmp_path / "run", mesh=data_mesh(1))
 
 
 @pytest.mark.parametrize("reason", ["RESOURCE_EXHAUSTED: Out of memory while trying to allocate", "INTERNAL: broken"])
@@ -228,12 +344,73 @@ def test_validation_reports_held_out_clips(run_config: TrainConfig, tmp_path: Pa
     validation = ValidationConfig(source=source, every=4, num_clips=4, clip_length=3, stride=2, size=(28, 42))
     train(dataclasses.replace(run_config, validation=validation), tmp_path, mesh=data_mesh(2))
     entries = [entry for entry in _numbers(tmp_path) if "validation/abs_rel" in entry]
-    assert [entry["step"] for entry in entries] == [4, 6]
+    # Once before the first step: what cannot be judged says so at once.
+    assert [entry["step"] for entry in entries] == [0, 4, 6]
     for entry in entries:
         assert 0 < entry["validation/abs_rel"] < 2
         assert entry["validation/rotation_over_identity"] == pytest.approx(
             entry["validation/rotation"] / entry["validation/identity_rotation"]
         )
+
+
+def _validated(config: TrainConfig) -> TrainConfig:
+    source = SourceConfig(name="rooms", root=None, split="val", options=config.data.sources[0].options)
+    validation = ValidationConfig(source=source, every=3, num_clips=2, clip_length=3, stride=2, size=(28, 42))
+    return dataclasses.replace(config, validation=validation)
+
+
+def test_a_validation_that_fails_has_its_checkpoint_and_is_made_up_for(
+    run_config: TrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = _validated(run_config)
+    train(config, tmp_path / "straight", mesh=data_mesh(2))
+    judged = loop.Validation.__call__
+
+    def fail(*given: Any) -> Any:
+        if int(RunCheckpoints(tmp_path / "run", config).steps[-1]) == 3:
+            raise RuntimeError("out of memory")
+        return judged(*given)
+
+    with monkeypatch.context() as patch, pytest.raises(RuntimeError, match="out of memory"):
+        patch.setattr(loop.RunCheckpoints, "save", _saved_at_once(loop.RunCheckpoints.save))
+        patch.setattr(loop.Validation, "__call__", fail)
+        train(config, tmp_path / "run", mesh=data_mesh(2))
+    with RunCheckpoints(tmp_path / "run", config) as checkpoints:
+        assert checkpoints.steps == [0, 3]
+    train(config, tmp_path / "run", mesh=data_mesh(2))
+    assert _numbers(tmp_path / "run") == _numbers(tmp_path / "straight")
+
+
+def _saved_at_once(save: Callable[..., None]) -> Callable[..., None]:
+    def saved(checkpoints: RunCheckpoints, *given: Any, **options: Any) -> None:
+        save(checkpoints, *given, **options)
+        checkpoints.wait()
+
+    return saved
+
+
+@pytest.mark.parametrize("failing", ["save", "validation"])
+def test_a_save_or_a_validation_that_fails_says_so_before_the_first_step(
+    failing: str, run_config: TrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any) -> None:
+        raise OSError("cannot be done")
+
+    if failing == "save":
+        monkeypatch.setattr("logvggt_jax.training.checkpoints.write_checkpoint", fail)
+    else:
+        monkeypatch.setattr(loop.Validation, "__call__", fail)
+    monkeypatch.setattr(loop._Run, "_program", lambda *_: pytest.fail("no step is to be compiled"))
+    with pytest.raises(OSError, match="cannot be done"):
+        train(_validated(run_config), tmp_path, mesh=data_mesh(1))
+
+
+def test_settings_may_change_until_a_step_is_done(run_config: TrainConfig, tmp_path: Path) -> None:
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyError, match="crash"):
+        patch.setattr(loop._Run, "_program", lambda *_: _crash())
+        train(run_config, tmp_path, mesh=data_mesh(1))
+    other = dataclasses.replace(run_config, loss=dataclasses.replace(run_config.loss, alpha=0.5))
+    assert int(train(other, tmp_path, mesh=data_mesh(1)).step) == 6
 
 
 def test_a_run_goes_on_when_its_initial_weights_are_gone(

@@ -1,9 +1,15 @@
-"""Position and settings of a run's checkpoints have a digest, and models of others are never replaced."""
+"""A run's checkpoints: damage is noticed and passed over, saves are whole or not there, nobody's files are lost."""
 
 from __future__ import annotations
 
+import dataclasses
+import errno
 import json
+import os
 import shutil
+import subprocess
+import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,7 +19,10 @@ import numpy as np
 import pytest
 
 from logvggt_jax.errors import InputError, OutputExists
-from logvggt_jax.training.checkpoints import Position, RunCheckpoints
+from logvggt_jax.training import checkpoint_files
+from logvggt_jax.training import checkpoints as module
+from logvggt_jax.training.checkpoint_files import Position
+from logvggt_jax.training.checkpoints import RunCheckpoints
 from logvggt_jax.training.config import OptimizerConfig, TrainConfig
 from logvggt_jax.training.optimizer import make_optimizer
 from logvggt_jax.training.state import TrainState, initial_state
@@ -31,18 +40,36 @@ def state(optimizer_config: OptimizerConfig) -> TrainState:
 
 
 @pytest.fixture
-def saved(run_config: TrainConfig, state: TrainState, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A run's folder with one checkpoint, of step 0; its model folder does not matter here."""
-    monkeypatch.setattr("logvggt_jax.training.checkpoints.save_model", lambda *_: None)
-    monkeypatch.setattr("logvggt_jax.training.checkpoints.unstack_layers", lambda tree, *_: tree)
-    with RunCheckpoints(tmp_path / "run", run_config) as checkpoints:
-        checkpoints.save(state, POSITION)
+def alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The model folder does not matter here, and the parameters are no model's."""
+    monkeypatch.setattr(module, "save_model", lambda *_: None)
+    monkeypatch.setattr(module, "unstack_layers", lambda tree, *_: tree)
+
+
+def _at(state: TrainState, step: int) -> TrainState:
+    """Another state for each step."""
+    return jax.tree.map(lambda x: x + step if x.dtype == np.float32 else x, state)._replace(step=state.step + step)
+
+
+def _save(folder: Path, config: TrainConfig, *states: TrainState) -> None:
+    with RunCheckpoints(folder, config) as checkpoints:
+        for state in states:
+            checkpoints.save(state, POSITION)
+        checkpoints.wait()
+
+
+@pytest.fixture
+def saved(run_config: TrainConfig, state: TrainState, tmp_path: Path, alone: None) -> Path:
+    """A run's folder with one checkpoint, of step 0."""
+    _save(tmp_path / "run", run_config, state)
     return tmp_path / "run"
 
 
-def _restore(folder: Path, config: TrainConfig, state: TrainState) -> tuple[TrainState, Position]:
+def _restore(
+    folder: Path, config: TrainConfig, state: TrainState, step: int | None = None
+) -> tuple[TrainState, Position]:
     with RunCheckpoints(folder, config) as checkpoints:
-        return checkpoints.restore(state)
+        return checkpoints.restore(state, step=step)
 
 
 def _edit(file: Path, change: Callable[[dict[str, Any]], Any]) -> None:
@@ -111,3 +138,189 @@ def test_a_model_that_the_run_did_not_write_is_never_replaced(
     save_model(run / "model", small_config, small_variables["params"], Provenance("windows", 42, None, source))
     with RunCheckpoints(run, run_config) as checkpoints:
         assert checkpoints.steps == []
+
+
+def _damage(checkpoint: Path) -> None:
+    largest = max(
+        (file for file in (checkpoint / "params").rglob("*") if file.is_file()), key=lambda f: f.stat().st_size
+    )
+    largest.write_bytes(largest.read_bytes()[: largest.stat().st_size // 2])
+
+
+def _same(a: Any, b: Any) -> None:
+    jax.tree.map(np.testing.assert_array_equal, jax.device_get(a), jax.device_get(b))
+
+
+@pytest.mark.usefixtures("abandoned_reads")
+@pytest.mark.parametrize("damage", ["values", "description", "nothing left"])
+def test_a_damaged_newest_checkpoint_is_named_and_the_one_before_is_taken(
+    damage: str, run_config: TrainConfig, state: TrainState, saved: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    _save(saved, run_config, _at(state, 3), _at(state, 6))
+    newest = saved / "checkpoints" / "6"
+    if damage == "values":
+        _damage(newest)
+    elif damage == "description":
+        (newest / "meta" / "metadata").write_text("{")
+    else:
+        shutil.rmtree(newest)
+        newest.mkdir()
+    before = sorted(str(file.relative_to(newest)) for file in newest.rglob("*"))
+    _same(_restore(saved, run_config, state)[0], _at(state, 3))
+    assert "checkpoint of step 6 in" in caplog.text and "going on from the checkpoint before it" in caplog.text
+    # It stays for whoever wants to look at it, and is no checkpoint any more.
+    aside = saved / "checkpoints" / "6.aside"
+    assert sorted(str(file.relative_to(aside)) for file in aside.rglob("*")) == before
+    with RunCheckpoints(saved, run_config) as checkpoints:
+        assert checkpoints.steps == [3]
+
+
+@pytest.mark.usefixtures("abandoned_reads")
+def test_only_damaged_checkpoints_are_an_error_and_stay(
+    run_config: TrainConfig, state: TrainState, saved: Path
+) -> None:
+    _save(saved, run_config, _at(state, 3))
+    for step in ("0", "3"):
+        _damage(saved / "checkpoints" / step)
+    with pytest.raises(InputError, match=r"checkpoint of step 0 .*start a new --workdir"):
+        _restore(saved, run_config, state)
+    with pytest.raises(InputError, match=r"checkpoint of step 3 .*--resume_step \(there are \[0\]\)"):
+        _restore(saved, run_config, state, step=3)
+    with RunCheckpoints(saved, run_config) as checkpoints:
+        assert checkpoints.steps == [0, 3]
+
+
+def test_a_step_is_gone_back_to_once_and_later_checkpoints_are_kept(
+    run_config: TrainConfig, state: TrainState, saved: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    _save(saved, run_config, _at(state, 3))
+    assert int(_restore(saved, run_config, state, step=0)[0].step) == 0
+    assert (saved / "checkpoints" / "3.aside" / "params").is_dir()
+    _save(saved, run_config, _at(state, 3))
+    # The same command is started again, perhaps by a machine.
+    _same(_restore(saved, run_config, state, step=0)[0], _at(state, 3))
+    assert "--resume_step=0 was honoured before" in caplog.text
+    (saved / "checkpoints" / "resumed.json").unlink()
+    assert int(_restore(saved, run_config, state, step=0)[0].step) == 0
+    assert (saved / "checkpoints" / "3.aside2").is_dir()
+
+
+def test_a_save_does_not_keep_the_next_step_waiting_nor_sees_what_it_does(
+    run_config: TrainConfig, state: TrainState, saved: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    go_on, write = threading.Event(), checkpoint_files.write_arrays
+
+    def slow(*given: Any) -> None:
+        assert go_on.wait(60)
+        write(*given)
+
+    monkeypatch.setattr(checkpoint_files, "write_arrays", slow)
+    expected = jax.device_get(_at(state, 3))
+    given = jax.device_put(_at(state, 3), jax.devices()[0])
+    with RunCheckpoints(saved, run_config) as checkpoints:
+        checkpoints.save(given, POSITION)
+        jax.jit(lambda state: jax.tree.map(lambda x: x * 0, state), donate_argnums=0)(given)
+        assert checkpoints.steps == [0]
+        go_on.set()
+        checkpoints.wait()
+        assert checkpoints.steps == [0, 3]
+        _same(checkpoints.restore(state)[0], expected)
+
+
+class _Killed(BaseException):
+    """Not an error that anything catches."""
+
+
+# What a save does to the disk, in its order.
+MOMENTS = ("write_arrays", "_to_disk", "json", "move")
+
+
+@pytest.mark.parametrize("full", [True, False])
+@pytest.mark.parametrize("moment", MOMENTS)
+def test_a_save_that_does_not_end_leaves_no_checkpoint(
+    moment: str, full: bool, run_config: TrainConfig, state: TrainState, saved: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any, **__: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)) if full else _Killed("9")
+
+    with monkeypatch.context() as patch:
+        if not full:  # Nobody tidies up after a process that was killed.
+            patch.setattr(shutil, "rmtree", lambda *_, **__: None)
+        if moment == "json":
+            patch.setattr(Path, "write_text", fail)
+        elif moment == "move":
+            patch.setattr("logvggt_jax.files._move", fail)
+        else:
+            patch.setattr(checkpoint_files, moment, fail)
+        with RunCheckpoints(saved, run_config) as checkpoints:
+            checkpoints.save(_at(state, 3), POSITION)
+            with pytest.raises(InputError if full else _Killed, match=r"checkpoints/3.*No space left" if full else "9"):
+                checkpoints.wait()
+            assert checkpoints.steps == [0]
+    if full:
+        assert [entry.name for entry in (saved / "checkpoints").iterdir()] == ["0"]
+    _same(_restore(saved, run_config, state)[0], state)
+
+
+def test_a_failed_save_is_told_by_the_next_step(
+    run_config: TrainConfig, state: TrainState, saved: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(checkpoint_files, "write_arrays", fail)
+    with RunCheckpoints(saved, run_config) as checkpoints:
+        checkpoints.check()
+        checkpoints.save(_at(state, 3), POSITION)
+        checkpoints._writer.submit(lambda: None).result()
+        with pytest.raises(InputError, match="No space left"):
+            checkpoints.check()
+
+
+def test_what_killed_saves_left_goes_when_the_run_comes_back(
+    run_config: TrainConfig, saved: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "check_destination", lambda _: None)
+    left = ["model.7-ab.partial", ".model.7-ab.old", "checkpoints/3.7-ab.partial", "checkpoints/.0.old"]
+    for name in left:
+        (saved / name / "params").mkdir(parents=True)
+    (saved / "model" / "params").mkdir(parents=True)
+    (saved / "notes").mkdir()
+    with RunCheckpoints(saved, run_config) as checkpoints:
+        assert checkpoints.steps == [0]
+        assert not any((saved / name).exists() for name in left)
+        assert (saved / "model" / "params").is_dir() and (saved / "notes").is_dir()
+    # Killed between two renamings: the old model is the only one.
+    (saved / "model").rename(saved / ".model.7-ab.old")
+    with RunCheckpoints(saved, run_config):
+        assert (saved / "model" / "params").is_dir() and not (saved / ".model.7-ab.old").exists()
+
+
+def test_a_folder_that_another_run_uses_is_refused(run_config: TrainConfig, saved: Path) -> None:
+    hold = (
+        "import sys; from pathlib import Path; from logvggt_jax.training.work_folder import FolderLock\n"
+        "lock = FolderLock(Path(sys.argv[1])); print('held', flush=True); sys.stdin.read()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", hold, str(saved)], text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as other:
+        assert other.stdout is not None and other.stdout.readline() == "held\n"
+        (saved / "model.1-a.partial").mkdir()
+        with pytest.raises(InputError, match=rf"another run is using this folder \(process {other.pid} on "):
+            RunCheckpoints(saved, run_config).__enter__()
+        assert (saved / "model.1-a.partial").is_dir(), "it may be writing that"
+        other.kill()
+    with RunCheckpoints(saved, run_config):
+        assert not (saved / "model.1-a.partial").exists()
+
+
+def test_the_newest_are_kept_and_one_can_give_its_place(
+    run_config: TrainConfig, state: TrainState, saved: Path
+) -> None:
+    config = dataclasses.replace(run_config, keep_checkpoints=2)
+    _save(saved, config, _at(state, 3), _at(state, 6))
+    with RunCheckpoints(saved, config) as checkpoints:
+        assert checkpoints.steps == [3, 6]
+        checkpoints.save(_at(state, 7), POSITION, in_place_of=6)
+        checkpoints.wait()
+        assert checkpoints.steps == [3, 7]

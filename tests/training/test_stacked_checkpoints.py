@@ -9,7 +9,8 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from logvggt_jax.model.parameters import stack_layers
-from logvggt_jax.training.checkpoints import Position, RunCheckpoints
+from logvggt_jax.training.checkpoint_files import Position
+from logvggt_jax.training.checkpoints import RunCheckpoints
 from logvggt_jax.training.config import OptimizerConfig, TrainConfig
 from logvggt_jax.training.optimizer import make_optimizer
 from logvggt_jax.training.state import TrainState, initial_state
@@ -40,8 +41,9 @@ def test_a_checkpoint_layer_by_layer_is_taken_up_as_stacks(
         "digests": {"params": digests(state.params), "state": digests(rest)},
         "libraries": {},
     }
-    with RunCheckpoints(tmp_path, run_config) as checkpoints:
-        checkpoints._manager.save(
+    # They were written by Orbax's manager, with files of its own beside ours.
+    with ocp.CheckpointManager(tmp_path / "checkpoints") as manager:
+        manager.save(
             7,
             args=ocp.args.Composite(
                 params=ocp.args.StandardSave(state.params),

@@ -36,7 +36,7 @@ def test_a_real_model_is_trained_validated_and_saved(tmp_path: Path) -> None:
     finished = run_train(tmp_path / "run")
     assert finished.returncode == 0, finished.stderr
     assert "step 2/2 stage_2" in finished.stdout and "validation after step 2" in finished.stdout
-    first, second, validation = read_metrics(tmp_path / "run" / "metrics.jsonl")
+    *_, first, second, validation = read_metrics(tmp_path / "run" / "metrics.jsonl")
     assert np.isfinite([first["loss/total"], second["loss/total"], validation["validation/abs_rel"]]).all()
     model, variables = load_model(tmp_path / "run" / "model")
     assert model.config.encoder.depth == 1
@@ -58,3 +58,10 @@ def test_a_fault_of_ours_keeps_its_traceback(tmp_path: Path) -> None:
     )
     assert finished.returncode != 0
     assert "Traceback" in finished.stderr and "ValueError: a bug" in finished.stderr
+
+
+def test_an_argument_that_is_no_flag_is_one_line(tmp_path: Path) -> None:
+    finished = run_train(tmp_path, "configs/h20.py")
+    assert finished.returncode == 1
+    expected = "train.py: unknown argument 'configs/h20.py'; settings are given as --config.NAME=VALUE\n"
+    assert finished.stderr == expected

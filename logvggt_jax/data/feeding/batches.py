@@ -7,24 +7,27 @@ together to batches, so that neither the batches nor what a worker holds in memo
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import cv2
 import grain
 import numpy as np
-from absl import flags
+from absl import flags, logging
 
 from logvggt_jax.config import check_size
-from logvggt_jax.data.dataset import Dataset
+from logvggt_jax.data.dataset import Dataset, DrawnOnDevice
 from logvggt_jax.data.feeding.augmentation import ColourAugmentation
 from logvggt_jax.data.feeding.broken_clips import BrokenClips
-from logvggt_jax.data.feeding.clips import BROKEN, FIELDS, Size
+from logvggt_jax.data.feeding.clips import BROKEN, NAME, Size
 from logvggt_jax.data.feeding.mixture import mixture
 from logvggt_jax.data.feeding.sampling import sampler_for
-from logvggt_jax.errors import InputError
+from logvggt_jax.errors import InputError, one_line
 
 Batch = dict[str, np.ndarray]
+# Workers that are killed are started again so many times, unless batches enough came in between.
+_MOST_RESTARTS = 3
+_RECOVERED = 100
 
 
 class BatchIterator(Iterator[Batch]):
@@ -34,6 +37,8 @@ class BatchIterator(Iterator[Batch]):
 
     Attributes:
       broken: clips of this process that were replaced.
+      draw: for data drawn on the device, the JAX function that makes a batch of clips from what `next` returns.
+      names: of the last batch's clips: data set, sequence and frames.
     """
 
     def __init__(
@@ -47,28 +52,64 @@ class BatchIterator(Iterator[Batch]):
         process_count: int,
         worker_count: int,
         num_threads: int,
+        draw: Callable[[Any], Any] | None = None,
     ) -> None:
-        self.broken = broken
+        self.broken, self.draw = broken, draw
         self._examples, self._identity = examples, dict(identity)
         self._batch_size, self._worker_count, self._num_threads = batch_size, worker_count, num_threads
         self._process_index, self._process_count = process_index, process_count
         self._consumed = 0
+        self._restarts = self._since_restart = 0
+        self.names: list[str] = []
         self._clips: Iterator[dict[str, Any]] | None = None
 
     def __next__(self) -> Batch:
         """The next batch: this process's share of `batch_size` examples."""
-        if self._clips is None:
-            self._clips = self._open()
-        try:
-            clips = [next(self._clips) for _ in range(self._batch_size // self._process_count)]
-        except BaseException:
-            # What was read of this batch is lost with the stream; the next call starts at its first clip.
-            self.close()
-            raise
+        clips = self._read()
         self._consumed += self._batch_size
         messages = [message for clip in clips for message in clip.get(BROKEN, ())]
         self.broken.add(messages, clips=len(clips))
-        return {name: np.stack([np.asarray(clip[name]) for clip in clips]) for name in FIELDS}
+        self.names = [clip[NAME] for clip in clips]
+        fields = clips[0].keys() - {BROKEN, NAME}
+        return {name: np.stack([np.asarray(clip[name]) for clip in clips]) for name in sorted(fields)}
+
+    def _read(self) -> list[dict[str, Any]]:
+        """This process's clips of the next batch; workers that are killed are started again a few times."""
+        while True:
+            if self._clips is None:
+                self._clips = self._open()
+            try:
+                clips = [next(self._clips) for _ in range(self._batch_size // self._process_count)]
+            except BaseException as error:
+                # What was read of this batch is lost with the stream; the next call starts at its first clip.
+                self.close()
+                if not _is_killed_worker(error):
+                    raise
+                self._restart(error)
+                continue
+            self._since_restart += 1
+            if self._since_restart >= _RECOVERED:
+                self._restarts = 0
+            return clips
+
+    def _restart(self, error: BaseException) -> None:
+        self._restarts, self._since_restart = self._restarts + 1, 0
+        mend = (
+            "the system kills what takes too much memory, which fewer data.worker_count need less of; a container "
+            "needs /dev/shm for three clips a worker"
+        )
+        if self._restarts > _MOST_RESTARTS:
+            raise InputError(
+                f"reading workers were killed {self._restarts} times with less than {_RECOVERED} batches in between "
+                f"({one_line(error)}): {mend}"
+            ) from error
+        logging.warning(
+            "a reading worker was killed (%s), all are started again (%d of %d times): %s",
+            one_line(error),
+            self._restarts,
+            _MOST_RESTARTS,
+            mend,
+        )
 
     def __enter__(self) -> BatchIterator:
         return self
@@ -184,7 +225,8 @@ def training_batches(
     Returns:
       Iterator of {"images" uint8 [B, T, H, W, 3], "depth" float32 [B, T, H, W] z-depth (0 = invalid),
       "intrinsics" float32 [B, T, 3, 3], "extrinsics" float32 [B, T, 4, 4] world-to-camera}, numpy, with
-      B = batch_size / process_count.
+      B = batch_size / process_count. Of a data set drawn on the device (`DrawnOnDevice`), which must be the only
+      one, it gives descriptions, and has the function `draw` that makes such a batch of them.
 
     Raises:
       InputError: an argument is out of range, or a data set has no sequence long enough. While iterating:
@@ -212,6 +254,7 @@ def training_batches(
         raise InputError(f"sizes must be different (height, width), at least one, got {sizes}")
     for size in sizes:
         check_size(size, "sizes")
+    draw = _drawing(datasets, sizes, augmentation)
     strides = dict(strides or {})
     if not strides.keys() <= datasets.keys():
         raise InputError(f"strides must be of {', '.join(datasets)}, got those of {', '.join(strides)}")
@@ -240,7 +283,40 @@ def training_batches(
         process_count=process_count,
         worker_count=worker_count,
         num_threads=num_threads,
+        draw=draw,
     )
+
+
+def _drawing(
+    datasets: Mapping[str, Dataset], sizes: Sequence[Size], augmentation: ColourAugmentation | None
+) -> Callable[[Any], Any] | None:
+    """What draws the clips on the device; None where they are read as pictures.
+
+    Raises InputError for what can only be done to pictures on the host.
+    """
+    for name, dataset in datasets.items():
+        if not isinstance(dataset, DrawnOnDevice):
+            continue
+        where = f"{name} is drawn on the device (renderer='device')"
+        if len(datasets) > 1:
+            raise InputError(f"{where} and cannot be mixed with {', '.join(datasets.keys() - {name})}: use 'host'")
+        if augmentation is not None:
+            raise InputError(
+                f"{where}, where data.augmentation does not reach its pictures: use 'host' or set it to None"
+            )
+        drawn = dataset.image_size(dataset.sequences[0])
+        if any(size != drawn for size in sizes):
+            raise InputError(
+                f"{where} at {drawn[0]} x {drawn[1]}, and the stage asks for sizes {[tuple(size) for size in sizes]}: "
+                "give height and width of the set the size of the stage, or use 'host'"
+            )
+        return dataset.draw
+    return None
+
+
+def _is_killed_worker(error: BaseException) -> bool:
+    # Grain has no error of its own for this.
+    return isinstance(error, RuntimeError) and "Worker process was terminated unexpectedly" in str(error)
 
 
 def _start_worker(index: int, count: int) -> None:

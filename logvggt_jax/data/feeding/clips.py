@@ -6,7 +6,7 @@ from typing import Any
 import grain
 import numpy as np
 
-from logvggt_jax.data.dataset import Dataset, check_frames
+from logvggt_jax.data.dataset import Dataset, DrawnOnDevice, check_frames
 from logvggt_jax.data.feeding.augmentation import ColourAugmentation
 from logvggt_jax.data.feeding.broken_clips import describe
 from logvggt_jax.data.feeding.sampling import Sampler, example_rng
@@ -15,7 +15,8 @@ from logvggt_jax.errors import InputError
 
 Size = tuple[int, int]
 
-FIELDS = ("images", "depth", "intrinsics", "extrinsics")
+FIELDS = ("images", "depth", "intrinsics", "extrinsics")  # of clips that are not drawn on the device
+NAME = "name"  # field of a clip: its data set, sequence and frames
 BROKEN = "broken"  # field of a clip that took the place of a broken one: what was wrong with that
 # So many clips in a row are broken only if nearly all of those sequences are.
 _MOST_REPLACEMENTS = 16
@@ -38,13 +39,15 @@ class ClipReader:
         self.name, self.dataset, self.sampler, self.size, self.seed = name, dataset, sampler, size, seed
         self.augmentation, self.min_valid_depth = augmentation, min_valid_depth
 
-    def __call__(self, index: int, sequence: str) -> dict[str, np.ndarray]:
+    def __call__(self, index: int, sequence: str) -> dict[str, Any]:
         rng = example_rng(self.seed, index)
         indices = [int(i) for i in self.sampler.draw(self.dataset, sequence, rng)]
+        where = f"{self.name}, {sequence}, frames {' '.join(map(str, indices))}"
+        if isinstance(self.dataset, DrawnOnDevice):
+            return {**self.dataset.describe(sequence, indices), NAME: where}
         # One frame at a time: a clip of large pictures would take a gigabyte.
         frames = (self.dataset.read(sequence, [index]) for index in indices)
         clip = fit_each(frames, len(indices), self.size)
-        where = f"{self.name}, {sequence}, frames {' '.join(map(str, indices))}"
         check_frames(clip, where)
         valid = np.count_nonzero(clip.depth > 0) / clip.depth.size
         if valid < self.min_valid_depth:
@@ -53,7 +56,7 @@ class ClipReader:
             )
         if self.augmentation is not None:
             self.augmentation(clip.images, rng)
-        return {name: getattr(clip, name) for name in FIELDS}
+        return {**{name: getattr(clip, name) for name in FIELDS}, NAME: where}
 
 
 class ReplaceBroken:

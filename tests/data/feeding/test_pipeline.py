@@ -1,6 +1,7 @@
 """Batches: shapes, coverage, shards, exact resume, and bad data named or replaced."""
 
 import json
+import multiprocessing
 from itertools import islice
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from absl import logging
 
 from logvggt_jax.data.errors import MissingFiles
+from logvggt_jax.data.feeding import batches as feeding
 from logvggt_jax.data.feeding.augmentation import ColourAugmentation
 from logvggt_jax.data.feeding.batches import training_batches
 from logvggt_jax.data.feeding.broken_clips import TooManyBrokenClips
@@ -201,6 +203,28 @@ def test_worker_processes_give_the_same_batches_and_resume_with_another_number()
     with batches(worker_count=0) as iterator:
         iterator.set_state(state)
         assert clips(iterator, 3) == expected[12:]
+
+
+def test_workers_that_are_killed_are_started_again_a_few_times(monkeypatch):
+    warnings = []
+    monkeypatch.setattr(logging, "warning", lambda text, *values: warnings.append(text % values))
+
+    def kill_a_worker():
+        next(child for child in multiprocessing.active_children() if "grain" in child.name).kill()
+
+    with batches() as iterator:
+        expected = clips(iterator, 12)
+    with batches(worker_count=2) as iterator:
+        seen = clips(iterator, 1)
+        kill_a_worker()
+        # A few clips were read ahead by the other.
+        seen += clips(iterator, 11)
+        assert seen == expected
+        assert len(warnings) == 1 and "exit code -9" in warnings[0] and "(1 of 3 times)" in warnings[0]
+        monkeypatch.setattr(feeding, "_MOST_RESTARTS", 1)
+        kill_a_worker()
+        with pytest.raises(InputError, match=r"killed 2 times .*exit code -9.*fewer data\.worker_count"):
+            clips(iterator, 12)
 
 
 def test_processes_share_the_global_batch():

@@ -1,0 +1,85 @@
+"""A preflight tries what a run will need, names what fails, and leaves nothing behind."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from logvggt_jax.data.registry import open_dataset
+from logvggt_jax.errors import DiskError, InputError
+from logvggt_jax.training import preflight as module
+from logvggt_jax.training.checkpoints import RunCheckpoints
+from logvggt_jax.training.config import TrainConfig
+from logvggt_jax.training.dry_run import StepCosts
+from logvggt_jax.training.preflight import preflight
+from logvggt_jax.training.sharding import data_mesh
+
+
+@pytest.fixture
+def compiled(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
+    """What is compiled, which takes a minute, is only asked for."""
+    asked: list[tuple[Any, ...]] = []
+
+    def costs(config: TrainConfig, mesh: Any, *shape: Any) -> StepCosts:
+        asked.append(shape)
+        return StepCosts(arguments=2**30, temporaries=2**30, collectives={}, compilation=1.0)
+
+    monkeypatch.setattr(module, "step_costs", costs)
+    return asked
+
+
+def test_everything_is_tried_and_nothing_is_left(
+    run_config: TrainConfig, compiled: list[tuple[Any, ...]], tmp_path: Path
+) -> None:
+    lines: list[str] = []
+    preflight(run_config, tmp_path, data_mesh(2), lines.append)
+    assert [line.split(":")[0] for line in lines] == [
+        "all-reduce", "data sets", "rooms", "checkpoint", "step of first", "step of second", "preflight",
+    ]  # fmt: skip
+    assert "64 MiB over 2 devices" in lines[0]
+    assert "20 clips of 2 frames" in lines[2] and "0 broken" in lines[2]
+    assert lines[-1] == "preflight: all is well"
+    assert compiled == [(1, 2, (28, 42)), (1, 3, (28, 42))]
+    assert not list(tmp_path.iterdir())
+
+
+def test_all_that_fails_is_named_at_the_end(
+    run_config: TrainConfig,
+    compiled: list[tuple[Any, ...]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise DiskError("no space left on device")
+
+    monkeypatch.setattr(RunCheckpoints, "save", full)
+    monkeypatch.setattr(module, "device_bytes", lambda device: 2**30)
+    monkeypatch.setattr(module, "_read_clips", full)
+    lines: list[str] = []
+    with pytest.raises(InputError, match="4 of the tries failed: rooms, checkpoint, step of first, step of second"):
+        preflight(run_config, tmp_path, data_mesh(2), lines.append)
+    assert "checkpoint: FAILED on process 0: no space left on device" in lines
+    assert any("do not fit the memory of a device" in line for line in lines)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_source_with_many_broken_clips_fails(run_config: TrainConfig) -> None:
+    source = run_config.data.sources[0]
+    dataset = open_dataset(source.name, None, source.split, **dict(source.options)).for_training(
+        cache_dir=None, progress=False
+    )
+
+    class Flaky:
+        def __getattr__(self, name: str) -> Any:
+            return getattr(dataset, name)
+
+        def read(self, sequence: str, indices: Any) -> Any:
+            if 1 in indices:
+                raise InputError(f"{sequence}: cannot be opened")
+            return dataset.read(sequence, indices)
+
+    with pytest.raises(InputError, match=r"of 20 clips are broken: .*cannot be opened"):
+        module._read_clips(Flaky(), source, run_config)  # type: ignore[arg-type]
+    tolerant = dataclasses.replace(run_config, data=dataclasses.replace(run_config.data, max_broken=0.9))
+    assert "broken" in module._read_clips(Flaky(), source, tolerant)  # type: ignore[arg-type]
