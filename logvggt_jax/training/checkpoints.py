@@ -24,7 +24,7 @@ from logvggt_jax.weights.checkpoints import (
 )
 from logvggt_jax.weights.digests import digests, json_digest, verify_digests
 from logvggt_jax.weights.folder import is_model_folder
-from logvggt_jax.weights.provenance import Provenance
+from logvggt_jax.weights.provenance import Provenance, TrainingRecord
 
 # How fast, from where and with how many broken clips the data come; the data stream checks that they are the same.
 FREE_DATA_SETTINGS = ("worker_count", "num_threads", "cache_dir", "max_broken")
@@ -79,7 +79,7 @@ class RunCheckpoints:
         if jax.process_index() == 0:
             try:
                 layers = unstack_layers(jax.device_get(params), self.config.model)
-                save_model(self.model_folder, self.config.model, layers, self._provenance())
+                save_model(self.model_folder, self.config.model, layers, self._provenance(step))
             except Exception as error:
                 failure = error
         # The others would wait for the first one in the checkpoint below.
@@ -120,10 +120,16 @@ class RunCheckpoints:
     def _here(self) -> str:
         return f" in {self.folder.parent}"
 
-    def _provenance(self) -> Provenance:
+    def _provenance(self, step: int) -> Provenance:
         longer_edge = max(max(size) for stage in self.config.stages for size in stage.sizes)
         start = self.config.initial_weights or "random parameters"
-        return Provenance("windows", longer_edge, source=f"trained from {start}{self._here()}")
+        record = TrainingRecord(
+            configuration=self.config.to_dict(),
+            data=", ".join(f"{source.name} ({source.split})" for source in self.config.data.sources),
+            steps=step,
+            device=f"{jax.device_count()} x {jax.devices()[0].device_kind}",
+        )
+        return Provenance("windows", longer_edge, source=f"trained from {start}{self._here()}", training=record)
 
     def restore(self, like: TrainState, *, step: int | None = None) -> tuple[TrainState, Position]:
         """The state at `step` (None: the latest), with the shapes and placement of `like`.

@@ -11,7 +11,7 @@ import numpy as np
 
 from logvggt_jax.errors import InputError
 
-_MEND = "the checkpoint is damaged: copy or convert it again"
+MEND = "the checkpoint is damaged: copy or convert it again, or install the package again if it ships with it"
 _SIZE = 16  # bytes
 
 
@@ -32,10 +32,10 @@ def verify_digests(tree: Any, expected: dict[str, str], where: str) -> None:
     for name in sorted(found.keys() | expected.keys()):
         if name not in found or name not in expected:
             which = "is not in the checkpoint" if name not in found else "has no digest"
-            raise InputError(f"{where}: leaf {name} {which}; {_MEND}")
+            raise InputError(f"{where}: leaf {name} {which}; {MEND}")
         if found[name] != expected[name]:
             raise InputError(
-                f"{where}: leaf {name} differs from its digest ({found[name]}, expected {expected[name]}); {_MEND}"
+                f"{where}: leaf {name} differs from its digest ({found[name]}, expected {expected[name]}); {MEND}"
             )
 
 

@@ -41,10 +41,19 @@ def provenance_lines(provenance: Provenance) -> str:
     """What the weights were trained for and where they come from, one line each."""
     purpose = {"windows": "windows (LoG-VGGT)", "vggt": "all frames at once (VGGT)"}
     edge = provenance.longer_edge
-    lines = {
+    lines: dict[str, str | None] = {
         "trained for": purpose.get(provenance.trained_for or ""),
         "image size": f"longer edge {edge} pixels" if edge else None,
         "licence": provenance.licence,
         "source": provenance.source,
     }
+    if training := provenance.training:
+        lines |= {
+            "trained by": training.command,
+            "code": f"commit {training.commit}" if training.commit else None,
+            "data": training.data,
+            "steps": f"{training.steps:,}" if training.steps else None,
+            "device": training.device,
+            "time": f"{training.minutes:,.0f} minutes" if training.minutes else None,
+        }
     return "\n".join(f"{title}: {value or 'not recorded'}" for title, value in lines.items())
