@@ -1,10 +1,10 @@
 """What every reader offers, and the checks that its frames pass before they reach a model."""
 
 import abc
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -50,6 +50,20 @@ class Dataset(Protocol):
 
         NaN for single frames that it lacks; None where there is no such set.
         """
+        ...
+
+
+@runtime_checkable
+class DrawnOnDevice(Protocol):
+    """A data set whose frames for training are described on the host and drawn on the device."""
+
+    def describe(self, sequence: str, indices: Sequence[int]) -> dict[str, np.ndarray]:
+        """What frames `indices` of `sequence` are drawn from; shapes depend on the number of frames alone."""
+        ...
+
+    @property
+    def draw(self) -> Callable[[Any], Any]:
+        """A pure JAX function from descriptions with a leading axis of clips to the arrays of a batch."""
         ...
 
 

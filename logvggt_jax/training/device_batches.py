@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from jax.sharding import Mesh
 
 from logvggt_jax.data.feeding.batches import BatchIterator
-from logvggt_jax.training.sharding import put_batch
+from logvggt_jax.training.sharding import on_each_device, put_batch
 from logvggt_jax.training.step import Batch
 
 
@@ -24,8 +24,9 @@ class _Ready(NamedTuple):
 class DeviceBatches(Iterator[Batch]):
     """Batches of `source` split over `mesh`; a context manager that ends its thread.
 
-    While a step runs, a thread puts the next batch together and copies it to the devices: one batch more than the
-    step's own is held there. State and errors are those of the batch handed out, not of the one read ahead.
+    While a step runs, a thread puts the next batch together and copies it to the devices, or draws it there where
+    the source only describes its pictures: one batch more than the step's own is held there. State and errors are
+    those of the batch handed out, not of the one read ahead.
 
     Attributes:
       broken_clips: clips of this process that were replaced, up to the last batch.
@@ -33,6 +34,7 @@ class DeviceBatches(Iterator[Batch]):
 
     def __init__(self, source: BatchIterator, mesh: Mesh) -> None:
         self._source, self._mesh = source, mesh
+        self._draw_pictures = None if source.draw is None else on_each_device(source.draw, mesh)
         self._state, self.broken_clips = source.get_state(), source.broken.count
         self._thread = ThreadPoolExecutor(1, "device-batches")
         self._next: Future[_Ready] | None = None
@@ -55,4 +57,6 @@ class DeviceBatches(Iterator[Batch]):
 
     def _draw(self) -> _Ready:
         batch = put_batch(next(self._source), self._mesh)
+        if self._draw_pictures is not None:
+            batch = self._draw_pictures(batch)
         return _Ready(batch, self._source.get_state(), self._source.broken.count)

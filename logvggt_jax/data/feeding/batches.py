@@ -7,7 +7,7 @@ together to batches, so that neither the batches nor what a worker holds in memo
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import cv2
@@ -16,10 +16,10 @@ import numpy as np
 from absl import flags
 
 from logvggt_jax.config import check_size
-from logvggt_jax.data.dataset import Dataset
+from logvggt_jax.data.dataset import Dataset, DrawnOnDevice
 from logvggt_jax.data.feeding.augmentation import ColourAugmentation
 from logvggt_jax.data.feeding.broken_clips import BrokenClips
-from logvggt_jax.data.feeding.clips import BROKEN, FIELDS, Size
+from logvggt_jax.data.feeding.clips import BROKEN, Size
 from logvggt_jax.data.feeding.mixture import mixture
 from logvggt_jax.data.feeding.sampling import sampler_for
 from logvggt_jax.errors import InputError
@@ -34,6 +34,7 @@ class BatchIterator(Iterator[Batch]):
 
     Attributes:
       broken: clips of this process that were replaced.
+      draw: for data drawn on the device, the JAX function that makes a batch of clips from what `next` returns.
     """
 
     def __init__(
@@ -47,8 +48,9 @@ class BatchIterator(Iterator[Batch]):
         process_count: int,
         worker_count: int,
         num_threads: int,
+        draw: Callable[[Any], Any] | None = None,
     ) -> None:
-        self.broken = broken
+        self.broken, self.draw = broken, draw
         self._examples, self._identity = examples, dict(identity)
         self._batch_size, self._worker_count, self._num_threads = batch_size, worker_count, num_threads
         self._process_index, self._process_count = process_index, process_count
@@ -68,7 +70,7 @@ class BatchIterator(Iterator[Batch]):
         self._consumed += self._batch_size
         messages = [message for clip in clips for message in clip.get(BROKEN, ())]
         self.broken.add(messages, clips=len(clips))
-        return {name: np.stack([np.asarray(clip[name]) for clip in clips]) for name in FIELDS}
+        return {name: np.stack([np.asarray(clip[name]) for clip in clips]) for name in clips[0] if name != BROKEN}
 
     def __enter__(self) -> BatchIterator:
         return self
@@ -184,7 +186,8 @@ def training_batches(
     Returns:
       Iterator of {"images" uint8 [B, T, H, W, 3], "depth" float32 [B, T, H, W] z-depth (0 = invalid),
       "intrinsics" float32 [B, T, 3, 3], "extrinsics" float32 [B, T, 4, 4] world-to-camera}, numpy, with
-      B = batch_size / process_count.
+      B = batch_size / process_count. Of a data set drawn on the device (`DrawnOnDevice`), which must be the only
+      one, it gives descriptions, and has the function `draw` that makes such a batch of them.
 
     Raises:
       InputError: an argument is out of range, or a data set has no sequence long enough. While iterating:
@@ -212,6 +215,7 @@ def training_batches(
         raise InputError(f"sizes must be different (height, width), at least one, got {sizes}")
     for size in sizes:
         check_size(size, "sizes")
+    draw = _drawing(datasets, sizes, augmentation)
     strides = dict(strides or {})
     if not strides.keys() <= datasets.keys():
         raise InputError(f"strides must be of {', '.join(datasets)}, got those of {', '.join(strides)}")
@@ -240,7 +244,35 @@ def training_batches(
         process_count=process_count,
         worker_count=worker_count,
         num_threads=num_threads,
+        draw=draw,
     )
+
+
+def _drawing(
+    datasets: Mapping[str, Dataset], sizes: Sequence[Size], augmentation: ColourAugmentation | None
+) -> Callable[[Any], Any] | None:
+    """What draws the clips on the device; None where they are read as pictures.
+
+    Raises InputError for what can only be done to pictures on the host.
+    """
+    for name, dataset in datasets.items():
+        if not isinstance(dataset, DrawnOnDevice):
+            continue
+        where = f"{name} is drawn on the device (renderer='device')"
+        if len(datasets) > 1:
+            raise InputError(f"{where} and cannot be mixed with {', '.join(datasets.keys() - {name})}: use 'host'")
+        if augmentation is not None:
+            raise InputError(
+                f"{where}, where data.augmentation does not reach its pictures: use 'host' or set it to None"
+            )
+        drawn = dataset.image_size(dataset.sequences[0])
+        if any(size != drawn for size in sizes):
+            raise InputError(
+                f"{where} at {drawn[0]} x {drawn[1]}, and the stage asks for sizes {[tuple(size) for size in sizes]}: "
+                "give height and width of the set the size of the stage, or use 'host'"
+            )
+        return dataset.draw
+    return None
 
 
 def _start_worker(index: int, count: int) -> None:

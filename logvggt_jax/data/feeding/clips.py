@@ -6,7 +6,7 @@ from typing import Any
 import grain
 import numpy as np
 
-from logvggt_jax.data.dataset import Dataset, check_frames
+from logvggt_jax.data.dataset import Dataset, DrawnOnDevice, check_frames
 from logvggt_jax.data.feeding.augmentation import ColourAugmentation
 from logvggt_jax.data.feeding.broken_clips import describe
 from logvggt_jax.data.feeding.sampling import Sampler, example_rng
@@ -15,7 +15,7 @@ from logvggt_jax.errors import InputError
 
 Size = tuple[int, int]
 
-FIELDS = ("images", "depth", "intrinsics", "extrinsics")
+FIELDS = ("images", "depth", "intrinsics", "extrinsics")  # of clips that are not drawn on the device
 BROKEN = "broken"  # field of a clip that took the place of a broken one: what was wrong with that
 # So many clips in a row are broken only if nearly all of those sequences are.
 _MOST_REPLACEMENTS = 16
@@ -41,6 +41,8 @@ class ClipReader:
     def __call__(self, index: int, sequence: str) -> dict[str, np.ndarray]:
         rng = example_rng(self.seed, index)
         indices = [int(i) for i in self.sampler.draw(self.dataset, sequence, rng)]
+        if isinstance(self.dataset, DrawnOnDevice):
+            return self.dataset.describe(sequence, indices)
         # One frame at a time: a clip of large pictures would take a gigabyte.
         frames = (self.dataset.read(sequence, [index]) for index in indices)
         clip = fit_each(frames, len(indices), self.size)

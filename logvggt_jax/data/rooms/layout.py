@@ -1,50 +1,51 @@
-"""Random furnished rooms: geometry, and textures as small tables that the ray caster looks up."""
+"""Random furnished rooms, one or several in a row with doors between them."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from logvggt_jax.data.rooms.trajectories import Trajectory, random_trajectory
+from logvggt_jax.data.rooms.textures import PIECES, Textures, random_textures
+from logvggt_jax.data.rooms.trajectories import CameraPath, random_laps, random_trajectory, random_walk
 
 STYLES = ("compass", "random")
-WAVES = 6  # sine waves of a texture: four of smooth noise, two whose product is a checker or stripe pattern
+MOST_ROOMS = 4
+MOST_LIGHTS = 3
+_FURNITURE = {"compass": (5, 2, 2), "random": (8, 4, 3)}  # boxes, spheres and cylinders of a room
+_DOOR = (0.55, 2.1)  # half width and height of a door in metres
+_LAMPS = 1.7  # brightness at no distance of all lamps of a room together
+_HALF_WALL = 0.06  # half the thickness of a partition in metres
+_BEYOND = 0.1  # metres by which partitions reach into outer walls, so that no two faces coincide in sight
 CLEARANCE = 0.3  # metres between the camera's path and any furniture
 _PATH_SAMPLES = 512
 _ATTEMPTS = 40
 
-# Walls -x, +x, ceiling -y, floor +y, walls -z, +z: the order of the surfaces of a room.
-_COMPASS_COLOURS = np.array(
-    [
-        [0.80, 0.34, 0.30],
-        [0.36, 0.70, 0.40],
-        [0.88, 0.88, 0.86],
-        [0.46, 0.38, 0.33],
-        [0.34, 0.44, 0.84],
-        [0.86, 0.76, 0.34],
-    ]
-)
-
 
 @dataclass(frozen=True)
-class Textures:
-    """Per-surface tables, float32, S surfaces. A texture is a function of the world point p (metres).
+class Furnishing:
+    """What makes rooms harder and closer to the world; the defaults add nothing."""
 
-    wave_k(p) = sin(frequency[k] . p + phase[k]). The mixing weight between the two colours is
-    1/2 + 1/2 (pattern_weight * clip(wave_4 wave_5 / edge) + (1 - pattern_weight) * mean(wave_0 … wave_3)).
-    """
+    repetition: float = 0.0  # share of bodies whose textures repeat exactly, as tiles and wallpaper do
+    lights: int = 0  # point lights of each room, which cast hard shadows; 0 = brightness by direction alone
+    clutter: int = 0  # small things more in each room, on the floor; half of them boxes against its walls
+    rooms: int = 1  # rooms in a row along x, each with a door to the next
+    laps: int = 1  # times that the camera walks round, each a little aside, before its path repeats
 
-    colour: np.ndarray  # [2, 3, S], RGB in [0, 1]
-    frequency: np.ndarray  # [WAVES, 3, S], radians a metre
-    phase: np.ndarray  # [WAVES, S]
-    pattern_weight: np.ndarray  # [S]
-    edge: np.ndarray  # [S], softness of the pattern's edges; 1 is a sine wave, small values are sharp
-    pattern_frequency: np.ndarray  # [S], radians a metre, of the finer of the pattern's waves
-    shade: np.ndarray  # [4, S], brightness as an affine function of p: shade[:3] . p + shade[3].
+    def capacity(self, style: str) -> tuple[int, int, int]:
+        """The most boxes, spheres and cylinders that a room of `style` has."""
+        boxes, spheres, cylinders = _FURNITURE[style]
+        extra = [_clutter_kind(index) for index in range(self.clutter)]
+        return (
+            self.rooms * (boxes + extra.count("box")) + PIECES * (self.rooms - 1),
+            self.rooms * (spheres + extra.count("sphere")),
+            self.rooms * (cylinders + extra.count("cylinder")),
+        )
 
 
 @dataclass(frozen=True)
 class Room:
     """A box room around the origin, y down, with furniture and a camera path that keeps clear of it.
+
+    Several rooms are one box with partitions, walls of three boxes around a door; they are the last boxes.
 
     Surfaces are numbered: 6 faces of the room (axis * 2 + positive side), 6 for each box, 1 for each sphere,
     2 for each cylinder (side, caps).
@@ -54,6 +55,7 @@ class Room:
       box_centres, box_half_sizes: [N, 3] float64; box_yaws: [N] float64 radians about y.
       sphere_centres: [N, 3] float64; sphere_radii: [N] float64.
       cylinder_centres: [N, 3] float64; cylinder_radii, cylinder_half_heights: [N] float64; axes along y.
+      lights: [N, 4] float64, places of point lights and their brightness at no distance; none without shadows.
       textures: of all surfaces.
       trajectory: the camera's path.
       focal: focal length in units of the image width.
@@ -68,8 +70,9 @@ class Room:
     cylinder_centres: np.ndarray
     cylinder_radii: np.ndarray
     cylinder_half_heights: np.ndarray
+    lights: np.ndarray
     textures: Textures
-    trajectory: Trajectory
+    trajectory: CameraPath
     focal: float
 
     def clearance(self, points: np.ndarray) -> np.ndarray:
@@ -85,8 +88,8 @@ class Room:
         return np.min(distances, axis=0)
 
 
-def random_room(rng: np.random.Generator, style: str) -> Room:
-    """A random room of `style`.
+def random_room(rng: np.random.Generator, style: str, furnishing: Furnishing) -> Room:
+    """A random room of `style`, or several in a row.
 
     `compass`: nearly one size, every wall, floor and ceiling in its own colour in all rooms (jitter 0.08), so
     that absolute heading can be read off an image; 5 boxes, 2 spheres, 2 cylinders. `random`: sizes and colours
@@ -97,20 +100,53 @@ def random_room(rng: np.random.Generator, style: str) -> Room:
         raise ValueError(f"unknown room style {style!r}: choose one of {', '.join(STYLES)}")
     compass = style == "compass"
     if compass:
-        half_size = np.array([3.0, 1.3, 2.4]) * rng.uniform(0.95, 1.05, 3)
-        counts, focal = (5, 2, 2), float(rng.uniform(0.55, 0.75))
+        single = np.array([3.0, 1.3, 2.4]) * rng.uniform(0.95, 1.05, 3)
+        focal = float(rng.uniform(0.55, 0.75))
     else:
-        half_size = np.array([rng.uniform(2.0, 3.5), rng.uniform(1.1, 1.5), rng.uniform(2.0, 3.5)])
-        counts, focal = (8, 4, 3), float(rng.uniform(0.55, 0.90))
-    trajectory = random_trajectory(rng, half_size)
-    path = trajectory.positions(np.linspace(0.0, 2.0 * np.pi, _PATH_SAMPLES, endpoint=False))
+        single = np.array([rng.uniform(2.0, 3.5), rng.uniform(1.1, 1.5), rng.uniform(2.0, 3.5)])
+        focal = float(rng.uniform(0.55, 0.90))
+    half_size = single * [furnishing.rooms, 1.0, 1.0]
+    # Middles of the rooms, and the doors from each to the next.
+    middles = single[0] * (2.0 * np.arange(furnishing.rooms) - furnishing.rooms + 1.0)
+    trajectory: CameraPath
+    if furnishing.rooms == 1:
+        doors = np.empty((0, 2))
+        trajectory = random_trajectory(rng, half_size)
+    else:
+        doors = np.stack([middles[:-1] + single[0], rng.uniform(-0.5, 0.5, len(middles) - 1) * single[2]], axis=1)
+        trajectory = random_walk(rng, _corners(rng, single, middles, doors))
+    samples = _PATH_SAMPLES * furnishing.rooms * furnishing.laps
+    if furnishing.laps > 1:
+        trajectory = random_laps(rng, trajectory, furnishing.laps)
+    path = trajectory.positions(np.linspace(0.0, 2.0 * np.pi * furnishing.laps, samples, endpoint=False))
 
-    boxes = [_place_box(rng, half_size, path) for _ in range(counts[0])]
-    spheres = [_place_sphere(rng, half_size, path) for _ in range(counts[1])]
-    cylinders = [_place_cylinder(rng, half_size, path) for _ in range(counts[2])]
-    box = np.array([b for b in boxes if b is not None]).reshape(-1, 7)
-    sphere = np.array([s for s in spheres if s is not None]).reshape(-1, 4)
-    cylinder = np.array([c for c in cylinders if c is not None]).reshape(-1, 5)
+    boxes, spheres, cylinders = [], [], []
+    for middle in middles:
+        moved = path - [middle, 0.0, 0.0]
+        counts = _FURNITURE[style]
+        boxes += _moved([_place_box(rng, single, moved) for _ in range(counts[0])], middle)
+        spheres += _moved([_place_sphere(rng, single, moved) for _ in range(counts[1])], middle)
+        cylinders += _moved([_place_cylinder(rng, single, moved) for _ in range(counts[2])], middle)
+        for index in range(furnishing.clutter):
+            kind = _clutter_kind(index)
+            into, place = {
+                "box": (boxes, _place_small_box),
+                "sphere": (spheres, _place_small_sphere),
+                "cylinder": (cylinders, _place_small_cylinder),
+            }[kind]
+            into += _moved([place(rng, single, moved)], middle)
+    boxes += [piece for x, z in doors for piece in _partition(half_size, x, z)]
+    box = np.array(boxes).reshape(-1, 7)
+    sphere = np.array(spheres).reshape(-1, 4)
+    cylinder = np.array(cylinders).reshape(-1, 5)
+    textures = random_textures(
+        rng, box, len(doors), sphere, cylinder, compass=compass, repetition=furnishing.repetition
+    )
+    lights = [
+        [middle + x * single[0], (y - 1.0) * single[1], z * single[2], _LAMPS / furnishing.lights]
+        for middle in middles
+        for x, y, z in rng.uniform((-0.7, 0.1, -0.7), (0.7, 0.4, 0.7), (furnishing.lights, 3))
+    ]
     return Room(
         half_size=half_size,
         box_centres=box[:, :3],
@@ -121,10 +157,94 @@ def random_room(rng: np.random.Generator, style: str) -> Room:
         cylinder_centres=cylinder[:, :3],
         cylinder_radii=cylinder[:, 3],
         cylinder_half_heights=cylinder[:, 4],
-        textures=_random_textures(rng, box, sphere, cylinder, _COMPASS_COLOURS if compass else None),
+        lights=np.array(lights).reshape(-1, 4),
+        textures=textures,
         trajectory=trajectory,
         focal=focal,
     )
+
+
+def _corners(rng: np.random.Generator, room: np.ndarray, middles: np.ndarray, doors: np.ndarray) -> np.ndarray:
+    """Corners [N, 3] of a way through all rooms and back, straight through the middle of every door.
+
+    On the way out it passes the rooms on one side, on the way back on the other.
+    """
+    height = rng.uniform(-0.15, 0.1)
+    side = rng.uniform(0.3, 0.55, (2, len(middles))) * room[2] * np.array([[-1.0], [1.0]])
+    before, after = doors[:, 0] - 0.8, doors[:, 0] + 0.8
+    way: list[tuple[float, float]] = [(middles[0] - rng.uniform(0.3, 0.5) * room[0], 0.0)]
+    for index, middle in enumerate(middles):
+        way.append((middle + rng.uniform(-0.2, 0.2), side[0, index]))
+        if index < len(doors):
+            way += [(before[index], doors[index, 1]), (after[index], doors[index, 1])]
+    way.append((middles[-1] + rng.uniform(0.3, 0.5) * room[0], 0.0))
+    for index in reversed(range(len(middles))):
+        way.append((middles[index] + rng.uniform(-0.2, 0.2), side[1, index]))
+        if index:
+            way += [(after[index - 1], doors[index - 1, 1]), (before[index - 1], doors[index - 1, 1])]
+    return np.array([[x, height, z] for x, z in way])
+
+
+def _partition(house: np.ndarray, x: float, z: float) -> list[np.ndarray]:
+    """The PIECES boxes of a wall across x with a door at z, from the walls to the door's sides and above it."""
+    half_width, height = _DOOR
+    top = house[1] - height
+    pieces = []
+    for low, high, bottom in (
+        (-house[2] - _BEYOND, z - half_width, house[1] + _BEYOND),
+        (z + half_width, house[2] + _BEYOND, house[1] + _BEYOND),
+        (z - half_width, z + half_width, top),
+    ):
+        ceiling = -house[1] - _BEYOND
+        centre = [x, (ceiling + bottom) / 2, (low + high) / 2]
+        pieces.append(np.array([*centre, _HALF_WALL, (bottom - ceiling) / 2, (high - low) / 2, 0.0]))
+    return pieces
+
+
+def _moved(things: list[np.ndarray | None], x: float) -> list[np.ndarray]:
+    """Those that found a place, moved along x."""
+    return [thing + np.array([x, *[0.0] * (len(thing) - 1)]) for thing in things if thing is not None]
+
+
+def _clutter_kind(index: int) -> str:
+    return ("box", "sphere", "box", "cylinder")[index % 4]
+
+
+def _place_small_box(rng: np.random.Generator, room: np.ndarray, path: np.ndarray) -> np.ndarray | None:
+    """A shelf, a case or a crate with its back to a wall, as `_place_box` gives it."""
+    for _ in range(_ATTEMPTS):
+        half = np.array([rng.uniform(0.1, 0.5), rng.uniform(0.05, 0.9) * room[1], rng.uniform(0.08, 0.2)])
+        along, across = (0, 2) if rng.random() < 0.5 else (2, 0)
+        centre = np.array([0.0, room[1] - half[1], 0.0])
+        centre[along] = rng.uniform(-1, 1) * (room[along] - half[0])
+        # A little into the wall: faces that coincide would have to share their pixels.
+        centre[across] = rng.choice([-1, 1]) * (room[across] - half[2] + 0.02)
+        yaw = 0.0 if along == 0 else np.pi / 2
+        if _box_distance(path, centre, half, yaw).min() > CLEARANCE:
+            return np.concatenate([centre, half, [yaw]])
+    return None
+
+
+def _place_small_sphere(rng: np.random.Generator, room: np.ndarray, path: np.ndarray) -> np.ndarray | None:
+    """A ball on the floor, as `_place_sphere` gives it."""
+    for _ in range(_ATTEMPTS):
+        radius = rng.uniform(0.06, 0.18)
+        x, z = rng.uniform(-1, 1, 2) * (room[[0, 2]] - radius)
+        centre = np.array([x, room[1] - radius, z])
+        if _sphere_distance(path, centre, radius).min() > CLEARANCE:
+            return np.array([*centre, radius])
+    return None
+
+
+def _place_small_cylinder(rng: np.random.Generator, room: np.ndarray, path: np.ndarray) -> np.ndarray | None:
+    """A vase or a bin on the floor, as `_place_cylinder` gives it."""
+    for _ in range(_ATTEMPTS):
+        radius, half_height = rng.uniform(0.05, 0.15), rng.uniform(0.08, 0.35)
+        x, z = rng.uniform(-1, 1, 2) * (room[[0, 2]] - radius)
+        centre = np.array([x, room[1] - half_height, z])
+        if _cylinder_distance(path, centre, radius, half_height).min() > CLEARANCE:
+            return np.array([*centre, radius, half_height])
+    return None
 
 
 def _place_box(rng: np.random.Generator, room: np.ndarray, path: np.ndarray) -> np.ndarray | None:
@@ -175,70 +295,3 @@ def _cylinder_distance(points: np.ndarray, centre: np.ndarray, radius: float, ha
     offset = points - centre
     radial = np.maximum(np.hypot(offset[:, 0], offset[:, 2]) - radius, 0.0)
     return np.hypot(radial, np.maximum(np.abs(offset[:, 1]) - half_height, 0.0))
-
-
-def _random_textures(
-    rng: np.random.Generator, box: np.ndarray, sphere: np.ndarray, cylinder: np.ndarray, room_colours: np.ndarray | None
-) -> Textures:
-    # Normals that face the viewer: into the room on its faces, outwards on furniture; NaN on curved surfaces.
-    axes = np.concatenate([np.eye(3)[:, None] * -1, np.eye(3)[:, None]], axis=1).reshape(6, 3)
-    normals = [-axes]
-    for yaw in box[:, 6]:
-        cosine, sine = np.cos(yaw), np.sin(yaw)
-        normals.append(axes @ np.array([[cosine, 0, -sine], [0, 1, 0], [sine, 0, cosine]]))
-    normals.append(np.zeros((len(sphere) + 2 * len(cylinder), 3)))
-    normal = np.concatenate(normals)
-    count, first_curved = len(normal), 6 + 6 * len(box)
-    owner = np.concatenate([np.arange(6), 6 + np.arange(6 * len(box)) // 6, np.full(count - first_curved, -1)])
-    owner[first_curved : first_curved + len(sphere)] = 6 + len(box) + np.arange(len(sphere))
-    owner[first_curved + len(sphere) :] = 6 + len(box) + len(sphere) + np.arange(2 * len(cylinder)) // 2
-    bodies = owner.max() + 1
-    of_room = np.arange(bodies) < 6
-
-    base = rng.uniform(0.15, 0.95, (bodies, 3))
-    if room_colours is not None:
-        base[:6] = room_colours + rng.uniform(-0.08, 0.08, (6, 3))
-    second = base * rng.uniform(0.35, 0.7, (bodies, 1)) + rng.uniform(-0.06, 0.06, (bodies, 3))
-    finest = np.where(of_room, rng.uniform(0.35, 0.9, bodies), rng.uniform(0.14, 0.4, bodies))
-    periods = np.concatenate([finest * rng.uniform(1.0, 4.0, (4, bodies)), np.tile(finest, (2, 1))])
-    direction = rng.normal(size=(bodies, WAVES, 3))
-    stripes = rng.random(bodies) < 0.35
-
-    frequency = np.empty((WAVES, 3, count))
-    for surface in range(count):
-        body = owner[surface]
-        waves = direction[body].copy()
-        flat = normal[surface]
-        if flat.any():
-            # Only the part within the plane makes a pattern there; the two pattern waves cross at right angles.
-            waves -= (waves @ flat)[:, None] * flat
-            waves[5] = np.cross(flat, waves[4])
-        waves *= (2.0 * np.pi / periods[:, body] / np.maximum(np.linalg.norm(waves, axis=1), 1e-6))[:, None]
-        frequency[:, :, surface] = waves
-    phase = rng.uniform(0.0, 2.0 * np.pi, (WAVES, bodies))[:, owner]
-    striped = stripes[owner]
-    frequency[5][:, striped] = 0.0
-    phase[5, striped] = np.pi / 2
-
-    light = rng.normal(size=3)
-    light /= np.linalg.norm(light)
-    shade = np.zeros((4, count))
-    shade[3] = 0.8 + 0.2 * normal @ light
-    for index, (centre, radius) in enumerate(zip(sphere[:, :3], sphere[:, 3], strict=True)):
-        slope = 0.2 * light / radius
-        shade[:, first_curved + index] = [*slope, 0.8 - slope @ centre]
-    for index, (centre, radius) in enumerate(zip(cylinder[:, :3], cylinder[:, 3], strict=True)):
-        slope = 0.2 * light / radius * np.array([1.0, 0.0, 1.0])
-        shade[:, first_curved + len(sphere) + 2 * index] = [*slope, 0.8 - slope @ centre]
-
-    colour = np.clip(np.stack([base, second]), 0.0, 1.0)[:, owner].transpose(0, 2, 1)
-    tables = {
-        "colour": colour,
-        "frequency": frequency,
-        "phase": phase,
-        "pattern_weight": rng.uniform(0.3, 0.8, bodies)[owner],
-        "edge": rng.uniform(0.05, 0.6, bodies)[owner],
-        "pattern_frequency": 2.0 * np.pi / finest[owner],
-        "shade": shade,
-    }
-    return Textures(**{name: np.ascontiguousarray(table, np.float32) for name, table in tables.items()})

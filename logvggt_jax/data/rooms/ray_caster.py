@@ -4,10 +4,17 @@ Rays are scaled so that their camera z is 1; the ray parameter is then the z-dep
 Furniture is tested only inside the image rectangle that bounds it.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from logvggt_jax.data.rooms.layout import WAVES, Room, Textures
+from logvggt_jax.data.rooms.layout import Room
+from logvggt_jax.data.rooms.textures import WAVES
 
+AMBIENT = 0.35
+"""Share of the brightness without lamps that reaches everything beside their light."""
+FADING = 2.5  # metres from a lamp at which half of its light is left
+SHADOW_BIAS = 2e-3  # metres by which shadow rays start off their surface, so that it does not shade itself
 _NEAR = 0.02  # metres: corners nearer than this make the bounding rectangle the whole image
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
 
@@ -58,15 +65,22 @@ class _View:
 
 
 def render(
-    room: Room, extrinsics: np.ndarray, intrinsics: np.ndarray, height: int, width: int
+    room: Room, exposures: Sequence[np.ndarray], intrinsics: np.ndarray, height: int, width: int, *, gain: float = 1.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Image [H, W, 3] uint8 and z-depth [H, W] float32 in metres of `room`.
 
-    `extrinsics` [4, 4] world-to-camera (OpenCV), camera inside the room; `intrinsics` [3, 3] in pixels with
-    centres at integers. Deterministic: no randomness, no threads, one frame at a time.
+    The image is the mean over the cameras `exposures` (one is enough; several blur what moves), made brighter by
+    `gain`; depth is that of the middle one. Each is [4, 4] world-to-camera (OpenCV), the camera inside the room;
+    `intrinsics` [3, 3] in pixels with centres at integers. Deterministic: no randomness, no threads, one frame at a
+    time.
     """
-    view = _cast(room, extrinsics, intrinsics, height, width)
-    return _shade(view, room.textures), view.depth
+    views = [_cast(room, extrinsics, intrinsics, height, width) for extrinsics in exposures]
+    colours = _colours(views[0], room)
+    for view in views[1:]:
+        colours += _colours(view, room)
+    colours *= np.float32(gain / len(views))
+    image = np.clip(colours + np.float32(0.5), 0.0, 255.0).astype(np.uint8)
+    return image.reshape(height, width, 3), views[len(views) // 2].depth
 
 
 def _cast(room: Room, extrinsics: np.ndarray, intrinsics: np.ndarray, height: int, width: int) -> _View:
@@ -153,7 +167,9 @@ def _cast_cylinders(view: _View, room: Room) -> None:
         view.keep_nearest(where, enter, (chord > 0) & (enter <= leave), surface)
 
 
-def _shade(view: _View, textures: Textures) -> np.ndarray:
+def _colours(view: _View, room: Room) -> np.ndarray:
+    """Colours [H * W, 3] float32 before they are rounded, 255 is white."""
+    textures = room.textures
     depth, surface = view.depth.ravel(), view.surface.ravel()
     points = [np.float32(view.origin[a]) + depth * view.rays[a].ravel() for a in range(3)]
 
@@ -171,10 +187,71 @@ def _shade(view: _View, textures: Textures) -> np.ndarray:
     pattern = np.clip(waves[4] * waves[5] / softness, -1.0, 1.0)
     weight = textures.pattern_weight[surface]
     mix = np.float32(0.5) + np.float32(0.5) * (noise + weight * (pattern - noise))
-    brightness = affine(textures.shade[:3], textures.shade[3]) * np.float32(255.0)
-    image = np.empty((*depth.shape, 3), np.uint8)
+    brightness: np.ndarray = affine(textures.shade[:3], textures.shade[3]) * np.float32(255.0)
+    if len(room.lights):
+        normal = [textures.normal_slope[a][surface] * points[a] + textures.normal_offset[a][surface] for a in range(3)]
+        brightness = np.float32(AMBIENT) * brightness + np.float32(255.0) * _light(room, points, normal)
+    colours = np.empty((*depth.shape, 3), np.float32)
     for channel in range(3):
         first = textures.colour[0, channel][surface]
         colour = first + mix * (textures.colour[1, channel][surface] - first)
-        image[:, channel] = np.clip(colour * brightness + np.float32(0.5), 0.0, 255.0)
-    return image.reshape(*view.depth.shape, 3)
+        colours[:, channel] = colour * brightness
+    return colours
+
+
+def _light(room: Room, points: list[np.ndarray], normal: list[np.ndarray]) -> np.ndarray:
+    """Brightness [N] by all lamps together of surfaces at `points` with `normal`, three arrays [N] each."""
+    start = [point + np.float32(SHADOW_BIAS) * slope for point, slope in zip(points, normal, strict=True)]
+    total = np.zeros_like(points[0])
+    for *lamp, power in room.lights.astype(np.float32):
+        way = [lamp[axis] - start[axis] for axis in range(3)]
+        squared = way[0] * way[0] + way[1] * way[1] + way[2] * way[2]
+        facing = (normal[0] * way[0] + normal[1] * way[1] + normal[2] * way[2]) / np.sqrt(squared)
+        light = power * np.maximum(facing, 0.0) / (1.0 + squared / np.float32(FADING * FADING))
+        total += np.where(_hidden(room, start, way), np.float32(0.0), light)
+    return total
+
+
+def _hidden(room: Room, start: list[np.ndarray], way: list[np.ndarray]) -> np.ndarray:
+    """Whether furniture lies between points `start` and `start` + `way`, three arrays [N] each."""
+    hidden = np.zeros(start[0].shape, bool)
+
+    def add(enter: np.ndarray, leave: np.ndarray) -> None:
+        nonlocal hidden
+        hidden |= (enter <= leave) & (leave > 0) & (enter < 1)
+
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        for centre, half_size, yaw in zip(room.box_centres, room.box_half_sizes, room.box_yaws, strict=True):
+            cosine, sine = np.float32(np.cos(yaw)), np.float32(np.sin(yaw))
+            x, y, z = (start[axis] - np.float32(centre[axis]) for axis in range(3))
+            origin = (cosine * x - sine * z, y, sine * x + cosine * z)
+            rays = (cosine * way[0] - sine * way[2], way[1], sine * way[0] + cosine * way[2])
+            near, far = [], []
+            for axis in range(3):
+                inverse = 1.0 / np.where(rays[axis] == 0, np.float32(1e-12), rays[axis])
+                middle, reach = -origin[axis] * inverse, np.float32(half_size[axis]) * np.abs(inverse)
+                near.append(middle - reach)
+                far.append(middle + reach)
+            add(np.maximum(np.maximum(near[0], near[1]), near[2]), np.minimum(np.minimum(far[0], far[1]), far[2]))
+        for centre, radius in zip(room.sphere_centres, room.sphere_radii, strict=True):
+            offset = [start[axis] - np.float32(centre[axis]) for axis in range(3)]
+            add(*_chord(offset, way, (0, 1, 2), radius))
+        cylinders = zip(room.cylinder_centres, room.cylinder_radii, room.cylinder_half_heights, strict=True)
+        for centre, radius, half_height in cylinders:
+            offset = [start[axis] - np.float32(centre[axis]) for axis in range(3)]
+            enter, leave = _chord(offset, way, (0, 2), radius)
+            inverse = 1.0 / np.where(way[1] == 0, np.float32(1e-12), way[1])
+            level, reach = -offset[1] * inverse, np.float32(half_height) * np.abs(inverse)
+            add(np.maximum(enter, level - reach), np.minimum(leave, level + reach))
+    return hidden
+
+
+def _chord(
+    offset: list[np.ndarray], way: list[np.ndarray], axes: tuple[int, ...], radius: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where lines `offset` + t `way` enter and leave the circle or sphere of `radius` in `axes`; NaN if they do not."""
+    squared = sum(way[axis] * way[axis] for axis in axes)
+    middle = -sum(offset[axis] * way[axis] for axis in axes) / squared
+    nearest = [offset[axis] + middle * way[axis] for axis in axes]
+    half = np.sqrt((np.float32(radius * radius) - sum(each * each for each in nearest)) / squared)
+    return middle - half, middle + half

@@ -1,0 +1,228 @@
+"""Renders rooms in JAX, clips and frames at once: the same surfaces, textures and lights as `ray_caster`.
+
+Everything is written out by components in float32: a matrix product would have the precision that the device chooses
+for it. One thing after another is tried on all rays, which needs no memory for rays times things.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from logvggt_jax.data.rooms.ray_caster import AMBIENT, FADING, SHADOW_BIAS
+from logvggt_jax.data.rooms.textures import WAVES
+
+Components = list[jax.Array]  # x, y and z of points or directions, arrays of one shape
+
+
+def draw_clips(clips: Mapping[str, jax.Array], *, size: tuple[int, int]) -> dict[str, jax.Array]:
+    """Clips as a training step takes them, from what `RoomScenes.describe` says of each.
+
+    Args:
+      clips: the arrays of `RoomScenes.describe`, each with a leading axis of B clips.
+      size: (H, W) of the pictures.
+
+    Returns:
+      `images` uint8 [B, T, H, W, 3], `depth` float32 [B, T, H, W], `intrinsics` and `extrinsics` as they came.
+    """
+    described = {name: value for name, value in clips.items() if name != "extrinsics"}
+    images, depth = jax.vmap(lambda clip: _draw_clip(clip, size))(described)
+    return {
+        "images": images,
+        "depth": depth,
+        "intrinsics": clips["intrinsics"],
+        "extrinsics": clips["extrinsics"],
+    }
+
+
+def _draw_clip(clip: Mapping[str, jax.Array], size: tuple[int, int]) -> tuple[jax.Array, jax.Array]:
+    """Images [T, H, W, 3] uint8 and depth [T, H, W] of one clip; each frame is the mean over its K cameras."""
+    frames, count = clip["rotations"].shape[:2]
+
+    def expose(known: tuple[Components, jax.Array], camera: Any) -> tuple[tuple[Components, jax.Array], None]:
+        colours, depth = known
+        index, rotation, origin = camera
+        found, found_depth = _expose(clip, rotation, origin, size)
+        depth = jnp.where(index == count // 2, found_depth, depth)
+        return ([old + new for old, new in zip(colours, found, strict=True)], depth), None
+
+    nothing = jnp.zeros((frames, *size))
+    cameras = (jnp.arange(count), jnp.moveaxis(clip["rotations"], 1, 0), jnp.moveaxis(clip["origins"], 1, 0))
+    (colours, depth), _ = jax.lax.scan(expose, ([nothing] * 3, nothing), cameras)
+    gain = clip["gains"][:, None, None] / count
+    image = jnp.stack([colour * gain for colour in colours], axis=-1)
+    return jnp.clip(image + 0.5, 0.0, 255.0).astype(jnp.uint8), depth
+
+
+def _expose(
+    clip: Mapping[str, jax.Array], rotation: jax.Array, origin: jax.Array, size: tuple[int, int]
+) -> tuple[Components, jax.Array]:
+    """Red, green, blue (255 is white) and depth, each [T, H, W], seen by cameras [T, 3, 3] at [T, 3]."""
+    height, width = size
+    intrinsics = clip["intrinsics"]
+    x = (jnp.arange(width) - intrinsics[:, 0, 2, None]) / intrinsics[:, 0, 0, None]
+    y = (jnp.arange(height) - intrinsics[:, 1, 2, None]) / intrinsics[:, 1, 1, None]
+    rays = []
+    for axis in range(3):
+        rows = rotation[:, 1, axis, None] * y + rotation[:, 2, axis, None]
+        rays.append(_not_zero(rotation[:, 0, axis, None, None] * x[:, None] + rows[:, :, None]))
+    start = [origin[:, axis, None, None] for axis in range(3)]
+    depth, surface = _cast(clip, start, rays)
+    points = [start[axis] + depth * rays[axis] for axis in range(3)]
+    pixel = depth / intrinsics[:, 0, 0, None, None]
+    return _colours(clip, surface, points, pixel), depth
+
+
+def _cast(clip: Mapping[str, jax.Array], start: Components, rays: Components) -> tuple[jax.Array, jax.Array]:
+    """Ray parameter and number of the nearest surface on each ray, from inside the room."""
+    half = clip["half_size"]
+    x, y, z = ((jnp.copysign(half[a], rays[a]) - start[a]) / rays[a] for a in range(3))
+    depth = jnp.minimum(jnp.minimum(x, y), z)
+    surface = jnp.where(
+        depth == x, 0 + (rays[0] > 0), jnp.where(depth == y, 2 + (rays[1] > 0), 4 + (rays[2] > 0))
+    ).astype(jnp.int32)
+    first_sphere = 6 + 6 * len(clip["boxes"])
+    first_cylinder = first_sphere + len(clip["spheres"])
+
+    def box(number: jax.Array, thing: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        near, leave, turned = _through_box(thing, start, rays)
+        enter = jnp.maximum(jnp.maximum(near[0], near[1]), near[2])
+        # A ray enters by the positive face where it runs in the negative direction.
+        face = jnp.where(
+            enter == near[0], 0 + (turned[0] < 0), jnp.where(enter == near[1], 2 + (turned[1] < 0), 4 + (turned[2] < 0))
+        )
+        return enter, enter <= leave, 6 + 6 * number + face
+
+    def sphere(number: jax.Array, thing: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        enter, leave = _through_sphere(thing, start, rays)
+        return enter, enter < leave, first_sphere + number
+
+    def cylinder(number: jax.Array, thing: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        side, cap, leave = _through_cylinder(thing, start, rays)
+        enter = jnp.maximum(side, cap)
+        return enter, enter <= leave, first_cylinder + 2 * number + (cap > side)
+
+    for things, meet in ((clip["boxes"], box), (clip["spheres"], sphere), (clip["cylinders"], cylinder)):
+        depth, surface = _nearest(things, meet, depth, surface)
+    return depth, surface
+
+
+def _nearest(
+    things: jax.Array, meet: Callable[..., tuple[jax.Array, ...]], depth: jax.Array, surface: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    def one(known: tuple[jax.Array, jax.Array], item: tuple[jax.Array, jax.Array]) -> Any:
+        depth, surface = known
+        enter, hit, number = meet(*item)
+        hit = hit & (enter > 0) & (enter < depth)
+        return (jnp.where(hit, enter, depth), jnp.where(hit, number, surface)), None
+
+    return jax.lax.scan(one, (depth, surface), (jnp.arange(len(things)), things))[0]
+
+
+def _through_box(thing: jax.Array, start: Components, rays: Components) -> tuple[Components, jax.Array, Components]:
+    """Where rays come between each pair of faces, where they leave the box, and the rays along its axes."""
+    x, y, z = (start[axis] - thing[axis] for axis in range(3))
+    cosine, sine = thing[6], thing[7]
+    origin = [cosine * x - sine * z, y, sine * x + cosine * z]
+    turned = [cosine * rays[0] - sine * rays[2], rays[1], sine * rays[0] + cosine * rays[2]]
+    near, far = [], []
+    for axis in range(3):
+        inverse = 1.0 / _not_zero(turned[axis])
+        middle, reach = -origin[axis] * inverse, thing[3 + axis] * jnp.abs(inverse)
+        near.append(middle - reach)
+        far.append(middle + reach)
+    return near, jnp.minimum(jnp.minimum(far[0], far[1]), far[2]), turned
+
+
+def _through_sphere(thing: jax.Array, start: Components, rays: Components) -> tuple[jax.Array, jax.Array]:
+    return _chord([start[axis] - thing[axis] for axis in range(3)], rays, thing[3])
+
+
+def _through_cylinder(thing: jax.Array, start: Components, rays: Components) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Where rays come within the side, between the caps, and where they leave the cylinder; NaN beside the side."""
+    x, y, z = (start[axis] - thing[axis] for axis in range(3))
+    side, side_end = _chord([x, z], [rays[0], rays[2]], thing[3])
+    inverse = 1.0 / _not_zero(rays[1])
+    level, reach = -y * inverse, thing[4] * jnp.abs(inverse)
+    return side, level - reach, jnp.minimum(side_end, level + reach)
+
+
+def _chord(offset: Components, rays: Components, squared_radius: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Where lines `offset` + t `rays` enter and leave a circle or sphere about zero; NaN where they pass it."""
+    squared = sum(ray * ray for ray in rays)
+    middle = -sum(a * ray for a, ray in zip(offset, rays, strict=True)) / squared
+    # Distance of the ray from the centre at its nearest point: no cancellation of large squares.
+    nearest = [a + middle * ray for a, ray in zip(offset, rays, strict=True)]
+    half = jnp.sqrt((squared_radius - sum(each * each for each in nearest)) / squared)
+    return middle - half, middle + half
+
+
+def _colours(clip: Mapping[str, jax.Array], surface: jax.Array, points: Components, pixel: jax.Array) -> Components:
+    """Red, green and blue of surfaces numbered `surface` at `points`, where pixels are `pixel` metres wide."""
+
+    def of(table: jax.Array) -> jax.Array:
+        return table[surface]
+
+    def affine(slopes: jax.Array, offset: jax.Array) -> jax.Array:
+        return of(offset) + sum(of(slopes[axis]) * points[axis] for axis in range(3))
+
+    waves = [jnp.sin(affine(clip["frequency"][k], clip["phase"][k])) for k in range(WAVES)]
+    noise = (waves[0] + waves[1] + waves[2] + waves[3]) * 0.25
+    # An edge is never sharper than a pixel is wide, and a pattern finer than pixels fades out.
+    softness = jnp.maximum(of(clip["edge"]), of(clip["pattern_frequency"]) * pixel)
+    pattern = jnp.clip(waves[4] * waves[5] / softness, -1.0, 1.0)
+    mix = 0.5 + 0.5 * (noise + of(clip["pattern_weight"]) * (pattern - noise))
+    brightness = affine(clip["shade"][:3], clip["shade"][3]) * 255.0
+    if len(clip["lights"]):
+        slope, offset = clip["normal_slope"], clip["normal_offset"]
+        normal = [of(slope[axis]) * points[axis] + of(offset[axis]) for axis in range(3)]
+        brightness = AMBIENT * brightness + 255.0 * _light(clip, points, normal)
+    first, second = clip["colour"]
+    return [(of(a) + mix * (of(b) - of(a))) * brightness for a, b in zip(first, second, strict=True)]
+
+
+def _light(clip: Mapping[str, jax.Array], points: Components, normal: Components) -> jax.Array:
+    """Brightness by all lamps together of surfaces at `points` with `normal`."""
+    start = [point + SHADOW_BIAS * slope for point, slope in zip(points, normal, strict=True)]
+
+    def add(total: jax.Array, lamp: jax.Array) -> tuple[jax.Array, None]:
+        way = [lamp[axis] - start[axis] for axis in range(3)]
+        squared = way[0] * way[0] + way[1] * way[1] + way[2] * way[2]
+        facing = (normal[0] * way[0] + normal[1] * way[1] + normal[2] * way[2]) / jnp.sqrt(squared)
+        light = lamp[3] * jnp.maximum(facing, 0.0) / (1.0 + squared / (FADING * FADING))
+        return total + jnp.where(_hidden(clip, start, way), 0.0, light), None
+
+    return jax.lax.scan(add, jnp.zeros_like(points[0]), clip["lights"])[0]
+
+
+def _hidden(clip: Mapping[str, jax.Array], start: Components, way: Components) -> jax.Array:
+    """Whether furniture lies between points `start` and `start` + `way`."""
+
+    def box(thing: jax.Array) -> tuple[jax.Array, jax.Array]:
+        near, leave, _ = _through_box(thing, start, way)
+        return jnp.maximum(jnp.maximum(near[0], near[1]), near[2]), leave
+
+    def sphere(thing: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return _through_sphere(thing, start, way)
+
+    def cylinder(thing: jax.Array) -> tuple[jax.Array, jax.Array]:
+        side, cap, leave = _through_cylinder(thing, start, way)
+        return jnp.maximum(side, cap), leave
+
+    hidden = jnp.zeros(start[0].shape, bool)
+    for things, through in ((clip["boxes"], box), (clip["spheres"], sphere), (clip["cylinders"], cylinder)):
+
+        def add(known: jax.Array, thing: jax.Array, through: Any = through) -> tuple[jax.Array, None]:
+            enter, leave = through(thing)
+            return known | ((enter <= leave) & (leave > 0) & (enter < 1)), None
+
+        hidden, _ = jax.lax.scan(add, hidden, things)
+    return hidden
+
+
+def _not_zero(values: jax.Array) -> jax.Array:
+    """`values` without zeros, which would make 0 * inf."""
+    return jnp.where(values == 0, 1e-12, values)
