@@ -2,11 +2,11 @@
 
     python train.py --config=configs/small.py --workdir=runs/small
 
-Written for one large GPU, in pieces: a run stops after eight minutes, and the same command goes on, to the same
-numbers, until all steps are done. The rooms are rendered before the first step, at most 8 GB of them; with
---config.data.cache_dir=FOLDER they are kept for the next piece. On a CPU it runs at less than a tenth of the pace, in
-float32: add --config.model.dtype=float32 and a larger --config.max_minutes. To go on from the weights that ship, with
-clips of the last stage alone (scripts/train_small.sh does it):
+Written for one large GPU, which draws the rooms itself, in pieces: a run stops after eight minutes, and the same
+command goes on, to the same numbers, until all steps are done. On a CPU it runs at less than a tenth of the pace, in
+float32: add --config.model.dtype=float32 and a larger --config.max_minutes. Where the memory of a GPU does not
+suffice, lower the stages' batch_size. To go on from the weights that ship, with clips of the last stage alone
+(scripts/train_small.sh does it):
 
     python train.py --config=configs/small.py:rooms --workdir=runs/small-more
 
@@ -14,8 +14,8 @@ Windows of four frames, the cache, GCCR and the losses are the paper's. A study 
 which is `configs/tiny.py`'s where it is not written below: compass rooms, in which pose is learned at all, half of
 them facing one wall, without which rotation stays at the identity for thousands of steps; single windows before
 clips; LayerScale 1 and a thawed encoder, since nothing is pre-trained; a camera head that starts from no motion and
-the mean field of view, with a weight of 10 in the loss. The longest clips go once round their room's closed path, so
-that they return to where they started.
+the mean field of view, with a weight of 10 in the loss. Camera paths are closed after 96 frames at the mean speed, so
+that most of the longest clips return to where they began.
 """
 
 import math
@@ -56,13 +56,13 @@ def get_config(initial_weights: str = "") -> ConfigDict:
         {
             "stage_1": _stage(steps=8000, clip_length=4, batch_size=32, strides=(1, 6)),
             "stage_2": _stage(steps=4000, clip_length=12, batch_size=16, strides=(1, 6)),
-            # 31 steps of three frames are once round at the mean speed.
-            "stage_3": _stage(steps=2000, clip_length=32, batch_size=8, strides=(1, 3)),
+            "stage_3": _stage(steps=2000, clip_length=32, batch_size=8, strides=(1, 6)),
         },
         sort_keys=False,
     )
-    rooms = {"height": HEIGHT, "width": WIDTH, "num_frames": 96}
-    config.data.sources.rooms.options.update(rooms, num_rooms=300)
+    rooms = {"height": HEIGHT, "width": WIDTH, "num_frames": 192}
+    # As many rooms as are kept laid out in memory.
+    config.data.sources.rooms.options.update(rooms, num_rooms=2000, renderer="device")
     config.validation.source.options.update(rooms)
     config.validation.size = (HEIGHT, WIDTH)
     config.validation.every = 1000

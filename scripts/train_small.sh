@@ -7,5 +7,4 @@
 # The same command goes on with the run. scripts/ship_model.py puts its model into the package.
 set -euo pipefail
 cd "$(dirname "$0")/.."
-exec "${PYTHON:-python}" train.py --config=configs/small.py:rooms --workdir=runs/small-more \
-  --config.data.cache_dir=runs/rooms "$@"
+exec "${PYTHON:-python}" train.py --config=configs/small.py:rooms --workdir=runs/small-more "$@"

@@ -67,7 +67,10 @@ def test_the_small_model_fits_the_package_and_is_the_papers_method(monkeypatch: 
     assert [stage.clip_length for stage in config.stages] == [4, 12, 32]
     assert {stage.sizes for stage in config.stages} == {((168, 224),)}
     rooms = Rooms("train", **dict(config.data.sources[0].options))
-    assert len(rooms.sequences) * rooms.num_frames(rooms.sequences[0]) * 168 * 224 * 7 < 8 * 2**30, "fits the pool"
+    assert rooms.renderer == "device"
+    long = config.stages[-1]
+    assert (long.clip_length - 1) * long.max_stride < rooms.num_frames(rooms.sequences[0]), "every clip finds its room"
+    assert (long.clip_length - 1) * (long.min_stride + long.max_stride) / 2 > rooms.period, "most clips close a loop"
 
 
 def test_the_small_models_step_is_traced_at_its_shortest_and_longest_clips(
