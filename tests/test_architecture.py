@@ -1,6 +1,7 @@
 """The package's layering: who may import whom, read from the source (CONTRIBUTING states the same rule)."""
 
 import ast
+import re
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -63,6 +64,16 @@ def test_rooms_are_a_data_set_like_any_other() -> None:
         if any(module.startswith("logvggt_jax.data.rooms") for module in imported_modules(path))
     }
     assert found == knowing
+
+
+def test_of_the_data_only_what_draws_on_the_device_imports_jax() -> None:
+    importing = {
+        name
+        for name, path in sources().items()
+        if name.startswith("logvggt_jax.data.")
+        and any(re.match(r"\s*(import|from) jax\b", line) for line in path.read_text().splitlines())
+    }
+    assert importing == {"logvggt_jax.data.rooms.device_renderer"}
 
 
 def test_there_are_no_import_circles_and_no_drawer_for_everything() -> None:

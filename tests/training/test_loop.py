@@ -95,6 +95,22 @@ def test_killed_run_goes_on_to_the_same_numbers(
     assert [entry["step"] for entry in _numbers(tmp_path)] == [1, 2, 3, 4, 5, 6]
 
 
+def test_a_killed_run_on_rooms_drawn_on_the_device_goes_on_to_the_same_numbers(
+    run_config: TrainConfig, straight: tuple[TrainState, Path], tmp_path: Path
+) -> None:
+    (rooms,) = run_config.data.sources
+    drawn = dataclasses.replace(rooms, options=(*rooms.options, ("renderer", "device")))
+    config = dataclasses.replace(run_config, data=dataclasses.replace(run_config.data, sources=(drawn,)))
+    whole = train(config, tmp_path / "whole", mesh=data_mesh(2))
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyError, match="crash"):
+        _at_step(patch, 5, _crash)
+        train(config, tmp_path / "killed", mesh=data_mesh(2))
+    _same(train(config, tmp_path / "killed", mesh=data_mesh(2)), whole)
+    assert _numbers(tmp_path / "killed") == _numbers(tmp_path / "whole")
+    # Pictures are equal to a grey level, and so are runs on them.
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=5e-3), whole.params, straight[0].params)
+
+
 def test_sigterm_saves_ends_cleanly_and_can_be_resumed(
     run_config: TrainConfig, straight: tuple[TrainState, Path], tmp_path: Path
 ) -> None:

@@ -1,4 +1,4 @@
-"""Renders rooms in JAX, clips and frames at once: the same surfaces, textures and lights as `ray_caster`.
+"""Renders rooms in JAX, all clips in one program: the same surfaces, textures and lights as `ray_caster`.
 
 Everything is written out by components in float32: a matrix product would have the precision that the device chooses
 for it. One thing after another is tried on all rays, which needs no memory for rays times things.
@@ -6,6 +6,7 @@ for it. One thing after another is tried on all rays, which needs no memory for 
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -15,6 +16,7 @@ import jax.numpy as jnp
 from logvggt_jax.data.rooms.ray_caster import AMBIENT, FADING, SHADOW_BIAS
 from logvggt_jax.data.rooms.textures import WAVES
 
+_OF_FRAMES = ("rotations", "origins", "gains", "intrinsics")
 Components = list[jax.Array]  # x, y and z of points or directions, arrays of one shape
 
 
@@ -29,7 +31,14 @@ def draw_clips(clips: Mapping[str, jax.Array], *, size: tuple[int, int]) -> dict
       `images` uint8 [B, T, H, W, 3], `depth` float32 [B, T, H, W], `intrinsics` and `extrinsics` as they came.
     """
     described = {name: value for name, value in clips.items() if name != "extrinsics"}
-    images, depth = jax.vmap(lambda clip: _draw_clip(clip, size))(described)
+    # A CPU computes one frame after another, which then lies in its cache; others need all of them to be busy.
+    each: Any = _one_by_one if jax.default_backend() == "cpu" else jax.vmap
+
+    def draw_clip(clip: Mapping[str, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        cameras = {name: clip[name] for name in _OF_FRAMES}
+        return each(lambda camera: _draw_frame({**clip, **camera}, size))(cameras)
+
+    images, depth = each(draw_clip)(described)
     return {
         "images": images,
         "depth": depth,
@@ -38,54 +47,57 @@ def draw_clips(clips: Mapping[str, jax.Array], *, size: tuple[int, int]) -> dict
     }
 
 
-def _draw_clip(clip: Mapping[str, jax.Array], size: tuple[int, int]) -> tuple[jax.Array, jax.Array]:
-    """Images [T, H, W, 3] uint8 and depth [T, H, W] of one clip; each frame is the mean over its K cameras."""
-    frames, count = clip["rotations"].shape[:2]
+def _one_by_one(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    return functools.partial(jax.lax.map, function)
+
+
+def _draw_frame(frame: Mapping[str, jax.Array], size: tuple[int, int]) -> tuple[jax.Array, jax.Array]:
+    """Image [H, W, 3] uint8 and depth [H, W] of a frame: a room and K cameras, over whose pictures it is the mean."""
+    count = len(frame["rotations"])
 
     def expose(known: tuple[Components, jax.Array], camera: Any) -> tuple[tuple[Components, jax.Array], None]:
         colours, depth = known
         index, rotation, origin = camera
-        found, found_depth = _expose(clip, rotation, origin, size)
+        found, found_depth = _expose(frame, rotation, origin, size)
         depth = jnp.where(index == count // 2, found_depth, depth)
         return ([old + new for old, new in zip(colours, found, strict=True)], depth), None
 
-    nothing = jnp.zeros((frames, *size))
-    cameras = (jnp.arange(count), jnp.moveaxis(clip["rotations"], 1, 0), jnp.moveaxis(clip["origins"], 1, 0))
+    nothing = jnp.zeros(size)
+    cameras = (jnp.arange(count), frame["rotations"], frame["origins"])
     (colours, depth), _ = jax.lax.scan(expose, ([nothing] * 3, nothing), cameras)
-    gain = clip["gains"][:, None, None] / count
-    image = jnp.stack([colour * gain for colour in colours], axis=-1)
+    image = jnp.stack(colours, axis=-1) * (frame["gains"] / count)
     return jnp.clip(image + 0.5, 0.0, 255.0).astype(jnp.uint8), depth
 
 
 def _expose(
-    clip: Mapping[str, jax.Array], rotation: jax.Array, origin: jax.Array, size: tuple[int, int]
+    frame: Mapping[str, jax.Array], rotation: jax.Array, origin: jax.Array, size: tuple[int, int]
 ) -> tuple[Components, jax.Array]:
-    """Red, green, blue (255 is white) and depth, each [T, H, W], seen by cameras [T, 3, 3] at [T, 3]."""
+    """Red, green, blue (255 is white) and depth, each [H, W], seen by a camera of `rotation` [3, 3] at `origin` [3]."""
     height, width = size
-    intrinsics = clip["intrinsics"]
-    x = (jnp.arange(width) - intrinsics[:, 0, 2, None]) / intrinsics[:, 0, 0, None]
-    y = (jnp.arange(height) - intrinsics[:, 1, 2, None]) / intrinsics[:, 1, 1, None]
-    rays = []
-    for axis in range(3):
-        rows = rotation[:, 1, axis, None] * y + rotation[:, 2, axis, None]
-        rays.append(_not_zero(rotation[:, 0, axis, None, None] * x[:, None] + rows[:, :, None]))
-    start = [origin[:, axis, None, None] for axis in range(3)]
-    depth, surface = _cast(clip, start, rays)
+    intrinsics = frame["intrinsics"]
+    x = (jnp.arange(width) - intrinsics[0, 2]) / intrinsics[0, 0]
+    y = (jnp.arange(height) - intrinsics[1, 2]) / intrinsics[1, 1]
+    # [H, W] each, along the axes of the world.
+    rays = [
+        _not_zero(rotation[0, axis] * x + (rotation[1, axis] * y + rotation[2, axis])[:, None]) for axis in range(3)
+    ]
+    start = list(origin)
+    depth, surface = _cast(frame, start, rays)
     points = [start[axis] + depth * rays[axis] for axis in range(3)]
-    pixel = depth / intrinsics[:, 0, 0, None, None]
-    return _colours(clip, surface, points, pixel), depth
+    pixel = depth / intrinsics[0, 0]
+    return _colours(frame, surface, points, pixel), depth
 
 
-def _cast(clip: Mapping[str, jax.Array], start: Components, rays: Components) -> tuple[jax.Array, jax.Array]:
+def _cast(room: Mapping[str, jax.Array], start: Components, rays: Components) -> tuple[jax.Array, jax.Array]:
     """Ray parameter and number of the nearest surface on each ray, from inside the room."""
-    half = clip["half_size"]
+    half = room["half_size"]
     x, y, z = ((jnp.copysign(half[a], rays[a]) - start[a]) / rays[a] for a in range(3))
     depth = jnp.minimum(jnp.minimum(x, y), z)
     surface = jnp.where(
         depth == x, 0 + (rays[0] > 0), jnp.where(depth == y, 2 + (rays[1] > 0), 4 + (rays[2] > 0))
     ).astype(jnp.int32)
-    first_sphere = 6 + 6 * len(clip["boxes"])
-    first_cylinder = first_sphere + len(clip["spheres"])
+    first_sphere = 6 + 6 * len(room["boxes"])
+    first_cylinder = first_sphere + len(room["spheres"])
 
     def box(number: jax.Array, thing: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         near, leave, turned = _through_box(thing, start, rays)
@@ -105,7 +117,7 @@ def _cast(clip: Mapping[str, jax.Array], start: Components, rays: Components) ->
         enter = jnp.maximum(side, cap)
         return enter, enter <= leave, first_cylinder + 2 * number + (cap > side)
 
-    for things, meet in ((clip["boxes"], box), (clip["spheres"], sphere), (clip["cylinders"], cylinder)):
+    for things, meet in ((room["boxes"], box), (room["spheres"], sphere), (room["cylinders"], cylinder)):
         depth, surface = _nearest(things, meet, depth, surface)
     return depth, surface
 
@@ -160,7 +172,7 @@ def _chord(offset: Components, rays: Components, squared_radius: jax.Array) -> t
     return middle - half, middle + half
 
 
-def _colours(clip: Mapping[str, jax.Array], surface: jax.Array, points: Components, pixel: jax.Array) -> Components:
+def _colours(room: Mapping[str, jax.Array], surface: jax.Array, points: Components, pixel: jax.Array) -> Components:
     """Red, green and blue of surfaces numbered `surface` at `points`, where pixels are `pixel` metres wide."""
 
     def of(table: jax.Array) -> jax.Array:
@@ -169,22 +181,22 @@ def _colours(clip: Mapping[str, jax.Array], surface: jax.Array, points: Componen
     def affine(slopes: jax.Array, offset: jax.Array) -> jax.Array:
         return of(offset) + sum(of(slopes[axis]) * points[axis] for axis in range(3))
 
-    waves = [jnp.sin(affine(clip["frequency"][k], clip["phase"][k])) for k in range(WAVES)]
+    waves = [jnp.sin(affine(room["frequency"][k], room["phase"][k])) for k in range(WAVES)]
     noise = (waves[0] + waves[1] + waves[2] + waves[3]) * 0.25
     # An edge is never sharper than a pixel is wide, and a pattern finer than pixels fades out.
-    softness = jnp.maximum(of(clip["edge"]), of(clip["pattern_frequency"]) * pixel)
+    softness = jnp.maximum(of(room["edge"]), of(room["pattern_frequency"]) * pixel)
     pattern = jnp.clip(waves[4] * waves[5] / softness, -1.0, 1.0)
-    mix = 0.5 + 0.5 * (noise + of(clip["pattern_weight"]) * (pattern - noise))
-    brightness = affine(clip["shade"][:3], clip["shade"][3]) * 255.0
-    if len(clip["lights"]):
-        slope, offset = clip["normal_slope"], clip["normal_offset"]
+    mix = 0.5 + 0.5 * (noise + of(room["pattern_weight"]) * (pattern - noise))
+    brightness = affine(room["shade"][:3], room["shade"][3]) * 255.0
+    if len(room["lights"]):
+        slope, offset = room["normal_slope"], room["normal_offset"]
         normal = [of(slope[axis]) * points[axis] + of(offset[axis]) for axis in range(3)]
-        brightness = AMBIENT * brightness + 255.0 * _light(clip, points, normal)
-    first, second = clip["colour"]
+        brightness = AMBIENT * brightness + 255.0 * _light(room, points, normal)
+    first, second = room["colour"]
     return [(of(a) + mix * (of(b) - of(a))) * brightness for a, b in zip(first, second, strict=True)]
 
 
-def _light(clip: Mapping[str, jax.Array], points: Components, normal: Components) -> jax.Array:
+def _light(room: Mapping[str, jax.Array], points: Components, normal: Components) -> jax.Array:
     """Brightness by all lamps together of surfaces at `points` with `normal`."""
     start = [point + SHADOW_BIAS * slope for point, slope in zip(points, normal, strict=True)]
 
@@ -193,12 +205,12 @@ def _light(clip: Mapping[str, jax.Array], points: Components, normal: Components
         squared = way[0] * way[0] + way[1] * way[1] + way[2] * way[2]
         facing = (normal[0] * way[0] + normal[1] * way[1] + normal[2] * way[2]) / jnp.sqrt(squared)
         light = lamp[3] * jnp.maximum(facing, 0.0) / (1.0 + squared / (FADING * FADING))
-        return total + jnp.where(_hidden(clip, start, way), 0.0, light), None
+        return total + jnp.where(_hidden(room, start, way), 0.0, light), None
 
-    return jax.lax.scan(add, jnp.zeros_like(points[0]), clip["lights"])[0]
+    return jax.lax.scan(add, jnp.zeros_like(points[0]), room["lights"])[0]
 
 
-def _hidden(clip: Mapping[str, jax.Array], start: Components, way: Components) -> jax.Array:
+def _hidden(room: Mapping[str, jax.Array], start: Components, way: Components) -> jax.Array:
     """Whether furniture lies between points `start` and `start` + `way`."""
 
     def box(thing: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -213,7 +225,7 @@ def _hidden(clip: Mapping[str, jax.Array], start: Components, way: Components) -
         return jnp.maximum(side, cap), leave
 
     hidden = jnp.zeros(start[0].shape, bool)
-    for things, through in ((clip["boxes"], box), (clip["spheres"], sphere), (clip["cylinders"], cylinder)):
+    for things, through in ((room["boxes"], box), (room["spheres"], sphere), (room["cylinders"], cylinder)):
 
         def add(known: jax.Array, thing: jax.Array, through: Any = through) -> tuple[jax.Array, None]:
             enter, leave = through(thing)
