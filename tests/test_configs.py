@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import importlib
 import math
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -90,6 +91,10 @@ def test_the_small_model_goes_on_from_weights_with_its_last_stage(monkeypatch: p
     assert more.initial_weights == "rooms" and whole.initial_weights is None
     assert more.stages == whole.stages[-1:] and more.model == whole.model
     assert more.optimizer.learning_rate < whole.optimizer.learning_rate
+    script = ["scripts/train_small.sh", "--config.max_minutes=120"]
+    shown = subprocess.run(script, cwd=ROOT, env={**os.environ, "PYTHON": "echo"}, capture_output=True, text=True)
+    words = shown.stdout.split()
+    assert words[:2] == ["train.py", "--config=configs/small.py:rooms"] and words[-1] == script[-1]
 
 
 def test_h20_is_the_papers_training(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -30,12 +30,14 @@ def open_run(
         benchmarks = open_benchmarks(protocols, data_root, run.protocol)
         return benchmarks, lambda _: [unit_depth(), static_camera()] if run.baselines else []
     clips = run.evaluation
-    if clips.image_size is None and longer_edge is None:
-        raise InputError(
-            "the checkpoint does not say at which image size it was trained; give it as "
-            "--config.evaluation.image_size='(H, W)', multiples of 14 pixels"
-        )
-    image_size = clips.image_size or PrincipalPointCrop(longer_edge).size((3, 4))
+    image_size = clips.image_size
+    if image_size is None:
+        if longer_edge is None:
+            raise InputError(
+                "the checkpoint does not say at which image size it was trained; give it as "
+                "--config.evaluation.image_size='(H, W)', multiples of 14 pixels"
+            )
+        image_size = PrincipalPointCrop(longer_edge).size((3, 4))
     root = None if data_root is None else str(data_root)
     dataset = open_evaluation_set(run.dataset, root, split=run.split, image_size=image_size, options=run.options)
     protocols = clip_protocols(run.dataset, run.split, clips, image_size)

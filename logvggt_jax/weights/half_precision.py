@@ -5,7 +5,7 @@ from typing import Any
 
 import ml_dtypes
 import numpy as np
-from safetensors.numpy import save_file
+from safetensors.numpy import save
 
 from logvggt_jax.weights.digests import named_leaves
 from logvggt_jax.weights.files import open_safetensors
@@ -35,7 +35,7 @@ def rounded(params: Any) -> tuple[dict[str, np.ndarray], float]:
 
 def write_parameters(folder: Path, leaves: dict[str, np.ndarray]) -> None:
     """Writes what `rounded` gave into a model folder."""
-    save_file(leaves, folder / PARAMETERS_FILE)
+    (folder / PARAMETERS_FILE).write_bytes(save(leaves))
 
 
 def read_parameters(folder: Path) -> dict[str, np.ndarray]:
