@@ -18,6 +18,7 @@ def get_config() -> ConfigDict:
     config.data.sources.rooms.options.num_rooms = 150
     config.data.sources.rooms.options.num_frames = 24
     config.validation.every = 100
+    config.log_every = 20
     config.validation.clip_length = 4
     config.save_every = 1000
     config.max_minutes = 2.0

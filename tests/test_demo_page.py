@@ -43,8 +43,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "evaluation" / "results.json").write_text(json.dumps(results))
     (folder / "training").mkdir()
     lines = [
-        {"step": step, "validation/abs_rel": error, "validation/constant_abs_rel": 0.2}
-        for step, error in ((100, 0.3), (200, 0.125))
+        {"step": 1, "train/abs_rel": 0.4},
+        {"step": 200, "train/abs_rel": 0.11},
+        {"step": 200, "validation/abs_rel": 0.125, "validation/constant_abs_rel": 0.2},
     ]
     (folder / "training" / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     return folder
@@ -66,7 +67,7 @@ def test_the_page_holds_pictures_numbers_and_the_viewers_command(demo: Path) -> 
     abs_rel, delta, rotation, rra, rta, auc, ate, ratio = re.findall(r"<td>(.*?)</td>", row[1])
     assert (abs_rel, delta, rotation, rra, rta) == ("0.000", "1.000", "0.000", "1.000", "1.000")
     assert (ate, ratio) == ("0.000", "0.000") and float(auc) > 0.95
-    assert "went from 0.300 after 100 steps to 0.125 after 200" in text
+    assert "went from 0.400 at step 1 to 0.110 at step 200; on rooms that are not trained on to 0.125, where" in text
     assert text.rindex("logvggt view result") > text.rindex("<img"), "at the end"
 
 
@@ -86,6 +87,11 @@ def test_a_camera_that_stands_still_makes_a_page_without_its_path(demo: Path, mo
     monkeypatch.setattr(Reconstruction, "open", lambda _: still)
     text = demo_page.write_page(demo).read_text()
     assert "The path could not be laid over the truth" in text and "<td>-</td>" in text
+
+
+def test_a_training_that_only_compiled_makes_a_page(demo: Path) -> None:
+    (demo / "training" / "metrics.jsonl").write_text(json.dumps({"step": 1, "train/abs_rel": 0.4}) + "\n")
+    assert "from 0.400 at step 1 to 0.400 at step 1. Camera" in demo_page.write_page(demo).read_text()
 
 
 @pytest.mark.parametrize(
