@@ -55,7 +55,10 @@ class Dataset(Protocol):
 
 @runtime_checkable
 class DrawnOnDevice(Protocol):
-    """A data set whose frames for training are described on the host and drawn on the device."""
+    """A data set whose frames for training are described on the host and drawn on the device.
+
+    They are not checked as pictures that were read are: all of them have to be what `check_frames` asks for.
+    """
 
     def describe(self, sequence: str, indices: Sequence[int]) -> dict[str, np.ndarray]:
         """What frames `indices` of `sequence` are drawn from; shapes depend on the number of frames alone."""

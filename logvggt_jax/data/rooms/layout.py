@@ -1,6 +1,6 @@
 """Random furnished rooms, one or several in a row with doors between them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -120,21 +120,7 @@ def random_room(rng: np.random.Generator, style: str, furnishing: Furnishing) ->
         trajectory = random_laps(rng, trajectory, furnishing.laps)
     path = trajectory.positions(np.linspace(0.0, 2.0 * np.pi * furnishing.laps, samples, endpoint=False))
 
-    boxes, spheres, cylinders = [], [], []
-    for middle in middles:
-        moved = path - [middle, 0.0, 0.0]
-        counts = _FURNITURE[style]
-        boxes += _moved([_place_box(rng, single, moved) for _ in range(counts[0])], middle)
-        spheres += _moved([_place_sphere(rng, single, moved) for _ in range(counts[1])], middle)
-        cylinders += _moved([_place_cylinder(rng, single, moved) for _ in range(counts[2])], middle)
-        for index in range(furnishing.clutter):
-            kind = _clutter_kind(index)
-            into, place = {
-                "box": (boxes, _place_small_box),
-                "sphere": (spheres, _place_small_sphere),
-                "cylinder": (cylinders, _place_small_cylinder),
-            }[kind]
-            into += _moved([place(rng, single, moved)], middle)
+    boxes, spheres, cylinders = _furniture(rng, single, middles, path, _FURNITURE[style], furnishing.clutter)
     boxes += [piece for x, z in doors for piece in _partition(half_size, x, z)]
     box = np.array(boxes).reshape(-1, 7)
     sphere = np.array(spheres).reshape(-1, 4)
@@ -142,12 +128,7 @@ def random_room(rng: np.random.Generator, style: str, furnishing: Furnishing) ->
     textures = random_textures(
         rng, box, len(doors), sphere, cylinder, compass=compass, repetition=furnishing.repetition
     )
-    lights = [
-        [middle + x * single[0], (y - 1.0) * single[1], z * single[2], _LAMPS / furnishing.lights]
-        for middle in middles
-        for x, y, z in rng.uniform((-0.7, 0.1, -0.7), (0.7, 0.4, 0.7), (furnishing.lights, 3))
-    ]
-    return Room(
+    room = Room(
         half_size=half_size,
         box_centres=box[:, :3],
         box_half_sizes=box[:, 3:6],
@@ -157,11 +138,51 @@ def random_room(rng: np.random.Generator, style: str, furnishing: Furnishing) ->
         cylinder_centres=cylinder[:, :3],
         cylinder_radii=cylinder[:, 3],
         cylinder_half_heights=cylinder[:, 4],
-        lights=np.array(lights).reshape(-1, 4),
+        lights=np.empty((0, 4)),
         textures=textures,
         trajectory=trajectory,
         focal=focal,
     )
+    if not furnishing.lights:
+        return room
+    return replace(room, lights=_lamps(rng, room, single, middles, furnishing.lights))
+
+
+def _furniture(
+    rng: np.random.Generator,
+    single: np.ndarray,
+    middles: np.ndarray,
+    path: np.ndarray,
+    counts: tuple[int, int, int],
+    clutter: int,
+) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
+    """Boxes, spheres and cylinders of rooms of half extents `single` [3] with `middles` [N] along x."""
+    boxes: list[np.ndarray] = []
+    spheres: list[np.ndarray] = []
+    cylinders: list[np.ndarray] = []
+    small = {
+        "box": (boxes, _place_small_box),
+        "sphere": (spheres, _place_small_sphere),
+        "cylinder": (cylinders, _place_small_cylinder),
+    }
+    for middle in middles:
+        moved = path - [middle, 0.0, 0.0]
+        boxes += _moved([_place_box(rng, single, moved) for _ in range(counts[0])], middle)
+        spheres += _moved([_place_sphere(rng, single, moved) for _ in range(counts[1])], middle)
+        cylinders += _moved([_place_cylinder(rng, single, moved) for _ in range(counts[2])], middle)
+        for index in range(clutter):
+            things, place = small[_clutter_kind(index)]
+            things += _moved([place(rng, single, moved)], middle)
+    return boxes, spheres, cylinders
+
+
+def _lamps(rng: np.random.Generator, room: Room, single: np.ndarray, middles: np.ndarray, count: int) -> np.ndarray:
+    """`count` lamps of each room, [N, 4] as `Room.lights`, near the ceiling, where furniture leaves most room."""
+    lamps = []
+    for middle in np.repeat(middles, count):
+        places = rng.uniform((-0.7, -0.9, -0.7), (0.7, -0.6, 0.7), (8, 3)) * single + [middle, 0.0, 0.0]
+        lamps.append([*places[room.clearance(places).argmax()], _LAMPS / count])
+    return np.array(lamps)
 
 
 def _corners(rng: np.random.Generator, room: np.ndarray, middles: np.ndarray, doors: np.ndarray) -> np.ndarray:

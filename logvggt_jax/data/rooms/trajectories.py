@@ -10,7 +10,7 @@ import numpy as np
 HARMONICS = 2
 _TABLE = 1024  # points of a walk
 _ROUNDING = 0.35  # metres of a walk over which its corners are rounded, to either side
-_LOOK_AHEAD = 0.6  # metres of a walk over which its direction is averaged, to either side
+_LOOK_AHEAD = 1.2  # metres of a walk over which its direction is averaged, to either side
 _DRIFT = (0.06, 0.03, 0.06)  # metres (x, y, z) by which laps of one path differ at most
 _GAZE = np.deg2rad(30.0)  # yaw by which they differ at most
 

@@ -7,7 +7,7 @@ from logvggt_jax.data.dataset import check_frames
 from logvggt_jax.data.rooms import ray_caster
 from logvggt_jax.data.rooms.layout import CLEARANCE, STYLES
 from logvggt_jax.data.rooms.rooms import Rooms
-from logvggt_jax.geometry import camera_centres, unproject
+from logvggt_jax.geometry import camera_centres, rotation_angle, unproject
 
 SMALL = {"height": 42, "width": 56, "num_frames": 60, "num_rooms": 4}
 HOUSE = {"rooms": 3, "period": 240, "num_frames": 240}
@@ -39,7 +39,9 @@ def test_cameras_walk_through_all_rooms_and_keep_clear(style: str) -> None:
         changes = visited[np.flatnonzero(np.diff(visited)) + 1].tolist()
         # There and back, wherever it begins.
         assert sorted(changes) == [0, 1, 1, 2] and np.abs(np.diff(visited)).max() == 1
+        turns = rooms.cameras(name, range(720))[1][:, :3, :3]
         assert np.linalg.norm(np.diff(places, axis=0), axis=1).max() < 0.25
+        assert np.rad2deg(rotation_angle(turns[1:], turns[:-1])).max() < 18
 
 
 def test_partitions_have_doors_that_one_sees_through() -> None:
@@ -80,6 +82,7 @@ def test_lamps_cast_shadows() -> None:
         room, frames = rooms.room(name), rooms.read(name, [0, 30])
         points = unproject(*(a.astype(np.float64) for a in (frames.depth, frames.intrinsics, frames.extrinsics)))
         points, lamp = points.reshape(-1, 3), room.lights[0, :3]
+        assert room.clearance(lamp[None]) > 0 and lamp[1] < -0.5 * room.half_size[1]
         # A little off the surface, and through everything that stands before the lamp.
         start = points + 0.01 * (lamp - points)
         hidden = ray_caster._hidden(room, list(start.T.astype(np.float32)), list((lamp - start).T.astype(np.float32)))
@@ -163,3 +166,15 @@ def test_exposure_changes_brightness_slowly_and_nothing_else() -> None:
 def test_bad_options_are_named(options: dict) -> None:
     with pytest.raises(ValueError, match=f"rooms: .*{next(iter(options))}"):
         Rooms(**options)
+
+
+def test_houses_and_laps_can_face_north_as_well() -> None:
+    ahead, north = (
+        Rooms("train", **{**SMALL, "num_frames": 400}, rooms=2, period=200, laps=2, facing_north=share)
+        for share in (0.0, 1.0)
+    )
+    for name in north.sequences:
+        forward = north.cameras(name, range(400))[1][:, 2, :3]
+        # The swing to either side, and what laps differ by.
+        assert np.degrees(np.abs(np.arctan2(forward[:, 0], forward[:, 2]))).max() < 60 + 31
+        np.testing.assert_allclose(centres(north, name, range(9)), centres(ahead, name, range(9)), atol=1e-5)
