@@ -18,7 +18,7 @@ import numpy as np
 
 from logvggt_jax.errors import InputError, MissingInput, disk_errors, one_line, printable
 from logvggt_jax.evaluation.report import figures, page
-from logvggt_jax.evaluation.report.tables import Table, benchmark_tables
+from logvggt_jax.evaluation.report.tables import MARK, Table, benchmark_tables
 from logvggt_jax.files import write_text
 from logvggt_jax.frames import Frames
 from logvggt_jax.geometry import camera_centres, invert, umeyama, unproject_pixels
@@ -180,7 +180,8 @@ def _evaluation(folder: Path) -> list[str]:
         page.heading("Rooms that training never saw, against answers that need no learning"),
         page.paragraph(
             "The best value of a column is bold. The untrained network is the same one with random numbers, VGGT the "
-            "same weights without windows and refinement. What every column means is in evaluation/report.html."
+            "same weights without windows and refinement. A camera that stands still cannot be laid over the truth: its "
+            f"ATE, marked {MARK}, is the size of the path. What every column means is in evaluation/report.html."
         ),
         *(page.table(table) for table in benchmark_tables(results)),
     ]
