@@ -180,8 +180,8 @@ def _evaluation(folder: Path) -> list[str]:
         page.heading("Rooms that training never saw, against answers that need no learning"),
         page.paragraph(
             "The best value of a column is bold. The untrained network is the same one with random numbers, VGGT the "
-            "same weights without windows and refinement. A camera that stands still cannot be laid over the truth: its "
-            f"ATE, marked {MARK}, is the size of the path. What every column means is in evaluation/report.html."
+            "same weights without windows and refinement. A camera that stands still cannot be laid over the truth: "
+            f"its ATE, marked {MARK}, is the size of the path. What every column means is in evaluation/report.html."
         ),
         *(page.table(table) for table in benchmark_tables(results)),
     ]
