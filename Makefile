@@ -12,7 +12,7 @@ CPU := JAX_PLATFORMS=cpu
 .DEFAULT_GOAL := help
 
 help:
-	@echo "make demo      train, evaluate and reconstruct on procedural rooms; README says how long it takes"
+	@echo "make demo      train, reconstruct and evaluate on procedural rooms, then open runs/demo/index.html; README says how long it takes"
 	@echo "make test      linter, type checker and tests (under 10 minutes)"
 	@echo "make test-all  the slow tests as well: 1B parity, compilation for TPUs, long streams"
 	@echo "make lint      linter, formatter check and type checker alone"
@@ -28,20 +28,16 @@ $(VENV)/.installed: pyproject.toml
 
 demo: install
 	rm -rf $(DEMO)
+	@echo "1 of 4: a tiny model trains from nothing on rooms that a program draws; abs_rel, the error of its depth, falls"
 	$(CPU) $(BIN)/python train.py --config=configs/demo.py --workdir=$(DEMO)/training
+	@echo "2 of 4: a walk through a room that training never saw, drawn frame by frame, with the true depth and camera path"
 	$(CPU) $(BIN)/logvggt render-room --output $(DEMO)/room --frames 48 --size 56x70 --split test
-	$(CPU) $(BIN)/logvggt reconstruct $(DEMO)/room --checkpoint $(DEMO)/training/model \
-	  --output $(DEMO)/reconstruction --longer-edge 70
+	@echo "3 of 4: the model sees the frames alone and gives depth, camera path and a point cloud"
+	$(CPU) $(BIN)/logvggt reconstruct $(DEMO)/room --checkpoint $(DEMO)/training/model --output $(DEMO)/reconstruction
+	@echo "4 of 4: the same model on eight such rooms, beside answers that need no learning; the best of a column is bold"
 	$(CPU) $(BIN)/python eval.py --config=configs/eval/rooms.py --config.options.num_rooms=8 \
 	  --checkpoint=$(DEMO)/training/model --output=$(DEMO)/evaluation
-	@echo
-	@echo "Results in $(DEMO)/:"
-	@echo "  evaluation/report.html         the tables above and the figures on one page; report.md and results.json as well"
-	@echo "  evaluation/figures/            trajectories and depth beside the truth"
-	@echo "  reconstruction/points.ply      coloured point cloud of a room that training never saw"
-	@echo "  reconstruction/trajectory.txt  its camera path (TUM format); cameras.json has the intrinsics as well"
-	@echo "  reconstruction/previews/       its depth as pictures; depth/ has the values"
-	@echo "  training/model/                the trained model; checkpoints/, metrics.jsonl and tensorboard/ beside it"
+	@$(CPU) $(BIN)/python scripts/demo_page.py $(DEMO)
 
 lint: install
 	$(BIN)/ruff check .

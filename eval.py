@@ -24,7 +24,9 @@ from logvggt_jax.evaluation.run import run_evaluation
 from logvggt_jax.terminal import forgiving_streams
 
 _CONFIG = config_flags.DEFINE_config_file("config", None, "what to evaluate: a file of configs/eval", lock_config=True)
-_CHECKPOINT = flags.DEFINE_string("checkpoint", None, "model folder, as training and `logvggt convert` write it")
+_CHECKPOINT = flags.DEFINE_string(
+    "checkpoint", None, "model folder, as training and `logvggt convert` write it, or `rooms`, which ships"
+)
 _OUTPUT = flags.DEFINE_string(
     "output",
     None,

@@ -316,8 +316,8 @@ def _parser() -> argparse.ArgumentParser:
         "--checkpoint",
         required=True,
         metavar="PATH_OR_REPO",
-        help="model folder, folder of a training run, VGGT checkpoint (a file, or its folder), or hub repository, "
-        "hf:OWNER/NAME[/FILE] or OWNER/NAME where no folder OWNER is here",
+        help="`rooms`, the small model that ships; or a model folder, folder of a training run, VGGT checkpoint (a "
+        "file, or its folder), or hub repository, hf:OWNER/NAME[/FILE] or OWNER/NAME where no folder OWNER is here",
     )
     sub.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder to make")
     sub.add_argument(
@@ -441,7 +441,8 @@ def _parser() -> argparse.ArgumentParser:
         "logvggt info models/vggt-1b",
     )
     sub.add_argument(
-        "checkpoint", type=Path, help="model folder made by `logvggt convert`, or folder of a training run"
+        "checkpoint",
+        help="model folder made by `logvggt convert`, folder of a training run, or `rooms`, the model that ships",
     )
 
     sub = command(

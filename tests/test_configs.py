@@ -3,6 +3,7 @@
 import dataclasses
 import importlib
 import math
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -28,7 +29,7 @@ def _config(name: str, monkeypatch: pytest.MonkeyPatch) -> TrainConfig:
     return TrainConfig.from_dict(importlib.import_module(f"configs.{name}").get_config().to_dict())
 
 
-@pytest.mark.parametrize("name", ["tiny", "demo", "h20"])
+@pytest.mark.parametrize("name", ["tiny", "demo", "small", "h20"])
 def test_configuration_builds_its_run(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     config = _config(name, monkeypatch)
     schedule = learning_rate_schedule(config.optimizer, config.stages)
@@ -37,20 +38,62 @@ def test_configuration_builds_its_run(name: str, monkeypatch: pytest.MonkeyPatch
     assert all(height % 14 == 0 == width % 14 for stage in config.stages for height, width in stage.sizes)
 
 
-def test_rooms_start_at_their_mean_field_of_view(monkeypatch: pytest.MonkeyPatch) -> None:
-    config = _config("tiny", monkeypatch)
+@pytest.mark.parametrize("name", ["tiny", "small"])
+def test_rooms_start_at_their_mean_field_of_view(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = _config(name, monkeypatch)
     rooms = Rooms("train", **{**dict(config.data.sources[0].options), "num_rooms": 40})
     focal = [rooms.room(name).focal for name in rooms.sequences]
-    mean = 2 * math.atan(0.5 / (sum(focal) / len(focal)))
-    assert config.model.camera_head.initial_pose[8] == pytest.approx(mean, abs=0.05)
+    mean = sum(focal) / len(focal)
+    height, width = config.stages[0].sizes[0]
+    expected = (2 * math.atan(height / width / 2 / mean), 2 * math.atan(0.5 / mean))
+    assert config.model.camera_head.initial_pose[7:] == pytest.approx(expected, abs=0.05)
 
 
-def test_training_and_validation_share_no_room(monkeypatch: pytest.MonkeyPatch) -> None:
-    config = _config("tiny", monkeypatch)
+@pytest.mark.parametrize("name", ["tiny", "small"])
+def test_training_and_validation_share_no_room(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = _config(name, monkeypatch)
     assert config.validation is not None
     sources = (*config.data.sources, config.validation.source)
     train, held_out = (set(Rooms(source.split, **dict(source.options)).sequences) for source in sources)
     assert not train & held_out
+
+
+def test_the_small_model_fits_the_package_and_is_the_papers_method(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = _config("small", monkeypatch)
+    parameters = sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(abstract_parameters(config.model)))
+    assert parameters > 4.5e6 and 2 * parameters < 12e6, "bytes at 16 bits"
+    assert config.model.windows == ModelConfig().windows and config.loss.name == "log_vggt"
+    assert config.model.refinement == dataclasses.replace(ModelConfig().refinement, num_heads=4)
+    assert [stage.clip_length for stage in config.stages] == [4, 12, 32]
+    assert {stage.sizes for stage in config.stages} == {((168, 224),)}
+    rooms = Rooms("train", **dict(config.data.sources[0].options))
+    assert rooms.renderer == "device"
+    long = config.stages[-1]
+    assert (long.clip_length - 1) * long.max_stride < rooms.num_frames(rooms.sequences[0]), "every clip finds its room"
+    assert (long.clip_length - 1) * (long.min_stride + long.max_stride) / 2 > rooms.period, "most clips close a loop"
+
+
+def test_the_small_models_step_is_traced_at_its_shortest_and_longest_clips(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    config = _config("small", monkeypatch)
+    state, step = _abstract_run(config, 1)
+    for stage in (config.stages[0], config.stages[-1]):
+        after, metrics = jax.eval_shape(step, state, abstract_clips(stage.batch_size, stage.clip_length, (168, 224)))
+        assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(lambda x: (x.shape, x.dtype), state)
+        assert all(value.shape == () for value in metrics.values())
+
+
+def test_the_small_model_goes_on_from_weights_with_its_last_stage(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = _config("small", monkeypatch)
+    more = TrainConfig.from_dict(importlib.import_module("configs.small").get_config("rooms").to_dict())
+    assert more.initial_weights == "rooms" and whole.initial_weights is None
+    assert more.stages == whole.stages[-1:] and more.model == whole.model
+    assert more.optimizer.learning_rate < whole.optimizer.learning_rate
+    script = ["scripts/train_small.sh", "--config.max_minutes=120"]
+    shown = subprocess.run(script, cwd=ROOT, env={**os.environ, "PYTHON": "echo"}, capture_output=True, text=True)
+    words = shown.stdout.split()
+    assert words[:2] == ["train.py", "--config=configs/small.py:rooms"] and words[-1] == script[-1]
 
 
 def test_h20_is_the_papers_training(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -51,3 +51,23 @@ def test_the_demo_calls_the_command_line_as_it_is(commands: list[list[str]]) -> 
                 _parser().parse_args(words[position + 1 :])
                 called.append(words[position + 1])
     assert called == ["render-room", "reconstruct"]
+
+
+def test_the_demo_writes_its_page_from_what_it_has_made(commands: list[list[str]]) -> None:
+    made = [word.rpartition("=")[2] for words in commands for word in words if "runs/demo/" in word]
+    parts = [Path(path).name for path in made if Path(path).parent == Path("runs/demo")]
+    assert set(parts) == {"room", "reconstruction", "evaluation", "training"}
+    assert commands[-1][-2:] == ["scripts/demo_page.py", "runs/demo"] and (ROOT / commands[-1][-2]).is_file()
+
+
+def test_the_demo_uses_the_model_that_it_has_trained(commands: list[list[str]]) -> None:
+    given = []
+    for words in commands:
+        given += [words[i + 1] for i, word in enumerate(words) if word == "--checkpoint"]
+        given += [word.partition("=")[2] for word in words if word.startswith("--checkpoint=")]
+    assert given == ["runs/demo/training/model"] * 2
+
+
+def test_one_duration_of_the_demo_is_stated() -> None:
+    assert "takes five to nine minutes on two cores" in (ROOT / "README.md").read_text()
+    assert "README says how long it takes" in (ROOT / "Makefile").read_text()

@@ -10,6 +10,7 @@ frames it is a global path of its own, which hides what the parts do. Another da
 """
 
 from ml_collections import ConfigDict
+from ml_collections.config_dict import placeholder
 
 
 def get_config() -> ConfigDict:
@@ -46,8 +47,8 @@ def get_config() -> ConfigDict:
     )
 
     config.evaluation = evaluation = ConfigDict()
-    # The size that the model was trained at; rooms are rendered at it.
-    evaluation.image_size = (56, 70)
+    # (H, W) of the images; by default 3:4 and as large as those that the model was trained at.
+    evaluation.image_size = placeholder(tuple)
     evaluation.clip_lengths = (10, 200)
     evaluation.stride = 2
     evaluation.clips_per_sequence = 1

@@ -4,6 +4,7 @@ python eval.py --config=configs/eval/rooms.py --checkpoint=runs/tiny/model --out
 """
 
 from ml_collections import ConfigDict
+from ml_collections.config_dict import placeholder
 
 
 def get_config() -> ConfigDict:
@@ -21,8 +22,8 @@ def get_config() -> ConfigDict:
     config.settings = ConfigDict({"offline": {"max_frames": 200}, "chunks": {"size": 12, "overlap": 6}})
 
     config.evaluation = evaluation = ConfigDict()
-    # The size that the model was trained at; rooms are rendered at it.
-    evaluation.image_size = (56, 70)
+    # (H, W) of the images; by default 3:4 and as large as those that the model was trained at.
+    evaluation.image_size = placeholder(tuple)
     evaluation.clip_lengths = (12, 32)
     evaluation.stride = 2
     evaluation.clips_per_sequence = 1

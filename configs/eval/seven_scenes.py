@@ -8,6 +8,7 @@ small models; it is not the paper's protocol.
 """
 
 from ml_collections import ConfigDict
+from ml_collections.config_dict import placeholder
 
 
 def get_config() -> ConfigDict:
@@ -24,8 +25,8 @@ def get_config() -> ConfigDict:
     config.settings = ConfigDict({"offline": {"max_frames": 200}, "chunks": {"size": 12, "overlap": 6}})
 
     config.evaluation = evaluation = ConfigDict()
-    # The tiny model's size, to which frames are scaled and cropped; VGGT-1B's would be (392, 518).
-    evaluation.image_size = (56, 70)
+    # (H, W), to which frames are scaled and cropped; by default 3:4 and as large as the model was trained at.
+    evaluation.image_size = placeholder(tuple)
     evaluation.clip_lengths = (12, 32)
     # About 8 degrees of rotation from frame to frame, as in the procedural rooms at stride 2.
     evaluation.stride = 5

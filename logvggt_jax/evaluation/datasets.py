@@ -18,20 +18,30 @@ from logvggt_jax.model.logvggt import LogVGGT
 
 
 def open_run(
-    run: ClipRun | PaperRun, data_root: str | Path | None
+    run: ClipRun | PaperRun, data_root: str | Path | None, longer_edge: int | None
 ) -> tuple[list[Benchmark], Callable[[LogVGGT], list[Method]]]:
     """The benchmarks of a run, and what makes its baselines once the model is known (nothing where it wants none).
 
-    Raises as `open_benchmarks` and `open_evaluation_set`.
+    `longer_edge`, of the images that the checkpoint was trained on, is for a run that says no size. Raises as
+    `open_benchmarks` and `open_evaluation_set`, and InputError where neither says the size.
     """
     if isinstance(run, PaperRun):
         protocols = chosen_protocols(run.protocol, run.benchmarks)
         benchmarks = open_benchmarks(protocols, data_root, run.protocol)
         return benchmarks, lambda _: [unit_depth(), static_camera()] if run.baselines else []
     clips = run.evaluation
+    image_size = clips.image_size
+    if image_size is None:
+        if longer_edge is None:
+            raise InputError(
+                "the checkpoint does not say at which image size it was trained; give it as "
+                "--config.evaluation.image_size='(H, W)', multiples of 14 pixels"
+            )
+        image_size = PrincipalPointCrop(longer_edge).size((3, 4))
     root = None if data_root is None else str(data_root)
-    dataset = open_evaluation_set(run.dataset, root, split=run.split, image_size=clips.image_size, options=run.options)
-    benchmarks = [Benchmark(each, dataset, run.split) for each in clip_protocols(run.dataset, run.split, clips)]
+    dataset = open_evaluation_set(run.dataset, root, split=run.split, image_size=image_size, options=run.options)
+    protocols = clip_protocols(run.dataset, run.split, clips, image_size)
+    benchmarks = [Benchmark(each, dataset, run.split) for each in protocols]
 
     def baselines(model: LogVGGT) -> list[Method]:
         if not run.baselines:
@@ -40,7 +50,7 @@ def open_run(
         source = "frames of the evaluated set itself (knows the test set's mean)"
         if known is not None:
             source = f"the training split of {known.title}"
-        return all_baselines(model, known or dataset, clips.image_size, source=source, seed=clips.seed)
+        return all_baselines(model, known or dataset, image_size, source=source, seed=clips.seed)
 
     return benchmarks, baselines
 

@@ -13,8 +13,9 @@ from logvggt_jax.evaluation.methods.variants import variant_methods
 from logvggt_jax.evaluation.records import RECORDS_FILE
 from logvggt_jax.evaluation.report.report import write_report
 from logvggt_jax.evaluation.runner import evaluate
-from logvggt_jax.evaluation.settings import PaperRun, read_run
+from logvggt_jax.evaluation.settings import ClipRun, PaperRun, read_run
 from logvggt_jax.files import check_output
+from logvggt_jax.weights.checkpoints import read_provenance
 
 
 def run_evaluation(
@@ -30,7 +31,7 @@ def run_evaluation(
 
     Args:
       configuration: as a file of configs/eval gives it.
-      checkpoint: model folder.
+      checkpoint: model folder, or the name of a model that ships.
       output: folder of the results: a new or empty one, or an evaluation's. What an interrupted run of the same code
         has measured is taken over; other results are replaced once these are complete.
       data_root: folder of the data set, where it is read from disk; for the paper's benchmarks that of their folders.
@@ -46,7 +47,9 @@ def run_evaluation(
     """
     run = read_run(configuration)
     output = check_output(output, overwrite=True, marker=RECORDS_FILE)
-    benchmarks, baselines = open_run(run, data_root)
+    asks = isinstance(run, ClipRun) and run.evaluation.image_size is None
+    longer_edge = read_provenance(checkpoint).longer_edge if asks else None
+    benchmarks, baselines = open_run(run, data_root, longer_edge)
     loaded = Checkpoint.load(checkpoint)
     rows = {method: model_row(method, loaded, run.settings_of(method)) for method in run.methods}
     timings = None

@@ -7,9 +7,11 @@ from pathlib import Path
 import numpy as np
 from rich.progress import track
 
+from logvggt_jax.data.formats.image import read_depth, read_rgb
 from logvggt_jax.data.rooms.rooms import Rooms
-from logvggt_jax.errors import disk_errors
+from logvggt_jax.errors import MissingInput, disk_errors
 from logvggt_jax.files import atomic_folder, check_output
+from logvggt_jax.frames import Frames
 from logvggt_jax.geometry import invert
 from logvggt_jax.reconstruction.depth_files import write_picture
 
@@ -64,3 +66,25 @@ def write_room_sequence(
         intrinsics, _ = rooms.cameras(sequence, [0])
         np.savetxt(folder / INTRINSICS_FILE, intrinsics[0], fmt="%.9g")
     return Path(output)
+
+
+def read_room_sequence(folder: str | Path) -> Frames:
+    """All frames of a folder that `write_room_sequence` has made, depth to the millimetre that its files keep.
+
+    Raises MissingInput where it is no such folder, InputError for a damaged picture.
+    """
+    folder = Path(folder)
+    stems = sorted(path.name.removesuffix(".color.png") for path in folder.glob("frame-*.color.png"))
+    if not stems:
+        raise MissingInput(f"{folder}: holds no frame-*.color.png; give the output of `logvggt render-room`")
+    with disk_errors(folder):
+        poses = np.stack([np.loadtxt(folder / f"{stem}.pose.txt") for stem in stems])
+        intrinsics = np.loadtxt(folder / INTRINSICS_FILE)
+    millimetres = np.stack([read_depth(folder / f"{stem}.depth.proj.png") for stem in stems])
+    return Frames(
+        images=np.stack([read_rgb(folder / f"{stem}.color.png") for stem in stems]),
+        depth=millimetres.astype(np.float32) / 1000.0,
+        intrinsics=np.tile(intrinsics, (len(stems), 1, 1)).astype(np.float32),
+        extrinsics=invert(poses).astype(np.float32),
+        metric=True,
+    )

@@ -24,7 +24,7 @@ from logvggt_jax.training.work_folder import FolderLock, remove_scratch
 from logvggt_jax.weights.checkpoints import check_destination, read_provenance, save_model
 from logvggt_jax.weights.digests import whole_array
 from logvggt_jax.weights.folder import is_model_folder
-from logvggt_jax.weights.provenance import Provenance
+from logvggt_jax.weights.provenance import Provenance, TrainingRecord
 
 # How fast, from where and with how many broken clips the data come; the data stream checks that they are the same.
 FREE_DATA_SETTINGS = ("worker_count", "num_threads", "cache_dir", "max_broken")
@@ -170,8 +170,8 @@ class RunCheckpoints:
     def _write(self, state: TrainState, position: Position, in_place_of: int | None) -> None:
         # First, so that a run that is killed in between goes on from an older checkpoint and writes both again.
         layers = unstack_layers(state.averaged, self.config.model)
-        save_model(self.model_folder, self.config.model, layers, self._provenance())
         step = int(state.step)
+        save_model(self.model_folder, self.config.model, layers, self._provenance(step))
         write_checkpoint(self.folder / str(step), state, position, self.config)
         newest = [kept for kept in self.steps if kept != in_place_of][-self.config.keep_checkpoints :]
         for old in {*self.steps} - {step, *newest}:
@@ -211,10 +211,16 @@ class RunCheckpoints:
     def _here(self) -> str:
         return f" in {self.folder.parent}"
 
-    def _provenance(self) -> Provenance:
+    def _provenance(self, step: int) -> Provenance:
         longer_edge = max(max(size) for stage in self.config.stages for size in stage.sizes)
         start = self.config.initial_weights or "random parameters"
-        return Provenance("windows", longer_edge, source=f"trained from {start}{self._here()}")
+        record = TrainingRecord(
+            configuration=self.config.to_dict(),
+            data=", ".join(f"{source.name} ({source.split})" for source in self.config.data.sources),
+            steps=step,
+            device=f"{jax.device_count()} x {jax.devices()[0].device_kind}",
+        )
+        return Provenance("windows", longer_edge, source=f"trained from {start}{self._here()}", training=record)
 
     def _check_configuration(self, stored: StoredCheckpoint) -> None:
         ours = self.config.to_dict()

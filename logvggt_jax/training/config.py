@@ -189,9 +189,9 @@ class ValidationConfig:
 class TrainConfig:
     """A whole run.
 
-    `initial_weights` is a path or hub repository that `from_pretrained` reads, None starts from random numbers.
-    The run stops in good order after `max_minutes`, and with an error after `max_skipped_in_a_row` updates in a
-    row that were not finite. `save_every` steps, and at the end, it writes a checkpoint and keeps the latest
+    `initial_weights` is what `from_pretrained` reads (a path, `rooms`, a hub repository), None starts from random
+    numbers. The run stops in good order after `max_minutes`, and with an error after `max_skipped_in_a_row` updates in
+    a row that were not finite. `save_every` steps, and at the end, it writes a checkpoint and keeps the latest
     `keep_checkpoints`.
 
     Each device takes its share of a batch in `accumulate` parts, one after the other, for the gradient of

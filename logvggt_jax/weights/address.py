@@ -1,4 +1,4 @@
-"""What a user means by a checkpoint: a path here, or a repository on the hub."""
+"""What a user means by a checkpoint: a path here, a model that ships, or a repository on the hub."""
 
 import difflib
 import re
@@ -8,14 +8,15 @@ from logvggt_jax.errors import MissingInput
 from logvggt_jax.weights.files import SUFFIXES
 from logvggt_jax.weights.folder import run_model
 from logvggt_jax.weights.hub import PREFIX, download
+from logvggt_jax.weights.shipped_models import SHIPPED, shipped_model
 
 _NAME = r"[\w-][\w.-]*"
 _HUB = re.compile(rf"(?P<repository>{_NAME}/{_NAME})(?:/(?P<file>.+))?")
 
 
 def resolve(path_or_repo: str | Path) -> Path:
-    """The local path that a path or an address on the hub means, for `from_pretrained` and its kin; downloads in the
-    second case, after a line that says so.
+    """The local path that a path, the name of a model that ships (`shipped_model`) or an address on the hub means, for
+    `from_pretrained` and its kin; downloads in the last case, after a line that says so.
 
     A `Path` is always local, and what this returns means itself. The folder of a training run means its `model`, a
     repository's folder in the hub's cache its newest snapshot. Raises MissingInput as `download`, or naming similar
@@ -28,11 +29,13 @@ def resolve(path_or_repo: str | Path) -> Path:
         raise MissingInput(
             f"{path_or_repo}: no address on the hub; expected {PREFIX}owner/name, or {PREFIX}owner/name/file"
         )
+    if shipped := shipped_model(path_or_repo):
+        return shipped
     path = Path(path_or_repo).expanduser()
     if not path.exists():
         raise MissingInput(
-            f"{path}: no such file or folder{similar(path)}; give a checkpoint file, its folder, or a hub repository "
-            f"as {PREFIX}owner/name"
+            f"{path}: no such file or folder{similar(path)}; give a checkpoint file, its folder, a hub repository as "
+            f"{PREFIX}owner/name, or a model that ships with this package: {', '.join(SHIPPED)}"
         )
     return _snapshot(path) or run_model(path)
 

@@ -1,10 +1,10 @@
-"""Model folders: parameters in Orbax's format, and beside them the configuration and a digest of every leaf.
+"""Model folders: parameters, and beside them the configuration and a digest of every leaf.
 
     <folder>/config.json   format version, ModelConfig, provenance, digests, versions of the libraries that wrote it,
                            and a digest of all this
-    <folder>/params/       Orbax
+    <folder>/params/       Orbax; or, in models that ship with the package, params.safetensors at 16 bits a number
 
-Orbax restores flipped bytes without complaint; the digests find them.
+Flipped bytes are restored without complaint; the digests, of the float32 parameters that come back, find them.
 """
 
 import contextlib
@@ -30,9 +30,11 @@ from logvggt_jax.weights.address import hub_address, resolve, similar
 from logvggt_jax.weights.digests import check_finite, digests, named_leaves, verify_digests
 from logvggt_jax.weights.files import open_state_dict
 from logvggt_jax.weights.folder import MEND, is_model_folder, read_description, run_model, write_description
+from logvggt_jax.weights.half_precision import PARAMETERS_FILE, read_parameters, rounded, write_parameters
 from logvggt_jax.weights.hub import licence
 from logvggt_jax.weights.lazy import LazyTensors
 from logvggt_jax.weights.provenance import Provenance
+from logvggt_jax.weights.shipped_models import SHIPPED, shipped_model
 from logvggt_jax.weights.vggt import ConversionReport, config_from_vggt, parameter_shapes, params_from_vggt, vggt_rules
 
 _UNKNOWN = Provenance()
@@ -58,14 +60,7 @@ def save_model(
     """
     path = Path(path).expanduser().absolute()
     check_destination(path)
-    description = {
-        "config": config.to_dict(),
-        "provenance": dataclasses.asdict(provenance),
-        "digests": digests(params),
-        "libraries": {
-            name: importlib.metadata.version(name) for name in ("logvggt-jax", "jax", "flax", "orbax-checkpoint")
-        },
-    }
+    description = _description(config, params, provenance)
     with atomic_folder(path, replace=replace) as fresh, writing_with_orbax(path):
         write_arrays(fresh / "params", params)
         write_description(fresh, description)
@@ -87,6 +82,31 @@ def read_arrays(path: Path, target: Any) -> Any:
         return checkpointer.restore(path, target)
 
 
+def save_rounded_model(path: str | Path, config: ModelConfig, params: Any, provenance: Provenance) -> float:
+    """Writes a model folder with its parameters in one file at 16 bits a number, in place of an older model folder.
+
+    Returns how much rounding changed the parameters (`rounded`). Raises OutputExists as `save_model`.
+    """
+    path = Path(path).expanduser().absolute()
+    check_destination(path)
+    leaves, change = rounded(params)
+    with atomic_folder(path, replace=True) as fresh, disk_errors(path):
+        write_parameters(fresh, leaves)
+        write_description(fresh, _description(config, read_parameters(fresh), provenance))
+    return change
+
+
+def _description(config: ModelConfig, params: Any, provenance: Provenance) -> dict[str, Any]:
+    return {
+        "config": config.to_dict(),
+        "provenance": provenance.to_dict(),
+        "digests": digests(params),
+        "libraries": {
+            name: importlib.metadata.version(name) for name in ("logvggt-jax", "jax", "flax", "orbax-checkpoint")
+        },
+    }
+
+
 def check_destination(path: Path) -> None:
     """Raises FileExistsError where `save_model` would have to overwrite something other than a model folder."""
     if not path.exists() or (path.is_dir() and not any(path.iterdir())):
@@ -100,21 +120,26 @@ def check_destination(path: Path) -> None:
 def load_model(path: str | Path) -> tuple[LogVGGT, dict[str, Any]]:
     """The model in a folder and its variables {"params": …}, float32, on the default device.
 
-    `path` is a folder of `save_model`, `logvggt convert` or training (`<workdir>/model`, or `<workdir>` for short).
+    `path` is a folder of `save_model`, `logvggt convert` or training (`<workdir>/model`, or `<workdir>` for short), or
+    the name of a model that ships with the package: `rooms`, unless a model folder of that name is here.
     Raises MissingInput where nothing is there, or no model folder; InputError where the configuration has an unknown
     field, the parameters do not fit it, a file is damaged, a leaf or the description differs from its digest, or a
     parameter is NaN or infinite.
     """
-    path = run_model(Path(path).expanduser().absolute())
+    path = shipped_model(path) or run_model(Path(path).expanduser().absolute())
     if not path.exists():
-        raise MissingInput(f"{path / 'config.json'}: no such folder{similar(path)}; give a model folder")
+        raise MissingInput(
+            f"{path / 'config.json'}: no such folder{similar(path)}; give a model folder, or a model that ships with "
+            f"this package: {', '.join(SHIPPED)}"
+        )
     description = read_description(path)
     try:
         config = ModelConfig.from_dict(description["config"])
     except InputError as error:
         raise InputError(f"{path / 'config.json'}: {error}; written by another version of this package?") from error
     model = LogVGGT(config)
-    params = _restore(path / "params", parameter_shapes(config))
+    restore = _restore_rounded if (path / PARAMETERS_FILE).exists() else _restore
+    params = restore(path, parameter_shapes(config))
     verify_digests(params, description["digests"], str(path))
     check_finite(params, str(path))
     return model, {"params": params}
@@ -154,8 +179,9 @@ def from_pretrained(
     VGGT-1B is converted in memory; its sizes are read off the tensors' shapes (`config_from_vggt`).
 
     Args:
-      path_or_repo: A model folder of this package, or a training run's folder; a VGGT checkpoint as
-        `open_state_dict` reads it; or a hub repository, `hf:owner/name` or `owner/name` (`resolve`).
+      path_or_repo: A model folder of this package, a training run's folder, or the name of a model that ships
+        (`rooms`); a VGGT checkpoint as `open_state_dict` reads it; or a hub repository, `hf:owner/name` or
+        `owner/name` (`resolve`).
       dtype: Compute type of the model, `float32` or `bfloat16`; None keeps the checkpoint's (VGGT: float32).
       point_head: Keep VGGT's point head. A model folder has it or not.
 
@@ -255,8 +281,9 @@ def _checkpointer() -> ocp.StandardCheckpointer:
     return ocp.StandardCheckpointer(multiprocessing_options=alone, save_concurrent_gb=1, restore_concurrent_gb=1)
 
 
-def _restore(path: Path, target: Any) -> Any:
+def _restore(folder: Path, target: Any) -> Any:
     """Parameters in the shapes and placement of `target`, after a check that these are the stored shapes."""
+    path = folder / "params"
     if not path.is_dir():
         raise MissingInput(f"{path}: the parameters are missing; {MEND}")
 
@@ -270,6 +297,15 @@ def _restore(path: Path, target: Any) -> Any:
         return read_arrays(path, target)
 
     return read_with_orbax(read, f"{path}:", MEND)
+
+
+def _restore_rounded(folder: Path, target: Any) -> Any:
+    """As `_restore`, from one file at 16 bits."""
+    stored = read_parameters(folder)
+    if wrong := first_misfit(stored, target, "the configuration in config.json"):
+        raise InputError(f"{folder / PARAMETERS_FILE}: {wrong}; the two belong to different models")
+    leaves = [jax.device_put(stored[name], leaf.sharding) for name, leaf in named_leaves(target)]
+    return jax.tree.unflatten(jax.tree.structure(target), leaves)
 
 
 def read_with_orbax(read: Callable[[], Any], where: str, mend: str) -> Any:

@@ -12,7 +12,7 @@ from jax.experimental import multihost_utils
 
 from logvggt_jax.errors import InputError
 
-_MEND = "the checkpoint is damaged: copy or convert it again"
+MEND = "the checkpoint is damaged: copy or convert it again, or install the package again if it ships with it"
 _SIZE = 16  # bytes
 
 
@@ -34,10 +34,10 @@ def verify_digests(tree: Any, expected: dict[str, str], where: str) -> None:
     for name in sorted(found.keys() | expected.keys()):
         if name not in found or name not in expected:
             which = "is not in the checkpoint" if name not in found else "has no digest"
-            raise InputError(f"{where}: leaf {name} {which}; {_MEND}")
+            raise InputError(f"{where}: leaf {name} {which}; {MEND}")
         if found[name] != expected[name]:
             raise InputError(
-                f"{where}: leaf {name} differs from its digest ({found[name]}, expected {expected[name]}); {_MEND}"
+                f"{where}: leaf {name} differs from its digest ({found[name]}, expected {expected[name]}); {MEND}"
             )
 
 

@@ -98,7 +98,7 @@ def _open_file(path: Path) -> AbstractContextManager[LazyTensors]:
     content = content_of(path)
     if content == "json":
         raise InputError(f"{path}: a JSON text, expected weights")
-    return _open_safetensors(path) if content == "safetensors" else open_torch_zip(path)
+    return open_safetensors(path) if content == "safetensors" else open_torch_zip(path)
 
 
 def _enter_shards(stack: ExitStack, path: Path) -> LazyTensors:
@@ -111,7 +111,8 @@ def _enter_shards(stack: ExitStack, path: Path) -> LazyTensors:
 
 
 @contextmanager
-def _open_safetensors(path: Path) -> Iterator[LazyTensors]:
+def open_safetensors(path: Path) -> Iterator[LazyTensors]:
+    """The tensors of one safetensors file under its own names; a context manager, errors as of `open_state_dict`."""
     try:
         with disk_errors(path):
             opened = safetensors.safe_open(path, framework="numpy")

@@ -5,12 +5,11 @@ from pathlib import Path
 from typing import Any
 
 from logvggt_jax.errors import InputError, MissingInput
-from logvggt_jax.weights.digests import json_digest
+from logvggt_jax.weights.digests import MEND, json_digest
 from logvggt_jax.weights.json_file import read_json
 
 FORMAT = "logvggt-jax model"
 VERSION = 1
-MEND = "the checkpoint is damaged: copy or convert it again"
 _ENTRIES = {"format", "version", "config", "provenance", "digests", "libraries", "digest"}
 
 

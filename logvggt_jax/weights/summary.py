@@ -46,10 +46,19 @@ def provenance_lines(provenance: Provenance) -> str:
         "causal": "each frame sees those before it (StreamVGGT)",
     }
     edge = provenance.longer_edge
-    lines = {
+    lines: dict[str, str | None] = {
         "trained for": purpose.get(provenance.trained_for or ""),
         "image size": f"longer edge {edge} pixels" if edge else None,
         "licence": provenance.licence,
         "source": provenance.source,
     }
+    if training := provenance.training:
+        lines |= {
+            "trained by": training.command,
+            "code": f"commit {training.commit}" if training.commit else None,
+            "data": training.data,
+            "steps": f"{training.steps:,}" if training.steps else None,
+            "device": training.device,
+            "time": f"{training.minutes:,.0f} minutes" if training.minutes else None,
+        }
     return "\n".join(f"{title}: {printable(value or 'not recorded')}" for title, value in lines.items())

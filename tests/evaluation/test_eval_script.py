@@ -49,7 +49,7 @@ def test_an_evaluation_leaves_tables_json_and_figures(
     [
         (["--config.evaluation.strides=3"], "no such field: 'strides' Did you mean \"stride\""),
         (["--config=configs/eval/none.py"], "configs/eval/none.py"),
-        (["--data_root=d"], "leave --data_root=d out"),
+        (["--data_root=d", "--config.evaluation.image_size=(28, 42)"], "leave --data_root=d out"),
     ],
 )
 def test_what_cannot_be_used_is_one_line(arguments: list[str], message: str, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from logvggt_jax.config import ModelConfig
 from logvggt_jax.errors import InputError, OutputExists
 from logvggt_jax.evaluation.report.report import print_report
 from logvggt_jax.evaluation.run import run_evaluation
-from logvggt_jax.weights import save_model
+from logvggt_jax.weights import Provenance, save_model
 
 ROOT = Path(__file__).parents[2]
 
@@ -54,12 +54,35 @@ def configuration(name: str, changes: dict[str, Any]) -> dict[str, Any]:
     ],
 )
 def test_what_cannot_be_used_is_named_before_anything_is_written(
-    name: str, changes: dict[str, Any], data_root: str | None, message: str, tmp_path: Path
+    name: str,
+    changes: dict[str, Any],
+    data_root: str | None,
+    message: str,
+    tmp_path: Path,
+    small_config: ModelConfig,
+    small_variables: dict[str, Any],
 ) -> None:
-    values = configuration(name, changes)
+    values, model = configuration(name, changes), tmp_path / "no-model"
+    if message != "no-model":
+        save_model(model, small_config, small_variables["params"], Provenance("windows", 42))
     with pytest.raises(InputError, match=message) as raised:
-        run_evaluation(values, tmp_path / "no-model", tmp_path / "out", data_root=data_root, command="command")
+        run_evaluation(values, model, tmp_path / "out", data_root=data_root, command="command")
     assert "\n" not in str(raised.value) and not (tmp_path / "out").exists()
+
+
+def test_images_are_of_the_size_that_the_model_was_trained_at(
+    small_config: ModelConfig, small_variables: dict[str, Any], tmp_path: Path
+) -> None:
+    clips = {"clip_lengths": (2,), "max_points": 100, "figures": 0}
+    changes: dict[str, Any] = {f"evaluation.{name}": value for name, value in clips.items()}
+    changes |= {"options.num_rooms": 1, "methods": ("windows",), "baselines": False}
+    values = configuration("rooms", changes)
+    save_model(tmp_path / "model", small_config, small_variables["params"], Provenance("windows", 42))
+    results = run_evaluation(values, tmp_path / "model", tmp_path / "out", command="command")
+    assert results["benchmarks"][0]["images"].startswith("42 x 28 pixels")
+    save_model(tmp_path / "model", small_config, small_variables["params"])
+    with pytest.raises(InputError, match=r"does not say at which image size .*--config\.evaluation\.image_size"):
+        run_evaluation(values, tmp_path / "model", tmp_path / "other", command="command")
 
 
 def test_the_model_and_all_baselines_make_a_table(

@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-from logvggt_jax.errors import InputError
+from logvggt_jax.data import open_dataset
+from logvggt_jax.errors import InputError, MissingInput
 from logvggt_jax.geometry import camera_centres, invert, quaternion_to_matrix, rotation_angle
 from logvggt_jax.reconstruction.cameras_file import read_cameras, write_cameras
 from logvggt_jax.reconstruction.depth_files import (
@@ -22,7 +23,7 @@ from logvggt_jax.reconstruction.depth_files import (
 )
 from logvggt_jax.reconstruction.exporters.tum import read_trajectory, write_trajectory
 from logvggt_jax.reconstruction.point_cloud import read_points
-from logvggt_jax.reconstruction.room_sequence import write_room_sequence
+from logvggt_jax.reconstruction.room_sequence import read_room_sequence, write_room_sequence
 
 
 def random_extrinsics(count: int) -> np.ndarray:
@@ -140,6 +141,18 @@ def test_depth_picture_is_brighter_when_nearer_and_black_where_invalid(tmp_path:
     assert brightness[1] > brightness[2] > brightness[3]
     write_picture(tmp_path / "p.png", picture)
     np.testing.assert_array_equal(cv2.imread(str(tmp_path / "p.png"))[..., ::-1], picture)
+
+
+def test_a_room_sequence_is_read_back_as_it_was_rendered(tmp_path: Path) -> None:
+    folder = write_room_sequence(tmp_path / "room", num_frames=3, image_size=(28, 42), seed=3, progress=False)
+    rooms = open_dataset("rooms", None, "test", height=28, width=42, num_frames=3, num_rooms=1, seed=3)
+    found, expected = read_room_sequence(folder), rooms.read(rooms.sequences[0], range(3))
+    np.testing.assert_array_equal(found.images, expected.images)
+    np.testing.assert_allclose(found.depth, expected.depth, atol=6e-4)
+    for name in ("intrinsics", "extrinsics"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-5)
+    with pytest.raises(MissingInput, match="holds no frame"):
+        read_room_sequence(tmp_path)
 
 
 def test_room_sequence_has_consistent_depth_poses_and_intrinsics(tmp_path: Path) -> None:

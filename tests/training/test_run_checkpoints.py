@@ -18,6 +18,7 @@ import jax
 import numpy as np
 import pytest
 
+from logvggt_jax.config import from_mapping
 from logvggt_jax.errors import InputError, OutputExists
 from logvggt_jax.training import checkpoint_files
 from logvggt_jax.training import checkpoints as module
@@ -123,6 +124,21 @@ def test_a_checkpoint_from_before_the_digest_is_restored(
 ) -> None:
     _edit(saved / "checkpoints" / "0" / "meta" / "metadata", lambda meta: meta.pop("digest"))
     assert _restore(saved, run_config, state)[1] == POSITION
+
+
+def test_the_model_folder_says_how_it_was_trained(
+    run_config: TrainConfig, state: TrainState, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written: list[Provenance] = []
+    monkeypatch.setattr("logvggt_jax.training.checkpoints.save_model", lambda *saved: written.append(saved[3]))
+    monkeypatch.setattr("logvggt_jax.training.checkpoints.unstack_layers", lambda tree, *_: tree)
+    with RunCheckpoints(tmp_path / "run", run_config) as checkpoints:
+        checkpoints.save(state, POSITION)
+    training = from_mapping(Provenance, json.loads(json.dumps(written[0].to_dict())), "provenance").training
+    assert training is not None and training.configuration is not None
+    assert TrainConfig.from_dict(training.configuration) == run_config
+    assert training.steps == 0 and training.device == f"{jax.device_count()} x cpu"
+    assert training.data == "rooms (train)"
 
 
 def test_a_model_that_the_run_did_not_write_is_never_replaced(

@@ -13,7 +13,9 @@ from logvggt_jax.evaluation.protocols.protocol import DepthMeasure, PointsMeasur
 class ClipSettings:
     """Which clips are cut and how they are compared (`evaluation` in configs/eval/rooms.py and its like)."""
 
-    image_size: tuple[int, int]  # (H, W) of the model's input, multiples of 14; frames are resized and cropped to it
+    # (H, W) of the model's input, multiples of 14; frames are resized and cropped to it. None: 3:4, as large as the
+    # images that the checkpoint was trained on.
+    image_size: tuple[int, int] | None
     clip_lengths: tuple[int, ...]  # frames of a clip
     stride: int = 1  # frames of the sequence from one frame of a clip to the next
     clips_per_sequence: int = 1  # clips with evenly spaced starts in each sequence
@@ -25,7 +27,8 @@ class ClipSettings:
     figures: int = 1  # clips of each length that are drawn, for the first method
 
     def __post_init__(self) -> None:
-        check_size(self.image_size, "ClipSettings.image_size")
+        if self.image_size is not None:
+            check_size(self.image_size, "ClipSettings.image_size")
         if not self.clip_lengths or any(length < 2 for length in self.clip_lengths):
             raise InputError(
                 f"ClipSettings.clip_lengths must be at least one number of 2 or more frames, got {self.clip_lengths}"
@@ -34,8 +37,8 @@ class ClipSettings:
         require_within(self, "(0, inf)", "icp_threshold")
 
 
-def clip_protocols(dataset: str, split: str, settings: ClipSettings) -> list[Protocol]:
-    """One benchmark for each clip length of the settings."""
+def clip_protocols(dataset: str, split: str, settings: ClipSettings, image_size: tuple[int, int]) -> list[Protocol]:
+    """One benchmark for each clip length of the settings, on images of `image_size` (H, W)."""
     return [
         Protocol(
             name=f"{dataset}-clips-{length}",
@@ -43,7 +46,7 @@ def clip_protocols(dataset: str, split: str, settings: ClipSettings) -> list[Pro
             dataset=dataset,
             splits=(split,),
             frames=Clips(length, settings.stride, settings.clips_per_sequence),
-            images=Fit(settings.image_size),
+            images=Fit(image_size),
             depth=DepthMeasure(),
             points=PointsMeasure(None, settings.max_points, settings.icp_threshold, settings.seed),
             poses=True,

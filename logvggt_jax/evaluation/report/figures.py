@@ -134,25 +134,30 @@ def point_clouds(path: Path, prediction: np.ndarray, target: np.ndarray, colours
     """
     frame = target @ _viewing_rotation(view).T
     low, high = np.percentile(frame[:, :2], 1, axis=0), np.percentile(frame[:, :2], 99, axis=0)
-    figure, axes = _figure(1, 2, (10.0, 4.2))
     grey = colours if len(colours) == len(target) else np.full((len(target), 3), 120, np.uint8)
-    for axis, title, points, shade in (
-        (axes[0], "prediction, aligned", prediction, colours),
-        (axes[1], "truth", target, grey),
-    ):
-        axis.imshow(_rendered(points @ _viewing_rotation(view).T, shade, low, high))
-        axis.set_title(f"{title}, {len(points):,} points", fontsize=9)
+    clouds = {"prediction, aligned": (prediction, colours), "truth": (target, grey)}
+    pictures = {
+        f"{title}, {len(points):,} points": _rendered(points @ _viewing_rotation(view).T, shade, low, high)
+        for title, (points, shade) in clouds.items()
+    }
+    height, width = next(iter(pictures.values())).shape[:2]
+    figure, axes = _figure(1, 2, (10.0, 5.0 * height / width + 0.4))
+    for axis, (title, picture) in zip(axes, pictures.items(), strict=True):
+        axis.imshow(picture)
+        axis.set_title(title, fontsize=9)
         axis.set_axis_off()
     _save(figure, path)
 
 
-def ate_against_views(path: Path, curves: Mapping[str, Sequence[tuple[int, float]]], title: str) -> None:
-    """ATE in metres over the number of views, a curve of (views, ATE) for each method, as a PNG file."""
+def curves_plot(
+    path: Path, curves: Mapping[str, Sequence[tuple[float, float]]], title: str, *, x_label: str, y_label: str
+) -> None:
+    """Named curves of (x, y), from zero upwards, as a PNG file."""
     figure, (axis,) = _figure(1, 1, (5.5, 4.0))
     for name, points in curves.items():
         axis.plot(*zip(*points, strict=True), ".-", label=name)
-    axis.set_xlabel("views")
-    axis.set_ylabel("ATE (m)")
+    axis.set_xlabel(x_label)
+    axis.set_ylabel(y_label)
     axis.set_ylim(bottom=0)
     axis.set_title(title, fontsize=9)
     axis.legend(fontsize=8)

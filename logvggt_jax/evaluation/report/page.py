@@ -1,4 +1,4 @@
-"""One self-contained HTML page of tables, notes and pictures."""
+"""Self-contained HTML pages of text, tables and pictures, which open in a browser without a server."""
 
 import base64
 import html
@@ -18,36 +18,65 @@ th, td { padding: 0.2rem 0.7rem; text-align: right; border-bottom: 1px solid #dd
 th:first-child, td:first-child { text-align: left; }
 tr.own { background: #eef4fb; }
 p.note, li { color: #555; font-size: 0.9rem; }
+pre { background: #f5f5f5; padding: 0.6rem 0.8rem; overflow-x: auto; }
 figure { margin: 1.5rem 0; } img { max-width: 100%; } figcaption { color: #555; font-size: 0.85rem; }
 """
 
 
 def html_page(title: str, tables: Sequence[Table], notes: Sequence[str], pictures: Sequence[Path]) -> str:
-    """The page as text; pictures (PNG files) are embedded, so that it can be sent and kept as one file."""
+    """A report as text: tables, notes, and pictures (PNG files) under their files' names."""
     parts = [
+        *(table(each) for each in tables),
+        heading("Notes"),
+        f"<ul>{''.join(f'<li>{html.escape(note)}</li>' for note in notes)}</ul>",
+        *([heading("Figures")] if pictures else []),
+        *(figure(path, path.stem) for path in pictures),
+    ]
+    return document(title, parts)
+
+
+def document(title: str, parts: Sequence[str]) -> str:
+    """A whole page; its parts are HTML, as the functions below make it of plain text."""
+    head = (
         "<!doctype html>",
         f'<html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title>',
         f"<style>{_STYLE}</style></head><body>",
         f"<h1>{html.escape(title)}</h1>",
-        *(_table(table) for table in tables),
-        "<h2>Notes</h2><ul>",
-        *(f"<li>{html.escape(note)}</li>" for note in notes),
-        "</ul>",
-        *(["<h2>Figures</h2>"] if pictures else []),
-        *(_figure(path) for path in pictures),
-        "</body></html>",
-    ]
-    return "\n".join(parts) + "\n"
+    )
+    return "\n".join([*head, *parts, "</body></html>"]) + "\n"
 
 
-def _table(table: Table) -> str:
-    head = "".join(f"<th>{html.escape(cell)}</th>" for cell in table.header)
-    rows = "\n".join(_row(row) for row in table.rows)
-    notes = "".join(f'<p class="note">{html.escape(note)}</p>' for note in table.notes)
+def heading(text: str) -> str:
+    """The title of a section."""
+    return f"<h2>{html.escape(text)}</h2>"
+
+
+def paragraph(text: str) -> str:
+    """Running text."""
+    return f"<p>{html.escape(text)}</p>"
+
+
+def command(text: str) -> str:
+    """What to type in a terminal."""
+    return f"<pre><code>{html.escape(text)}</code></pre>"
+
+
+def table(content: Table) -> str:
+    """A table under its title, its notes below."""
+    head = "".join(f"<th>{html.escape(cell)}</th>" for cell in content.header)
+    rows = "\n".join(_row(row) for row in content.rows)
+    notes = "".join(f'<p class="note">{html.escape(note)}</p>' for note in content.notes)
     return (
-        f'<h2>{html.escape(table.title)}</h2>\n<div class="scroll"><table><thead><tr>{head}</tr></thead>\n'
+        f'{heading(content.title)}\n<div class="scroll"><table><thead><tr>{head}</tr></thead>\n'
         f"<tbody>\n{rows}\n</tbody></table></div>{notes}"
     )
+
+
+def figure(path: Path, caption: str) -> str:
+    """A picture (a PNG file), embedded, so that the page can be sent and kept as one file."""
+    data = base64.b64encode(path.read_bytes()).decode()
+    text = html.escape(printable(caption))
+    return f'<figure><img alt="{text}" src="data:image/png;base64,{data}"><figcaption>{text}</figcaption></figure>'
 
 
 def _row(row: Sequence[str]) -> str:
@@ -57,9 +86,3 @@ def _row(row: Sequence[str]) -> str:
 
 def _cell(text: str) -> str:
     return re.sub(r"\*\*(.+?)\*\*", r"<b>\1</b>", html.escape(text, quote=False))
-
-
-def _figure(path: Path) -> str:
-    data = base64.b64encode(path.read_bytes()).decode()
-    name = html.escape(printable(path.stem))
-    return f'<figure><img alt="{name}" src="data:image/png;base64,{data}"><figcaption>{name}</figcaption></figure>'

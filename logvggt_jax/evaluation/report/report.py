@@ -206,4 +206,5 @@ def _draw_ate_against_views(results: Mapping[str, Any], output: Path) -> None:
     from logvggt_jax.evaluation.report import figures as plots
 
     for dataset, curves in _ate_curves(results).items():
-        plots.ate_against_views(output / f"figures/ate_against_views_{dataset}.png", curves, f"ATE on {dataset}")
+        path = output / f"figures/ate_against_views_{dataset}.png"
+        plots.curves_plot(path, curves, f"ATE on {dataset}", x_label="views", y_label="ATE (m)")

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from logvggt_jax.evaluation.report.figures import (
-    ate_against_views,
+    curves_plot,
     depth_panel,
     efficiency_plot,
     point_clouds,
@@ -91,7 +91,8 @@ def test_both_clouds_are_drawn_in_their_colours_and_the_nearest_points_in_front(
 
 
 def test_ate_is_drawn_for_every_method(tmp_path: Path) -> None:
-    ate_against_views(tmp_path / "ate.png", {"a": [(50, 0.1), (100, 0.2)], "b": [(50, 0.3), (100, 0.1)]}, "ATE")
+    curves = {"a": [(50, 0.1), (100, 0.2)], "b": [(50, 0.3), (100, 0.1)]}
+    curves_plot(tmp_path / "ate.png", curves, "ATE", x_label="views", y_label="ATE (m)")
     assert orange_pixels(tmp_path / "ate.png") > 200
 
 
