@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +31,17 @@ COUNT, THINNED = 12, PointFilter(max_points=3000)
 def saved_after_every_frame(monkeypatch: pytest.MonkeyPatch) -> None:
     """With `save_seconds=0`, whatever the share of the time that saving takes."""
     monkeypatch.setattr("logvggt_jax.reconstruction.run._SAVING", 1e9)
+
+
+@pytest.fixture(autouse=True)
+def signals_reach_this_process() -> Iterator[None]:
+    """A shell starts what it runs in the background deaf to Ctrl-C."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    for number in before:
+        signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 @pytest.fixture

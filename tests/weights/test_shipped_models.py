@@ -14,6 +14,7 @@ import ship_model
 from logvggt_jax.cli import main
 from logvggt_jax.errors import InputError, MissingInput, OutputExists
 from logvggt_jax.model.logvggt import LogVGGT
+from logvggt_jax.model.parameters import unstack_layers
 from logvggt_jax.training.initialization import initial_parameters
 from logvggt_jax.weights import from_pretrained, load_model, read_provenance, resolve, save_model, shipped_models
 from logvggt_jax.weights.half_precision import PARAMETERS_FILE, rounded
@@ -64,7 +65,8 @@ def test_the_shipped_model_is_the_trained_one_at_16_bits(shipped, small_config, 
 
 def test_its_name_stands_for_it_wherever_a_checkpoint_is_named(shipped, small_config, capsys):
     expected = jax.tree.leaves(load_model("rooms")[1])
-    for found in (from_pretrained("rooms")[1], {"params": initial_parameters(small_config, seed=3, weights="rooms")}):
+    started = unstack_layers(initial_parameters(small_config, seed=3, weights="rooms"), small_config)
+    for found in (from_pretrained("rooms")[1], {"params": started}):
         assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(found), expected, strict=True))
     assert resolve("rooms") == shipped
     assert main(["info", "rooms"]) == 0
