@@ -27,12 +27,10 @@ import numpy as np
 from logvggt_jax import LogVGGT
 from logvggt_jax.data import Rooms
 from logvggt_jax.data.rooms.scenes import RoomScenes
-from logvggt_jax.model.parameters import stack_layers
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.initialization import initial_parameters
 from logvggt_jax.training.program import make_program
 from logvggt_jax.training.sharding import data_mesh, put_batch
-from logvggt_jax.training.state import initial_state
 
 HARD: dict[str, Any] = {
     "repetition": 0.5,
@@ -100,19 +98,19 @@ def training_step(clips: int, clip_length: int, rounds: int) -> None:
     spec.loader.exec_module(module)
     config = TrainConfig.from_dict(module.get_config().to_dict())
     mesh = data_mesh(1)
-    params = stack_layers(initial_parameters(config.model, seed=0, weights=None))
-    optimizer, step = make_program(LogVGGT(config.model), config, params, mesh)
-    state = initial_state(params, optimizer)
+    params = initial_parameters(config.model, seed=0, weights=None)
+    run = make_program(LogVGGT(config.model), config, params, mesh)
+    state = run.initial_state(params)
     rooms = Rooms("train", height=module.HEIGHT, width=module.WIDTH)
     scenes = RoomScenes(rooms)
     described = [scenes.describe(sequence, range(clip_length)) for sequence in rooms.sequences[:clips]]
     batch = put_batch({key: np.stack([each[key] for each in described]) for key in described[0]}, mesh)
     drawn = jax.jit(scenes.draw)(batch)
-    program = step.lower(state, drawn).compile()
+    program = run.step.lower(state, drawn).compile()
     speeds = []
     for _ in range(rounds + 1):
         started = time.perf_counter()
-        state, metrics = program(state, drawn)
+        state, metrics, _ = program(state, drawn)
         jax.block_until_ready(metrics)
         speeds.append(clips * clip_length / (time.perf_counter() - started))
     print(

@@ -79,7 +79,7 @@ def test_the_small_models_step_is_traced_at_its_shortest_and_longest_clips(
     config = _config("small", monkeypatch)
     state, step = _abstract_run(config, 1)
     for stage in (config.stages[0], config.stages[-1]):
-        after, metrics = jax.eval_shape(step, state, abstract_clips(stage.batch_size, stage.clip_length, (168, 224)))
+        after, metrics, _ = jax.eval_shape(step, state, abstract_clips(stage.batch_size, stage.clip_length, (168, 224)))
         assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(lambda x: (x.shape, x.dtype), state)
         assert all(value.shape == () for value in metrics.values())
 
@@ -187,7 +187,7 @@ def _check_step(
     state, step = _abstract_run(config, 16)
     stage = config.stages[stage_index]
     traced = step.trace(state, abstract_clips(stage.batch_size, stage.clip_length, size))
-    after, metrics = traced.out_info
+    after, metrics, _ = traced.out_info
     assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(lambda x: (x.shape, x.dtype), state)
     assert all(value.shape == () for value in metrics.values())
     program = traced.lower(lowering_platforms=(platform,)).as_text()
