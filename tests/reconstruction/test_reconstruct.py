@@ -9,6 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
+from PIL.ExifTags import IFD, Base
 from recorder import Recorder, reconstruct_recorded
 
 from logvggt_jax import LogVGGT, ModelConfig
@@ -261,6 +263,20 @@ def test_a_full_disk_stops_the_run_with_its_own_error(
         reconstruct_recorded(predictor, walk, tmp_path / "out", progress=False, workers=1)
     assert predictor.num_frames < 30
     assert [entry.name for entry in tmp_path.iterdir()] == ["walk"]
+
+
+def test_the_focal_length_of_the_camera_is_shown_beside_the_predicted_one(tmp_path: Path) -> None:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    exif = Image.Exif()
+    exif.get_ifd(IFD.Exif)[Base.FocalLengthIn35mmFilm] = 36  # as wide as the film: focal length = width
+    for index in range(4):
+        Image.new("RGB", (84, 56), (index, 0, 0)).save(folder / f"{index}.jpg", exif=exif)
+    result = reconstruct_recorded(Recorder(), folder, tmp_path / "out", progress=False)
+    noted = Reconstruction.open(result.folder).noted_focal_length
+    assert noted == pytest.approx(84, rel=0.05)
+    predicted = float(np.median(result.intrinsics[:, 0, 0]))
+    assert f"focal length: {predicted:.0f} pixels predicted, {noted:.0f} by the camera's EXIF" in result.summary()
 
 
 @pytest.mark.parametrize("terminal", ["0", "1"])
