@@ -49,7 +49,7 @@ def clip_of(frames: Frames) -> ClipData:
 
 
 def benchmarks_of(dataset: Any, settings: ClipSettings = SETTINGS) -> list[Benchmark]:
-    return [Benchmark(protocol, dataset, "test") for protocol in clip_protocols("rooms", "test", settings)]
+    return [Benchmark(protocol, dataset, "test") for protocol in clip_protocols("rooms", "test", settings, SIZE)]
 
 
 def run(

@@ -5,7 +5,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from known_answers import SETTINGS, clip_of, oracle
+from known_answers import SETTINGS, SIZE, clip_of, oracle
 
 from logvggt_jax.data.rooms.rooms import Rooms
 from logvggt_jax.evaluation import scores, scratch
@@ -27,7 +27,7 @@ from logvggt_jax.metrics.depth import pixel_errors, resize_depth
 from logvggt_jax.metrics.pose import relative_pose_errors
 from logvggt_jax.types import Frames
 
-PROTOCOL = clip_protocols("rooms", "test", SETTINGS)[0]
+PROTOCOL = clip_protocols("rooms", "test", SETTINGS, SIZE)[0]
 
 
 def score_of(frames: Frames, truth: ClipTruth, **changes: np.ndarray) -> ClipScore:
