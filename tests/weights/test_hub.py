@@ -14,7 +14,7 @@ from logvggt_jax.weights import open_state_dict, read_provenance
 from logvggt_jax.weights.address import resolve
 from logvggt_jax.weights.hub import download
 
-constants = pytest.importorskip("huggingface_hub.constants")
+constants = pytest.importorskip("huggingface_hub.constants", reason="extra `hub` is not installed")
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 
 
