@@ -5,7 +5,7 @@ import hashlib
 import json
 import multiprocessing
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ import numpy as np
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from logvggt_jax.data.dataset import Dataset, check_indices, check_sequence
+from logvggt_jax.data.rooms.same_rooms import SameRooms
 from logvggt_jax.errors import InputError, OutputExists
 from logvggt_jax.files import atomic_folder
 from logvggt_jax.frames import Frames
@@ -22,7 +23,7 @@ _ARRAYS = ("images", "depth", "intrinsics", "extrinsics")
 _SERIAL_PIXELS = 3e7  # fewer than this are rendered sooner than worker processes start
 
 
-class RoomPool:
+class RoomPool(SameRooms[Dataset]):
     """All frames of a `Rooms`, rendered by `render_pool`; the same bytes as reading `Rooms` itself.
 
     Costs 7 bytes a pixel (uint8 RGB, float32 depth): 1,500 rooms of 24 frames of 56 x 70 take 0.99 GB. A pool
@@ -31,8 +32,8 @@ class RoomPool:
     """
 
     def __init__(self, rooms: Dataset, arrays: dict[str, np.ndarray], folder: Path | None) -> None:
-        self.rooms, self.folder = rooms, folder
-        self.sequences = rooms.sequences
+        super().__init__(rooms)
+        self.folder = folder
         self._rows = {name: row for row, name in enumerate(rooms.sequences)}
         self._arrays = arrays
 
@@ -43,27 +44,6 @@ class RoomPool:
         self.__dict__.update(state)
         if self.folder:
             self._arrays = _open_arrays(self.folder, self.rooms)
-
-    @property
-    def identity(self) -> Mapping[str, Any]:
-        """That of the rooms."""
-        return self.rooms.identity
-
-    def num_frames(self, sequence: str) -> int:
-        """Frames of `sequence`."""
-        return self.rooms.num_frames(sequence)
-
-    def image_size(self, sequence: str) -> tuple[int, int]:
-        """(H, W): the same for all rooms."""
-        return self.rooms.image_size(sequence)
-
-    def frame_names(self, sequence: str) -> Sequence[str]:
-        """Names as `Rooms` gives them."""
-        return self.rooms.frame_names(sequence)
-
-    def sfm_extrinsics(self, sequence: str, indices: Sequence[int]) -> np.ndarray | None:
-        """None: rooms have exact poses only."""
-        return self.rooms.sfm_extrinsics(sequence, indices)
 
     def read(self, sequence: str, indices: Sequence[int]) -> Frames:
         """Copies of frames `indices`."""

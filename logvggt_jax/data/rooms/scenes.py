@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.data.rooms.layout import Room
+from logvggt_jax.data.rooms.same_rooms import SameRooms
 from logvggt_jax.data.rooms.textures import Textures
-from logvggt_jax.frames import Frames
 
 
 class Views(NamedTuple):
@@ -20,9 +20,8 @@ class Views(NamedTuple):
 
     intrinsics: np.ndarray  # [T, 3, 3] pixels
     extrinsics: np.ndarray  # [T, 4, 4] world-to-camera (OpenCV), the frame's pose
-    exposures: (
-        np.ndarray
-    )  # [T, K, 4, 4] world-to-camera over whose pictures a frame is the mean; the middle is its pose
+    # [T, K, 4, 4] world-to-camera, over whose pictures a frame is the mean; the middle is its pose
+    exposures: np.ndarray
     gains: np.ndarray  # [T] factor of the brightness
 
 
@@ -43,37 +42,11 @@ class DescribedRooms(Dataset, Protocol):
         ...
 
 
-class RoomScenes:
-    """The frames of `rooms` for training, described on the host and drawn on the device; a `DrawnOnDevice`."""
+class RoomScenes(SameRooms[DescribedRooms]):
+    """The frames of rooms for training, described on the host and drawn on the device; a `DrawnOnDevice`.
 
-    def __init__(self, rooms: DescribedRooms) -> None:
-        self.rooms = rooms
-        self.sequences = rooms.sequences
-
-    @property
-    def identity(self) -> Mapping[str, Any]:
-        """That of the rooms."""
-        return self.rooms.identity
-
-    def num_frames(self, sequence: str) -> int:
-        """Frames of `sequence`."""
-        return self.rooms.num_frames(sequence)
-
-    def image_size(self, sequence: str) -> tuple[int, int]:
-        """(H, W): the same for all rooms."""
-        return self.rooms.image_size(sequence)
-
-    def frame_names(self, sequence: str) -> Sequence[str]:
-        """Names as the rooms give them."""
-        return self.rooms.frame_names(sequence)
-
-    def sfm_extrinsics(self, sequence: str, indices: Sequence[int]) -> np.ndarray | None:
-        """None: rooms have exact poses only."""
-        return self.rooms.sfm_extrinsics(sequence, indices)
-
-    def read(self, sequence: str, indices: Sequence[int]) -> Frames:
-        """Frames `indices`, drawn on the host: equal to the device's to a grey level."""
-        return self.rooms.read(sequence, indices)
+    `read` draws on the host: equal to the device's to a grey level.
+    """
 
     def describe(self, sequence: str, indices: Sequence[int]) -> dict[str, np.ndarray]:
         """What `draw` makes frames `indices` from: float32 arrays whose shapes are those of every room."""
