@@ -31,27 +31,12 @@ FIELD_OF_VIEW = (2 * math.atan(HEIGHT / WIDTH / 2 / tiny.FOCAL), 2 * math.atan(1
 def get_config(initial_weights: str = "") -> ConfigDict:
     """The run from random numbers, or its last stage from `initial_weights`, which `from_pretrained` reads."""
     config = tiny.get_config()
-    config.model = {
-        # 12 x 16 patches.
-        "encoder": {"embed_dim": 128, "depth": 2, "num_heads": 4, "position_grid": 16, "frozen": False},
-        "aggregator": {
-            "depth": 8,
-            "num_heads": 4,
-            "key_layers": (1, 3, 5, 7),
-            "layer_scale": 1.0,
-            "token_scale": 1.0,
-        },
-        "camera_head": {
-            "depth": 1,
-            "num_heads": 4,
-            "layer_scale": 1.0,
-            "initial_pose": (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, *FIELD_OF_VIEW),
-        },
-        "depth_head": {"features": 32, "out_channels": (32, 64, 64, 64)},
-        "windows": {"size": 4, "stride": 2},
-        "refinement": {"num_heads": 4},
-        "dtype": "bfloat16",
-    }
+    # 12 x 16 patches.
+    config.model.encoder.update(embed_dim=128, position_grid=16)
+    config.model.aggregator.update(depth=8, key_layers=(1, 3, 5, 7))
+    config.model.camera_head.initial_pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, *FIELD_OF_VIEW)
+    config.model.depth_head = {"features": 32, "out_channels": (32, 64, 64, 64)}
+    config.model.dtype = "bfloat16"
     config.stages = ConfigDict(
         {
             "stage_1": _stage(steps=8000, clip_length=4, batch_size=32, strides=(1, 6)),
