@@ -1,13 +1,17 @@
 """Results appear whole or not at all: files and folders written under another name and renamed at the end."""
 
 import os
+import platform
 import secrets
 import shutil
 import stat
-from collections.abc import Iterator
+import warnings
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
+
+from filelock import FileLock, Timeout
 
 from logvggt_jax.errors import DiskError, InputError, OutputExists, disk_errors
 
@@ -67,7 +71,7 @@ def atomic_folder(path: str | Path, *, replace: bool = False) -> Iterator[Path]:
     try:
         yield partial
         with disk_errors(path):
-            _move(partial, path, replace=replace)
+            move_folder(partial, path, replace=replace)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
 
@@ -120,6 +124,49 @@ def existing_parent(path: Path) -> Path:
     return next(parent for parent in path.parents if parent.exists())
 
 
+class FolderLock:
+    """The exclusive use of a folder, which ends with the process that has it, however that ends.
+
+    Args:
+      folder: made where it is not there; its `.lock` and `.owner` belong to the lock.
+      mend: what else a user can do, for the end of an error.
+
+    Raises:
+      InputError: another run has the folder; says which process.
+      DiskError: it cannot be written.
+    """
+
+    def __init__(self, folder: Path, mend: str) -> None:
+        owner = folder / ".owner"
+        with disk_errors(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            self._lock = FileLock(folder / ".lock")
+            try:
+                self._lock.acquire(timeout=0)
+            except Timeout:
+                who = owner.read_text() if owner.exists() else "unknown"
+                raise InputError(
+                    f"{folder}: another run is using this folder ({who}); wait until it has ended or {mend}"
+                ) from None
+            except NotImplementedError as error:  # some network file systems
+                warnings.warn(f"{folder} cannot be locked ({error}); take care that no other run uses it", stacklevel=2)
+            owner.write_text(f"process {os.getpid()} on {platform.node()}")
+
+    def release(self) -> None:
+        """Lets others have the folder."""
+        self._lock.release()
+
+
+def to_disk(paths: Iterable[Path]) -> None:
+    """Makes the operating system write files and folders: a full disk, or a lost one, says so here."""
+    for path in paths:
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
 def user_cache_folder(kind: str) -> Path:
     """`logvggt/<kind>` in the user's cache folder (`XDG_CACHE_HOME`, else `~/.cache`); not created here."""
     return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "logvggt" / kind
@@ -133,7 +180,8 @@ def _exists(path: Path) -> OutputExists:
     return OutputExists(f"{path} exists: choose another output or pass --overwrite to replace it")
 
 
-def _move(source: Path, target: Path, *, replace: bool) -> None:
+def move_folder(source: Path, target: Path, *, replace: bool) -> None:
+    """Renames a folder; with `replace` what is at `target` goes once the other stands in its place."""
     if not replace:
         if target.exists():
             raise _exists(target)

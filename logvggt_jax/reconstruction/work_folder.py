@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import shutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -12,16 +11,15 @@ from types import TracebackType
 from typing import Any, NamedTuple
 
 import numpy as np
-from filelock import FileLock, Timeout
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from logvggt_jax.errors import InputError, OutputExists, disk_errors, one_line
-from logvggt_jax.files import atomic_file, check_output, write_text
+from logvggt_jax.files import FolderLock, atomic_file, check_output, move_folder, to_disk, write_text
 from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE, is_complete
 
 _PROGRESS = ".progress"
-_REQUEST, _STATE, _LOCK, _OWNER = "request.json", "state.safetensors", "lock", "owner"
+_REQUEST, _STATE = "request.json", "state.safetensors"
 _MEND = "pass --overwrite to start anew"
 
 
@@ -53,7 +51,7 @@ class WorkFolder:
         self._output, self._request, self._overwrite = output, dict(request), overwrite
         self.path = work_path(output)
         self._progress = self.path / _PROGRESS
-        self._lock = FileLock(self._progress / _LOCK)
+        self._lock: FolderLock | None = None
 
     def __enter__(self) -> WorkFolder:
         with disk_errors(self.path):
@@ -63,11 +61,7 @@ class WorkFolder:
             check_output(self._output, overwrite=self._overwrite, marker=CAMERAS_FILE)
             if self.path.exists() and not self._progress.is_dir() and any(self.path.iterdir()):
                 raise OutputExists(f"{self.path} is in the way and was not made by this program: move it elsewhere")
-            self._progress.mkdir(parents=True, exist_ok=True)
-            try:
-                self._lock.acquire(timeout=0)
-            except Timeout:
-                raise InputError(f"{self.path}: {_owner(self._progress)} is writing there; let it end first") from None
+        self._lock = FolderLock(self._progress, "choose another output")
         try:
             with disk_errors(self.path):
                 self._take_over()
@@ -80,7 +74,8 @@ class WorkFolder:
         """Lets go of the folder; without a saved state nobody can use it, and it goes."""
         if self._progress.is_dir() and not (self._progress / _STATE).is_file():
             shutil.rmtree(self.path, ignore_errors=True)
-        self._lock.release()
+        if self._lock is not None:
+            self._lock.release()
 
     def _take_over(self) -> None:
         stored = self._progress / _REQUEST
@@ -92,7 +87,6 @@ class WorkFolder:
                     shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
             (self._progress / _STATE).unlink(missing_ok=True)
         write_text(stored, json.dumps(self._request, indent=1))
-        write_text(self._progress / _OWNER, f"process {os.getpid()} on {os.uname().nodename}")
 
     def saved(self) -> Progress | None:
         """What the last `save` stored; None for a new run. InputError where the file is damaged."""
@@ -114,23 +108,18 @@ class WorkFolder:
     def save(self, progress: Progress, files: Iterable[Path]) -> None:
         """Stores where the run is, once what it rests on, `files`, is on the disk."""
         with disk_errors(self.path):
-            for file in files:
-                _to_disk(file)
+            to_disk(files)
         arrays = {name: np.ascontiguousarray(array) for name, array in progress.arrays.items()}
         facts = json.dumps(progress.facts)
         with atomic_file(self._progress / _STATE) as temporary:
             save_file(arrays, temporary, metadata={"facts": facts, "digest": _digest(facts, arrays)})
-            _to_disk(temporary)
+            to_disk([temporary])
 
     def commit(self, *, complete: bool) -> None:
         """Puts the folder in the result's place; an incomplete one can still be taken up."""
         with disk_errors(self._output):
-            aside = self._output.with_name(f".{self._output.name}.{os.getpid()}.old")
-            if self._output.exists():
-                check_output(self._output, overwrite=self._overwrite, marker=CAMERAS_FILE)
-                self._output.rename(aside)
-            self.path.rename(self._output)
-        shutil.rmtree(aside, ignore_errors=True)
+            check_output(self._output, overwrite=self._overwrite, marker=CAMERAS_FILE)
+            move_folder(self.path, self._output, replace=self._overwrite)
         if complete:
             shutil.rmtree(self._output / _PROGRESS, ignore_errors=True)
 
@@ -159,25 +148,9 @@ def _check_request(folder: Path, request: Mapping[str, str]) -> None:
         )
 
 
-def _owner(progress: Path) -> str:
-    try:
-        return (progress / _OWNER).read_text()
-    except OSError:
-        return "another run"
-
-
 def _digest(facts: str, arrays: Mapping[str, np.ndarray]) -> str:
     digest = hashlib.blake2b(facts.encode(), digest_size=16)
     for name in sorted(arrays):
         digest.update(f"{name} {arrays[name].dtype.name} {arrays[name].shape}".encode())
-        digest.update(arrays[name].tobytes())
+        digest.update(np.ascontiguousarray(arrays[name]).reshape(-1).view(np.uint8).data)  # no copy of its bytes
     return digest.hexdigest()
-
-
-def _to_disk(file: Path) -> None:
-    """Survives a loss of power from here on."""
-    descriptor = os.open(file, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

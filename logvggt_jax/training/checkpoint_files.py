@@ -12,7 +12,6 @@ from __future__ import annotations
 import contextlib
 import importlib.metadata
 import json
-import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,7 +21,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 
 from logvggt_jax.compile import out_of_device_memory
 from logvggt_jax.errors import InputError
-from logvggt_jax.files import atomic_folder
+from logvggt_jax.files import atomic_folder, to_disk
 from logvggt_jax.model.parameters import stack_layers, unstack_layers
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.state import TrainState
@@ -65,7 +64,7 @@ def write_checkpoint(folder: Path, state: TrainState, position: Position, config
         for name, content in (("data", position.data), ("meta", meta)):
             (fresh / name).mkdir()
             (fresh / name / "metadata").write_text(json.dumps(content))
-        _to_disk(fresh)
+        to_disk([*fresh.rglob("*"), fresh])
 
 
 class StoredCheckpoint:
@@ -132,16 +131,6 @@ class StoredCheckpoint:
                 raise
             reason = f"{type(error).__name__}: {' '.join(str(error).split()):.200}"
             raise DamagedCheckpoint(f"{self.where} cannot be read ({reason})") from error
-
-
-def _to_disk(folder: Path) -> None:
-    """Makes the operating system write all files below `folder`: a full disk, or a lost one, says so here."""
-    for path in (*folder.rglob("*"), folder):
-        descriptor = os.open(path, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
 
 
 def _parts(state: TrainState) -> tuple[Any, dict[str, Any]]:

@@ -14,13 +14,13 @@ import numpy as np
 from absl import logging
 
 from logvggt_jax.errors import DiskError, InputError, OutputExists, disk_errors, one_line
-from logvggt_jax.files import write_text
+from logvggt_jax.files import FolderLock, write_text
 from logvggt_jax.model.parameters import unstack_layers
 from logvggt_jax.training.checkpoint_files import DamagedCheckpoint, Position, StoredCheckpoint, write_checkpoint
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.processes import any_process
 from logvggt_jax.training.state import TrainState
-from logvggt_jax.training.work_folder import FolderLock, remove_scratch
+from logvggt_jax.training.work_folder import remove_scratch
 from logvggt_jax.weights.checkpoints import check_destination, read_provenance, save_model
 from logvggt_jax.weights.digests import whole_array
 from logvggt_jax.weights.folder import is_model_folder
@@ -53,7 +53,7 @@ class RunCheckpoints:
     def __enter__(self) -> RunCheckpoints:
         """Raises InputError where another run uses the folder."""
         if jax.process_index() == 0:
-            self._lock = FolderLock(self.folder.parent)
+            self._lock = FolderLock(self.folder.parent, "start in another --workdir")
             remove_scratch(self.folder.parent)
         return self
 

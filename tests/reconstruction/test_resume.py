@@ -246,7 +246,7 @@ def test_one_run_at_a_time(tmp_path: Path) -> None:
         work.save(Progress({}, {}), [])
         for overwrite in (False, True):
             with (
-                pytest.raises(InputError, match=f"process {os.getpid()} on .* is writing there"),
+                pytest.raises(InputError, match=rf"another run is using this folder \(process {os.getpid()} on "),
                 WorkFolder(output, {"method": "windows"}, overwrite=overwrite),
             ):
                 pass

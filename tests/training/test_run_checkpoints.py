@@ -248,7 +248,7 @@ class _Killed(BaseException):
 
 
 # What a save does to the disk, in its order.
-MOMENTS = ("write_arrays", "_to_disk", "json", "move")
+MOMENTS = ("write_arrays", "to_disk", "json", "move")
 
 
 @pytest.mark.parametrize("full", [True, False])
@@ -265,7 +265,7 @@ def test_a_save_that_does_not_end_leaves_no_checkpoint(
         if moment == "json":
             patch.setattr(Path, "write_text", fail)
         elif moment == "move":
-            patch.setattr("logvggt_jax.files._move", fail)
+            patch.setattr("logvggt_jax.files.move_folder", fail)
         else:
             patch.setattr(checkpoint_files, moment, fail)
         with RunCheckpoints(saved, run_config) as checkpoints:
@@ -314,8 +314,8 @@ def test_what_killed_saves_left_goes_when_the_run_comes_back(
 
 def test_a_folder_that_another_run_uses_is_refused(run_config: TrainConfig, saved: Path) -> None:
     hold = (
-        "import sys; from pathlib import Path; from logvggt_jax.training.work_folder import FolderLock\n"
-        "lock = FolderLock(Path(sys.argv[1])); print('held', flush=True); sys.stdin.read()"
+        "import sys; from pathlib import Path; from logvggt_jax.files import FolderLock\n"
+        "lock = FolderLock(Path(sys.argv[1]), 'wait'); print('held', flush=True); sys.stdin.read()"
     )
     with subprocess.Popen(
         [sys.executable, "-c", hold, str(saved)], text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE
