@@ -150,7 +150,11 @@ class FolderLock:
                 ) from None
             except NotImplementedError as error:  # some network file systems
                 warnings.warn(f"{folder} cannot be locked ({error}); take care that no other run uses it", stacklevel=2)
-            owner.write_text(f"process {os.getpid()} on {platform.node()}")
+            try:
+                owner.write_text(f"process {os.getpid()} on {platform.node()}")
+            except OSError:
+                self._lock.release()
+                raise
 
     def release(self) -> None:
         """Lets others have the folder."""

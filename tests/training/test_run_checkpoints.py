@@ -259,7 +259,7 @@ def test_a_save_that_does_not_end_leaves_no_checkpoint(
     def fail(*_: Any, **__: Any) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)) if full else _Killed("9")
 
-    with monkeypatch.context() as patch:
+    with RunCheckpoints(saved, run_config) as checkpoints, monkeypatch.context() as patch:
         if not full:  # Nobody tidies up after a process that was killed.
             patch.setattr(shutil, "rmtree", lambda *_, **__: None)
         if moment == "json":
@@ -268,11 +268,10 @@ def test_a_save_that_does_not_end_leaves_no_checkpoint(
             patch.setattr("logvggt_jax.files.move_folder", fail)
         else:
             patch.setattr(checkpoint_files, moment, fail)
-        with RunCheckpoints(saved, run_config) as checkpoints:
-            checkpoints.save(_at(state, 3), POSITION)
-            with pytest.raises(InputError if full else _Killed, match=r"checkpoints/3.*No space left" if full else "9"):
-                checkpoints.wait()
-            assert checkpoints.steps == [0]
+        checkpoints.save(_at(state, 3), POSITION)
+        with pytest.raises(InputError if full else _Killed, match=r"checkpoints/3.*No space left" if full else "9"):
+            checkpoints.wait()
+        assert checkpoints.steps == [0]
     if full:
         assert [entry.name for entry in (saved / "checkpoints").iterdir()] == ["0"]
     _same(_restore(saved, run_config, state)[0], state)
