@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from logvggt_jax.errors import InputError, MissingPackage
+from logvggt_jax.errors import InputError, MissingPackage, install_line
 from logvggt_jax.geometry import camera_centres, matrix_to_quaternion
 from logvggt_jax.reconstruction.result import Reconstruction
 
@@ -36,7 +36,7 @@ def open_viewer(folder: str | Path, *, host: str = HOST, port: int = 8080) -> An
     try:
         import viser
     except ImportError as error:
-        raise MissingPackage('the viewer needs viser: pip install "logvggt-jax[viewer]"') from error
+        raise MissingPackage(f"the viewer needs viser: {install_line('viewer')}") from error
 
     centres = camera_centres(result.extrinsics)
     shown = points[:: max(1, len(points) // 10_000)].astype(np.float64)

@@ -20,7 +20,7 @@ import jax
 from jax.sharding import NamedSharding, PartitionSpec
 
 from logvggt_jax.compile import out_of_device_memory
-from logvggt_jax.errors import InputError
+from logvggt_jax.errors import InputError, one_line
 from logvggt_jax.files import atomic_folder, to_disk
 from logvggt_jax.model.parameters import stack_layers, unstack_layers
 from logvggt_jax.training.config import TrainConfig
@@ -129,7 +129,7 @@ class StoredCheckpoint:
             # What the machine lacks is no fault of the checkpoint.
             if isinstance(error, jax.errors.JaxRuntimeError) and out_of_device_memory(error):
                 raise
-            reason = f"{type(error).__name__}: {' '.join(str(error).split()):.200}"
+            reason = f"{type(error).__name__}: {one_line(error):.200}"
             raise DamagedCheckpoint(f"{self.where} cannot be read ({reason})") from error
 
 

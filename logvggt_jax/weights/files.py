@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import safetensors
 
-from logvggt_jax.errors import InputError, MissingInput, disk_errors
+from logvggt_jax.errors import InputError, MissingInput, disk_errors, one_line
 from logvggt_jax.weights.content import content_of
 from logvggt_jax.weights.lazy import LazyTensors, refused_type
 from logvggt_jax.weights.shards import INDEX_SUFFIX, is_shard, present_shards, read_index
@@ -117,9 +117,9 @@ def open_safetensors(path: Path) -> Iterator[LazyTensors]:
         with disk_errors(path):
             opened = safetensors.safe_open(path, framework="numpy")
     except safetensors.SafetensorError as error:
-        reason = " ".join(str(error).split())
         raise InputError(
-            f"{path}: not a readable safetensors file ({reason}); it is damaged or truncated, copy or download it again"
+            f"{path}: not a readable safetensors file ({one_line(error)}); it is damaged or truncated, copy or download it "
+            "again"
         ) from error
     with opened as file:
 

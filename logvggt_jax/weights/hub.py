@@ -5,7 +5,7 @@ from typing import Any
 
 from rich.console import Console
 
-from logvggt_jax.errors import InputError, MissingInput, MissingPackage, one_line
+from logvggt_jax.errors import InputError, MissingInput, MissingPackage, install_line, one_line
 from logvggt_jax.weights.files import choose_weights
 from logvggt_jax.weights.shards import INDEX_SUFFIX, read_index
 
@@ -102,7 +102,7 @@ def _client(repository: str) -> Any:
     except ImportError as error:
         raise MissingPackage(
             f"{repository}: no such path here, and reading from the hub needs huggingface_hub; "
-            'pip install "logvggt-jax[hub]" or download the file and give its path'
+            f"{install_line('hub')} or download the file and give its path"
         ) from error
     return huggingface_hub
 

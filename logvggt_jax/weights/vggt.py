@@ -22,7 +22,7 @@ from logvggt_jax.config import (
     RefinementConfig,
 )
 from logvggt_jax.errors import InputError
-from logvggt_jax.model.logvggt import LogVGGT
+from logvggt_jax.model.logvggt import LogVGGT, variable_shapes
 from logvggt_jax.weights.digests import non_finite
 
 ParamPath = tuple[str, ...]
@@ -359,13 +359,8 @@ def _seen(state_dict: Mapping[str, np.ndarray]) -> str:
 def parameter_shapes(config: ModelConfig) -> dict[str, Any]:
     """The parameter tree as `jax.ShapeDtypeStruct`s placed on the default device, nothing computed."""
     sharding = jnp.zeros(()).sharding
-    traced = _traced_shapes(config)
-    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding), traced)
-
-
-@functools.lru_cache(maxsize=8)
-def _traced_shapes(config: ModelConfig) -> dict[str, Any]:
-    return jax.eval_shape(LogVGGT(config).init, jax.random.key(0), _smallest_images(config))["params"]
+    shapes: dict[str, Any] = variable_shapes(config)["params"]
+    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding), shapes)
 
 
 def _differences(state_dict: Mapping[str, np.ndarray], config: ModelConfig) -> str:

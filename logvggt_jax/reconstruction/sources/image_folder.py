@@ -22,7 +22,6 @@ from logvggt_jax.reconstruction.sources.pictures import read_picture, refuse_dep
 from logvggt_jax.reconstruction.sources.source import SkippedFrame, Source, SourceFrame, SourceOptions, fingerprint
 
 _LONGEST_NAME = 240  # bytes; a file of the result adds its suffix, and file systems allow 255
-_FIRST_BROKEN = 2
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,7 +128,7 @@ class FolderSource(Source):
             self.skipped.append(SkippedFrame(name, str(error)))
 
     def _check_share(self) -> None:
-        if len(self.skipped) > max(_FIRST_BROKEN, self.options.most_broken * self._asked_for):
+        if self.options.too_many_broken(len(self.skipped), self._asked_for):
             raise InputError(
                 f"{len(self.skipped)} of {self._asked_for} images of {self.path} cannot be read, more than the "
                 f"{self.options.most_broken:.0%} that may be left out: {_reasons(self.skipped)}"

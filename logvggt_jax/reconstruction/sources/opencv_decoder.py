@@ -16,14 +16,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from logvggt_jax.errors import InputError
+from logvggt_jax.errors import InputError, install_line
 from logvggt_jax.reconstruction.sources.decoding import Damage, Picture, VideoHeader
 
 # OpenCV tells neither why a frame failed nor whether the file has ended: after so many failures in a row it has.
 _MOST_FAILURES = 64
 # The codec by which FFmpeg draws text as a terminal would.
 _TEXT = "ansi"
-_PYAV = "pip install 'logvggt-jax[video]'"
+_PYAV = install_line("video")
 
 
 class OpenCVDecoder:

@@ -54,7 +54,7 @@ class SourceOptions:
       size_mismatch: what happens to images of several sizes: `error`, `crop` (all are cut from their centre to the
         smallest height and the smallest width) or `skip` (the most frequent size stays).
       strict: a frame that cannot be read is an error. Otherwise it is left out and listed.
-      most_broken: the share of the frames that may be left out so, beyond a first two.
+      most_broken: the share of the frames that may be left out so; two always may.
     """
 
     stride: int = 1
@@ -78,6 +78,10 @@ class SourceOptions:
             raise InputError(f"start must lie between 0 and the end ({self.end} s), got {self.start} s")
         if self.size_mismatch not in SIZE_MISMATCH:
             raise InputError(f"size_mismatch must be one of {', '.join(SIZE_MISMATCH)}, got {self.size_mismatch!r}")
+
+    def too_many_broken(self, broken: int, total: int) -> bool:
+        """Whether so many of the frames are more than may be left out."""
+        return broken > max(2, self.most_broken * total)
 
 
 class Source(abc.ABC):

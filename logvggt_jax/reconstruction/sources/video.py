@@ -30,8 +30,6 @@ _STREAM = re.compile(r"(rtsps?|rtmps?|https?|udp|tcp|rtp|srt|mms):/{1,2}(?=[^/])
 _TIMEOUT = 10.0
 # Brands of files that are built like an mp4 but hold pictures.
 _PICTURES = (b"heic", b"heix", b"hevc", b"mif1", b"msf1", b"avif", b"avis")
-# So many frames may be left out, whatever share of the video they are.
-_ALWAYS_ALLOWED = 2
 
 
 def is_live(path: str | Path) -> bool:
@@ -156,7 +154,7 @@ class VideoSource(Source):
         if self.options.strict:
             raise InputError(f"{self._name}: {name} cannot be decoded ({reason}); re-encode the video")
         total = self.expected_frames or taken + count
-        if count > max(_ALWAYS_ALLOWED, self.options.most_broken * total):
+        if self.options.too_many_broken(count, total):
             raise InputError(
                 f"{self._name}: {count} of {total} frames cannot be decoded, up to {name} ({reason}), more than "
                 f"{self.options.most_broken:.0%}; copy the video anew or re-encode it"
