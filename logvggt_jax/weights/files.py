@@ -118,8 +118,8 @@ def open_safetensors(path: Path) -> Iterator[LazyTensors]:
             opened = safetensors.safe_open(path, framework="numpy")
     except safetensors.SafetensorError as error:
         raise InputError(
-            f"{path}: not a readable safetensors file ({one_line(error)}); it is damaged or truncated, copy or download "
-            "it again"
+            f"{path}: not a readable safetensors file ({one_line(error)}); it is damaged or truncated, "
+            "copy or download it again"
         ) from error
     with opened as file:
 
