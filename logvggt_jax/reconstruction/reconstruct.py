@@ -131,7 +131,11 @@ def reconstruct(
         if run.num_taken and progress:
             console.print(f"going on after {run.num_taken} frames that an earlier run has done", highlight=False)
         started = time.monotonic()
-        complete = run.stream(stop, advance=lambda: bars.advance(task))
+        complete = run.stream(
+            stop,
+            advance=lambda: bars.advance(task),
+            refined=lambda done, count: bars.update(task, description="Refinement", completed=done, total=count),
+        )
         seconds = time.monotonic() - started
         run.write_cameras(complete=complete)
         result = Reconstruction.with_cameras_of(work.path)

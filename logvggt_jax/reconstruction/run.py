@@ -20,8 +20,9 @@ from logvggt_jax.reconstruction.frame_pool import FramePool
 from logvggt_jax.reconstruction.point_cloud import PointSelection
 from logvggt_jax.reconstruction.result import DEPTH_FOLDER, IMAGE_FOLDER, depth_file, image_file
 from logvggt_jax.reconstruction.sources import SkippedFrame, Source, SourceFrame
-from logvggt_jax.reconstruction.work_folder import Progress, WorkFolder
-from logvggt_jax.streaming import FrameResult, Predictor
+from logvggt_jax.reconstruction.work_folder import WorkFolder
+from logvggt_jax.streaming import FrameResult, Predictor, Progress
+from logvggt_jax.streaming.state_file import State
 
 _NARROWEST_FIELD_OF_VIEW = 0.01  # radians
 # Saving takes at most this share of the time.
@@ -83,8 +84,13 @@ class Run:
         if (saved := work.saved()) is not None:
             self._restore(saved)
 
-    def stream(self, stop: StopRequest, *, advance: Callable[[], object]) -> bool:
+    def stream(self, stop: StopRequest, *, advance: Callable[[], object], refined: Progress) -> bool:
         """The rest of the sequence through the predictor; images and depth go to disk, and the selection sees all.
+
+        Args:
+          stop: asks for an early end.
+          advance: called with every frame taken.
+          refined: told how far a long refinement at the end has come.
 
         Returns:
           Whether the source was read to its end; False if SIGINT ended the sequence.
@@ -112,7 +118,7 @@ class Run:
         if stop.reason not in (None, "SIGINT"):
             kept = f"{self._predictor.num_frames} frames are kept in {self._work.path}"
             raise Interrupted(stop.reason, f"{kept}; the same command goes on from there")
-        self._hand_on(self._predictor.close())
+        self._hand_on(self._predictor.close(refined))
         self._pool.finish()
         if not self._names:
             raise InputError(f"{self._source.path} gave no frame")
@@ -198,12 +204,12 @@ class Run:
             "size": None if self._transform is None else self._transform.original_size,
             "model_size": None if self._transform is None else self._transform.size,
         }
-        self._work.save(Progress(arrays, facts), self._files)
+        self._work.save(State(arrays, facts), self._files)
         self._files = []
         self._last_save = time.monotonic()
         self._saving = self._last_save - started
 
-    def _restore(self, saved: Progress) -> None:
+    def _restore(self, saved: State) -> None:
         facts = saved.facts
         self.num_taken = facts["num_taken"]
         if self._source.fingerprint(self.num_taken) != facts["source"]:

@@ -7,8 +7,9 @@ from logvggt_jax.streaming.merged import MergedSession, MergedSettings
 from logvggt_jax.streaming.offline import OfflineSession, OfflineSettings
 from logvggt_jax.streaming.predictor import METHODS, Method, Predictor, open_predictor
 from logvggt_jax.streaming.pruned import PrunedSettings
-from logvggt_jax.streaming.results import Cameras, FrameResult, PredictionError
+from logvggt_jax.streaming.results import Cameras, FrameResult, PredictionError, Progress, Signals
 from logvggt_jax.streaming.rolling import RollingSettings
+from logvggt_jax.streaming.state_file import load_stream, save_stream
 from logvggt_jax.streaming.windows import StreamSession, WindowSettings
 
 __all__ = [
@@ -26,9 +27,13 @@ __all__ = [
     "OfflineSettings",
     "PredictionError",
     "Predictor",
+    "Progress",
     "PrunedSettings",
     "RollingSettings",
+    "Signals",
     "StreamSession",
     "WindowSettings",
+    "load_stream",
     "open_predictor",
+    "save_stream",
 ]

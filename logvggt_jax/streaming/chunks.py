@@ -23,7 +23,7 @@ from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.model.parameters import in_compute_type
 from logvggt_jax.streaming.offline import FinalFrames, PlainPrediction, plain_program, predict_plain
 from logvggt_jax.streaming.program import Program
-from logvggt_jax.streaming.results import Cameras, FrameResult, PredictionError, checked_frames, device_memory
+from logvggt_jax.streaming.results import Cameras, FrameResult, PredictionError, Progress, checked_frames, device_memory
 
 PredictChunk = Callable[[np.ndarray], PlainPrediction]
 
@@ -173,7 +173,7 @@ class ChunkSession:
                 results += self._final.add(self._chain.push(frame))
         return results
 
-    def close(self) -> list[FrameResult]:
+    def close(self, progress: Progress | None = None) -> list[FrameResult]:
         """Ends the stream: the frames still held; PredictionError where the last chunk does not fit the others."""
         self._closed, self._newest = True, None
         with self._memory():

@@ -15,7 +15,7 @@ from logvggt_jax.geometry import encode_poses
 from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.model.parameters import in_compute_type
 from logvggt_jax.streaming.program import Program, abstract_variables, flops_of
-from logvggt_jax.streaming.results import Cameras, FrameResult, PredictionError, checked_frames, device_memory
+from logvggt_jax.streaming.results import Cameras, FrameResult, PredictionError, Progress, checked_frames, device_memory
 
 
 class PlainPrediction(NamedTuple):
@@ -180,7 +180,7 @@ class OfflineSession:
             )
         return []
 
-    def close(self) -> list[FrameResult]:
+    def close(self, progress: Progress | None = None) -> list[FrameResult]:
         """Predicts all frames at once."""
         images, self._images, self._closed = self._images, [], True
         if not images:

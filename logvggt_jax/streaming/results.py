@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import jax
@@ -32,6 +32,9 @@ class FrameResult:
       pose_is_final: whether `pose_encoding` stays as it is.
       points: [H, W, 3] float32 in the first camera's frame; None without point head.
       points_confidence: [H, W] float32; None without point head.
+      latency: seconds from the frame's `push` to this result; None where it is not measured.
+      overlap_change: difference between the frame's camera tokens in its last two windows, as a fraction of their
+        norm: it rises where windows do not agree. None where the frame was in one window, and for other methods.
     """
 
     index: int
@@ -41,6 +44,24 @@ class FrameResult:
     pose_is_final: bool
     points: np.ndarray | None
     points_confidence: np.ndarray | None
+    latency: float | None = None
+    overlap_change: float | None = None
+
+
+# Told how much of something is done, and of how much.
+Progress = Callable[[int, int], object]
+
+
+class Signals(NamedTuple):
+    """What a stream tells of its own quality, for the first N frames, numpy arrays; NaN where it is not known.
+
+    Attributes:
+      overlap_change: [N] float32, see `FrameResult`.
+      correction: [N] float32, how far GCCR moved the camera token, as a fraction of its norm.
+    """
+
+    overlap_change: np.ndarray
+    correction: np.ndarray
 
 
 class Cameras(NamedTuple):

@@ -28,6 +28,7 @@ COUNT = 11
 CASES = {
     "windows": ("windows", None, RefinementConfig()),
     "online windows": ("windows", None, RefinementConfig(period=2, context=4)),
+    "bounded windows": ("windows", None, RefinementConfig(period=2, context=4, max_registers=8)),
     "windows without refinement": ("windows", None, RefinementConfig(enabled=False)),
     "chunks": ("chunks", ChunkPlan(4, 2), RefinementConfig()),
     "offline": ("offline", None, RefinementConfig()),

@@ -10,6 +10,7 @@ import pytest
 
 from logvggt_jax import LogVGGT, ModelConfig, Predictions, RefinementConfig, WindowConfig
 from logvggt_jax.errors import InputError
+from logvggt_jax.streaming import pose_stream
 from logvggt_jax.streaming import windows as session_module
 from logvggt_jax.streaming.windows import FrameResult, StreamSession, WindowSettings
 
@@ -90,6 +91,9 @@ def test_stream_equals_apply_for_every_length(
         {"period": 2, "context": 3},
         {"period": 5, "context": 4},
         {"period": 3, "enabled": False, "context": 2},
+        {"max_registers": 12},
+        {"period": 3, "max_registers": 16},
+        {"period": 2, "context": 3, "max_registers": 8},
     ],
     ids=str,
 )
@@ -217,31 +221,33 @@ def test_nothing_compiles_per_frame_and_the_state_does_not_grow(
     session.push(np.stack([frame] * 8))
 
     def compiled() -> list[int]:
-        programs = (session_module._step, session_module._fire)
+        programs = (session_module._step, pose_stream._fire)
         return [program._cache_size() for program in programs]
 
     def state_bytes() -> int:
         return sum(leaf.nbytes for leaf in jax.tree.leaves(session._state))
 
-    before, size, capacity = compiled(), state_bytes(), session._store.capacity
+    before, size, capacity = compiled(), state_bytes(), session._poses.capacity
     for _ in range(40):
         session.push(frame)
     assert compiled() == before
     assert state_bytes() == size
-    assert session._store.capacity == capacity == 64
+    assert session._poses.capacity == capacity == 64
     assert len(session._pending) < 2
 
 
-def test_programs_grow_with_the_logarithm_of_an_online_stream(small_config: ModelConfig, small_variables: dict) -> None:
+def test_programs_grow_with_the_logarithm_of_a_stream_that_reads_everything(
+    small_config: ModelConfig, small_variables: dict
+) -> None:
     """Buffers double: from 4 frames to 128 there are six sizes, and no more programs than that."""
-    session = StreamSession(with_modes(small_config, period=2, context=2), small_variables, first_capacity=4)
-    frame, before = np.zeros((HEIGHT, WIDTH, 3), np.uint8), session_module._fire._cache_size()
+    session = StreamSession(with_modes(small_config, period=2), small_variables, first_capacity=4)
+    frame, before = np.zeros((HEIGHT, WIDTH, 3), np.uint8), pose_stream._fire._cache_size()
     for _ in range(120):
         session.push(frame)
     session.close()
     assert len(session.cameras().is_final) == 120
-    assert session._store.capacity == 128
-    assert session_module._fire._cache_size() - before <= 6
+    assert session._poses.capacity == 128
+    assert pose_stream._fire._cache_size() - before <= 6
 
 
 def test_an_empty_stream_has_no_frames(small_config: ModelConfig, small_variables: dict) -> None:

@@ -94,7 +94,7 @@ def _refinement_parts(model: LogVGGT, num_frames: int) -> list[Part]:
     variables = variable_shapes(model.config)
     tokens = jax.ShapeDtypeStruct((1, count, width), jnp.float32)
     scalar, lengths = jax.ShapeDtypeStruct((), jnp.int32), jax.ShapeDtypeStruct((1,), jnp.int32)
-    span = Span(scalar, scalar, lengths)  # type: ignore[arg-type]
+    span = Span(scalar, scalar, lengths, lengths)  # type: ignore[arg-type]
     parts = []
     if settings.enabled:
         register_tokens = jax.ShapeDtypeStruct((1, count, model.config.aggregator.num_registers, width), jnp.float32)
