@@ -91,7 +91,7 @@ class RunTimes:
     def remaining_seconds(self, step: int, end: int | None = None, *, compilations: int = 0) -> float:
         """Seconds until step `end` (None: the last of all), if frames, validations and saves take as long as so far.
 
-        `compilations` are still to be made.
+        The steps of `compilations` more stages are still to be compiled.
         """
         config = self._config
         end = config.total_steps if end is None else end

@@ -47,12 +47,13 @@ Path(sys.argv[2], "ended.pickle").write_bytes(pickle.dumps(jax.device_get(state)
 def test_twelve_kills_change_nothing(run_config: TrainConfig, pixel_params: Any, tmp_path: Path) -> None:
     stages = [{**stage, "steps": 30} for stage in run_config.to_dict()["stages"]]
     validation = {
-        "source": {**run_config.to_dict()["data"]["sources"][0], "split": "val"},
+        "sources": [{**run_config.to_dict()["data"]["sources"][0], "split": "val"}],
         "every": 4,
         "num_clips": 2,
         "clip_length": 3,
         "stride": 2,
         "size": [28, 42],
+        "best": "abs_rel",
     }
     settings = {**run_config.to_dict(), "stages": stages, "validation": validation, "save_every": 2, "log_every": 2}
     given = tmp_path / "run.pickle"

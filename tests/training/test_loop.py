@@ -285,12 +285,20 @@ def test_the_data_are_looked_for_before_the_weights_are_read(
 def test_a_step_that_does_not_fit_says_what_it_needs_and_what_lowers_it(
     reason: str, run_config: TrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    compiled = loop._Run._program
+    compiled = loop.compiled_steps
 
     def refuse(*_: object) -> None:
         raise jax.errors.JaxRuntimeError(reason)
 
-    monkeypatch.setattr(loop._Run, "_program", lambda run, *given: compiled(run, *given) and refuse)
+    class Refusing:
+        def __init__(self, step: jax.stages.Compiled) -> None:
+            self.memory_analysis = step.memory_analysis
+
+        __call__ = staticmethod(refuse)
+
+    monkeypatch.setattr(
+        loop, "compiled_steps", lambda *given: [step._replace(run=Refusing(step.run)) for step in compiled(*given)]
+    )
     monkeypatch.setattr(loop, "device_bytes", lambda device: 3 * 2**30)
     if reason.startswith("INTERNAL"):
         with pytest.raises(jax.errors.JaxRuntimeError, match="broken"):
@@ -308,7 +316,7 @@ def test_a_step_that_does_not_fit_says_what_it_needs_and_what_lowers_it(
 
 def test_validation_reports_held_out_clips(run_config: TrainConfig, tmp_path: Path) -> None:
     source = SourceConfig(name="rooms", root=None, split="val", options=run_config.data.sources[0].options)
-    validation = ValidationConfig(source=source, every=4, num_clips=4, clip_length=3, stride=2, size=(28, 42))
+    validation = ValidationConfig(sources=(source,), every=4, num_clips=4, clip_length=3, stride=2, size=(28, 42))
     train(dataclasses.replace(run_config, validation=validation), tmp_path, mesh=data_mesh(2))
     entries = [entry for entry in _numbers(tmp_path) if "validation/abs_rel" in entry]
     # Once before the first step: what cannot be judged says so at once.
@@ -322,7 +330,7 @@ def test_validation_reports_held_out_clips(run_config: TrainConfig, tmp_path: Pa
 
 def _validated(config: TrainConfig) -> TrainConfig:
     source = SourceConfig(name="rooms", root=None, split="val", options=config.data.sources[0].options)
-    validation = ValidationConfig(source=source, every=3, num_clips=2, clip_length=3, stride=2, size=(28, 42))
+    validation = ValidationConfig(sources=(source,), every=3, num_clips=2, clip_length=3, stride=2, size=(28, 42))
     return dataclasses.replace(config, validation=validation)
 
 
@@ -367,14 +375,14 @@ def test_a_save_or_a_validation_that_fails_says_so_before_the_first_step(
         monkeypatch.setattr("logvggt_jax.training.checkpoints.write_checkpoint", fail)
     else:
         monkeypatch.setattr(loop.Validation, "__call__", fail)
-    monkeypatch.setattr(loop._Run, "_program", lambda *_: pytest.fail("no step is to be compiled"))
+    monkeypatch.setattr(loop._Run, "_compile", lambda *_: pytest.fail("no step is to be compiled"))
     with pytest.raises(OSError, match="cannot be done"):
         train(_validated(run_config), tmp_path, mesh=data_mesh(1))
 
 
 def test_settings_may_change_until_a_step_is_done(run_config: TrainConfig, tmp_path: Path) -> None:
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyError, match="crash"):
-        patch.setattr(loop._Run, "_program", lambda *_: _crash())
+        patch.setattr(loop._Run, "_compile", lambda *_: _crash())
         train(run_config, tmp_path, mesh=data_mesh(1))
     other = dataclasses.replace(run_config, loss=dataclasses.replace(run_config.loss, alpha=0.5))
     assert int(train(other, tmp_path, mesh=data_mesh(1)).step) == 6

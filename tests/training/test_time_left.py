@@ -31,7 +31,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 def config(run_config: TrainConfig) -> TrainConfig:
     """A hundred steps of four frames, sixty of six; saves at 30, 60, …, 150, and at the ends of the stages."""
     source = SourceConfig(name="rooms", root=None, split="val")
-    validation = ValidationConfig(source=source, every=70, num_clips=2, clip_length=2, stride=1, size=(28, 42))
+    validation = ValidationConfig(sources=(source,), every=70, num_clips=2, clip_length=2, stride=1, size=(28, 42))
     first, second = run_config.stages
     stages = dataclasses.replace(first, steps=100), dataclasses.replace(second, steps=60)
     return dataclasses.replace(run_config, stages=stages, validation=validation, save_every=30)

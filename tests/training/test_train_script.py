@@ -23,7 +23,7 @@ SETTINGS = (
     "--config.data.sources.rooms.options.num_frames=24",
     "--config.validation.num_clips=2",
     "--config.validation.clip_length=4",
-    "--config.validation.source.options.num_rooms=2",
+    "--config.validation.sources.rooms.options.num_rooms=2",
 )
 
 
