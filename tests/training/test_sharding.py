@@ -15,11 +15,13 @@ from parallel_runs import LayeredModel, Outcome, steps, steps_of_processes
 from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.model.parameters import stack_layers
 from logvggt_jax.training import loop
+from logvggt_jax.training.checkpoint_files import Position, StoredCheckpoint
 from logvggt_jax.training.config import LossConfig, TrainConfig
 from logvggt_jax.training.loop import train
 from logvggt_jax.training.program import make_program
-from logvggt_jax.training.sharding import check_batch_size, data_mesh, parameter_layout, put_batch
+from logvggt_jax.training.sharding import Layout, check_batch_size, data_mesh, parameter_layout, put_batch
 from logvggt_jax.training.step import loss_and_gradients, make_loss_terms
+from logvggt_jax.training.watchdog import Watchdog
 
 Clips = dict[str, np.ndarray]
 WIDTH = 16
@@ -203,6 +205,56 @@ def test_the_state_lies_in_its_place_from_the_start(
         shard.data.unsafe_buffer_pointer() for leaf in jax.tree.leaves(state) for shard in leaf.addressable_shards
     ]
     assert len(set(places)) == len(places)
+
+
+@pytest.mark.parametrize("shard", [True, False])
+def test_no_device_ever_holds_a_second_copy_when_a_run_starts_or_goes_on(
+    shard: bool,
+    run_config: TrainConfig,
+    layered: LayeredModel,
+    layered_params: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Shapes, then places, then values: each goes to where it stays, from the host or from the disk."""
+    monkeypatch.setattr(loop, "LogVGGT", lambda _: layered)
+    monkeypatch.setattr(loop, "abstract_parameters", lambda _: jax.eval_shape(lambda: layered_params))
+    monkeypatch.setattr("logvggt_jax.training.checkpoints.save_model", lambda *_: None)
+    config, mesh = dataclasses.replace(run_config, shard_parameters=shard, average=0.5), data_mesh(4)
+    before, held = {id(x) for x in jax.live_arrays()}, []
+
+    def look(*_: Any, **__: Any) -> None:
+        # An array and its parts are the same memory.
+        places = {
+            (part.device, part.data.unsafe_buffer_pointer()): part.data.nbytes
+            for array in (x for x in jax.live_arrays() if id(x) not in before)
+            for part in array.addressable_shards
+        }
+        held.append(max(sum(size for (at, _), size in places.items() if at == device) for device in mesh.devices.flat))
+
+    def initial(*_: Any, **__: Any) -> Any:
+        look()
+        return layered_params
+
+    monkeypatch.setattr(loop, "initial_parameters", initial)
+    put, read, verified = Layout.put, StoredCheckpoint.read, StoredCheckpoint.verified
+    monkeypatch.setattr(Layout, "put", lambda *given: (look(), put(*given), look())[1])
+    monkeypatch.setattr(StoredCheckpoint, "read", lambda *given: (look(), read(*given), look())[1])
+    monkeypatch.setattr(StoredCheckpoint, "verified", lambda *given: (look(), verified(*given), look())[1])
+    for step in (0, 1):
+        run = loop._Run(config, tmp_path, mesh, Watchdog(0))
+        with run.checkpoints as checkpoints:
+            run.start(None)
+            state = run.state
+            look()
+            size = max(sum(leaf.addressable_shards[i].data.nbytes for leaf in jax.tree.leaves(state)) for i in range(4))
+            assert held[0] == 0, "shapes alone until then"
+            assert max(held) == held[-1] == size
+            if step == 0:
+                checkpoints.save(state._replace(step=state.step + 1), Position(0, {}))
+                checkpoints.wait()
+        del run, state
+        before, held[:] = {id(x) for x in jax.live_arrays()}, []
 
 
 def test_steps_in_parts_are_those_of_whole_parameters(
