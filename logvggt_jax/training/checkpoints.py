@@ -14,7 +14,7 @@ import numpy as np
 from absl import logging
 
 from logvggt_jax.errors import DiskError, InputError, OutputExists, disk_errors, one_line
-from logvggt_jax.files import FolderLock, write_text
+from logvggt_jax.files import FolderLock, check_space, write_text
 from logvggt_jax.model.parameters import unstack_layers
 from logvggt_jax.training.checkpoint_files import DamagedCheckpoint, Position, StoredCheckpoint, write_checkpoint
 from logvggt_jax.training.config import TrainConfig
@@ -181,8 +181,11 @@ class RunCheckpoints:
         return state, stored.position
 
     def _write(self, state: TrainState, position: Position, in_place_of: int | None) -> None:
-        # First, so that a run that is killed in between goes on from an older checkpoint and writes both again.
         step = int(state.step)
+        # Else the library that writes says the same in hundreds of lines.
+        needed = sum(leaf.nbytes for leaf in jax.tree.leaves((state, state.averaged)))
+        check_space(self.folder / str(step), needed, "make room, and the same command goes on from the last checkpoint")
+        # First, so that a run that is killed in between goes on from an older checkpoint and writes both again.
         self._write_model(self.model_folder, state.averaged, step)
         write_checkpoint(self.folder / str(step), state, position, self.config)
         newest = [kept for kept in self.steps if kept != in_place_of][-self.config.keep_checkpoints :]
