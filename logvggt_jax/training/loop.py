@@ -33,7 +33,7 @@ from logvggt_jax.training.metrics_log import MetricsLog, read_metrics
 from logvggt_jax.training.processes import Vote, any_process, check_agreement, check_shared
 from logvggt_jax.training.profile import ProfiledSteps, Profiler
 from logvggt_jax.training.program import abstract_parameters, make_program
-from logvggt_jax.training.progress import IntervalMeans, RunTimes, duration, progress_line
+from logvggt_jax.training.progress import IntervalMeans, RunTimes, duration, goodput, progress_line
 from logvggt_jax.training.sharding import check_batch_size
 from logvggt_jax.training.skipped import clips_to_blame, described
 from logvggt_jax.training.state import TrainState
@@ -176,11 +176,9 @@ class _Run:
             if ended:
                 break
         self.checkpoints.wait()
-        wall = max(time.time() - log.started, 1e-9)
         log.say(
-            f"{step}/{self.config.total_steps} steps done; model in {self.checkpoints.model_folder}; goodput "
-            f"{min(self.times.productive / wall, 1.0):.0%}: {duration(self.times.productive)} of training in "
-            f"{duration(wall)} since the first start"
+            f"{step}/{self.config.total_steps} steps done; model in {self.checkpoints.model_folder}; "
+            f"{goodput(self.times.productive, time.time() - log.started)}"
         )
 
     def _train_stage(

@@ -166,6 +166,15 @@ def progress_line(
     return f"step {step}/{total} {stage}: {', '.join(parts)}, {left}"
 
 
+def goodput(productive: float, wall: float) -> str:
+    """Productive seconds as a part of those since the first start, in words; the latter are of a clock that people and
+    machines set."""
+    done = f"{duration(productive)} of training"
+    if wall < productive or wall <= 0:
+        return f"goodput not known, {done} in less time: the clock was set back since the first start"
+    return f"goodput {productive / wall:.0%}: {done} in {duration(wall)} since the first start"
+
+
 def duration(seconds: float) -> str:
     """Seconds as hours, minutes and seconds, 1:02:03, or as minutes and seconds, 2:03."""
     minutes, rest = divmod(round(seconds), 60)
