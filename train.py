@@ -50,6 +50,9 @@ _WATCHDOG = flags.DEFINE_float(
     "watchdog", 30.0, "End the process, with all stacks, when no step ended in so many median steps; 0: never."
 )
 _PROFILE = flags.DEFINE_string("profile", None, "Steps to write a trace of to WORKDIR/profile, such as 20:25.")
+_WANDB = flags.DEFINE_string(
+    "wandb", None, "Project of Weights & Biases to show the run in (WANDB_MODE=offline works)."
+)
 _DRY_RUN = flags.DEFINE_bool("dry_run", False, "Say what every step needs and how many clips fit; train nothing.")
 _PREFLIGHT = flags.DEFINE_bool("preflight", False, "Try network, data, folder and step in minutes; train nothing.")
 _DESCRIBED = flags.DEFINE_string(
@@ -92,6 +95,7 @@ def main(arguments: Sequence[str]) -> None:
                 resume_step=_RESUME_STEP.value,
                 watchdog=_WATCHDOG.value,
                 profile=profile,
+                wandb=_WANDB.value,
             )
     except BaseException as error:
         _fail(error, watched)

@@ -48,7 +48,7 @@ def get_config(initial_weights: str = "") -> ConfigDict:
     rooms = {"height": HEIGHT, "width": WIDTH, "num_frames": 192}
     # As many rooms as are kept laid out in memory.
     config.data.sources.rooms.options.update(rooms, num_rooms=2000, renderer="device")
-    config.validation.source.options.update(rooms)
+    config.validation.sources.rooms.options.update(rooms)
     config.validation.size = (HEIGHT, WIDTH)
     config.validation.every = 1000
     config.save_every = 1000

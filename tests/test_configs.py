@@ -53,7 +53,7 @@ def test_rooms_start_at_their_mean_field_of_view(name: str, monkeypatch: pytest.
 def test_training_and_validation_share_no_room(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     config = _config(name, monkeypatch)
     assert config.validation is not None
-    sources = (*config.data.sources, config.validation.source)
+    sources = (*config.data.sources, *config.validation.sources)
     train, held_out = (set(Rooms(source.split, **dict(source.options)).sequences) for source in sources)
     assert not train & held_out
 

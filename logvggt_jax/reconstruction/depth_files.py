@@ -1,4 +1,4 @@
-"""Depth maps and images on disk, one file a frame, and pictures of depth."""
+"""Depth maps and images on disk, one file a frame."""
 
 from __future__ import annotations
 
@@ -64,16 +64,6 @@ def read_depth(path: str | Path, size: tuple[int, int] | None = None) -> tuple[n
             found = f"{list(values.shape)} of {values.dtype}"
             raise InputError(f"{path}: {name} must be floats {expected}, got {found}; reconstruct again")
     return maps[0].astype(np.float32), maps[1].astype(np.float32)
-
-
-def depth_picture(depth: np.ndarray, *, near: float, far: float) -> np.ndarray:
-    """Depth [H, W] as colours [H, W, 3] uint8 RGB: inverse depth, bright near, dark far, black where invalid."""
-    valid = np.isfinite(depth) & (depth > 0)
-    inverse = 1.0 / np.where(valid, depth, 1.0)
-    scaled = (inverse - 1.0 / far) / max(1.0 / near - 1.0 / far, 1e-12)
-    levels = (255 * np.clip(scaled, 0.0, 1.0)).astype(np.uint8)
-    colours = cv2.cvtColor(cv2.applyColorMap(levels, cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB)
-    return np.where(valid[..., None], colours, 0).astype(np.uint8)
 
 
 def write_picture(path: str | Path, image: np.ndarray) -> None:

@@ -26,12 +26,13 @@ from rich.progress import (
 )
 from rich.text import Text
 
+from logvggt_jax.colours import depth_picture
 from logvggt_jax.data.feeding.transforms import LONGER_EDGE
 from logvggt_jax.errors import InputError
 from logvggt_jax.interruption import StopRequest
 from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE
-from logvggt_jax.reconstruction.depth_files import depth_picture, write_picture
+from logvggt_jax.reconstruction.depth_files import write_picture
 from logvggt_jax.reconstruction.exporters.ply import write_cloud
 from logvggt_jax.reconstruction.exporters.tum import export_tum
 from logvggt_jax.reconstruction.frame_pool import FramePool

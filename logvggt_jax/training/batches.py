@@ -22,11 +22,11 @@ def open_source(source: SourceConfig) -> Reader:
     return open_dataset(source.name, source.root, source.split, **dict(source.options))
 
 
-def open_sources(config: DataConfig, validation: SourceConfig | None = None) -> dict[str, Dataset]:
+def open_sources(config: DataConfig, validation: Sequence[SourceConfig] = ()) -> dict[str, Dataset]:
     """The mixture's data sets by name, in the form in which training reads them; what has to be made is made here.
 
     Raises InputError: folders of data sets do not exist and `config.allow_missing` is off, or none exists; a data set
-    would train on sequences that `config.hold_out` or the `validation` source keeps.
+    would train on sequences that `config.hold_out` or a source of `validation` keeps.
     """
     rules = dict(config.hold_out)
     if unknown := sorted(rules.keys() - set(DATASETS)):
@@ -41,8 +41,9 @@ def open_sources(config: DataConfig, validation: SourceConfig | None = None) -> 
                 source.name, dataset.sequences, rules[source.name], functools.partial(_split_sequences, source)
             )
         # Names of sequences do not depend on where a copy of the set lies.
-        if validation is not None and validation.name == source.name:
-            check_disjoint(source.name, dataset.sequences, open_source(validation).sequences)
+        for kept in validation:
+            if kept.name == source.name:
+                check_disjoint(source.name, dataset.sequences, open_source(kept).sequences)
         progress = jax.process_index() == 0
         datasets[source.name] = dataset.for_training(cache_dir=config.cache_dir, progress=progress)
     return datasets

@@ -26,6 +26,14 @@ from logvggt_jax.errors import InputError
 
 LOSSES = ("log_vggt", "vggt")
 SCHEDULES = ("cosine", "linear_tail")
+# What validation measures of a model, and whether more of it is better.
+VALIDATION_METRICS = {
+    "abs_rel": False,
+    "delta_1.25": True,
+    "rotation": False,
+    "translation_direction": False,
+    "auc_30": True,
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -168,17 +176,24 @@ class DataConfig:
 
 @dataclasses.dataclass(frozen=True)
 class ValidationConfig:
-    """Every `every` steps, `num_clips` fixed clips of `clip_length` frames, `stride` apart, of a held-out set."""
+    """Every `every` steps, `num_clips` fixed clips of `clip_length` frames, `stride` apart, of each of some held-out
+    sets. The model of the best value of the metric `best` is kept, None keeps none.
+    """
 
-    source: SourceConfig
+    sources: tuple[SourceConfig, ...]
     every: int
     num_clips: int
     clip_length: int
     stride: int
     size: tuple[int, int]
+    best: str | None = None
 
     def __post_init__(self) -> None:
         freeze_lists(self)
+        if not self.sources:
+            raise InputError("ValidationConfig.sources is empty: name at least one data set, or set validation to None")
+        if self.best is not None:
+            require_one_of(self, tuple(VALIDATION_METRICS), "best")
         require_counts(self, "every", "num_clips", "clip_length", "stride")
         if self.clip_length < 2:
             raise InputError("ValidationConfig.clip_length must be at least 2: pose errors are of pairs of frames")

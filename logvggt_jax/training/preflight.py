@@ -63,7 +63,7 @@ def preflight(config: TrainConfig, workdir: Path, mesh: Mesh, say: Callable[[str
     datasets: dict[str, Dataset] = {}
 
     def find_data() -> str:
-        validation = None if config.validation is None else config.validation.source
+        validation = () if config.validation is None else config.validation.sources
         datasets.update(open_sources(config.data, validation))
         for stage in config.stages:
             stage_batches(datasets, config.data, stage, seed=config.seed).close()

@@ -66,6 +66,26 @@ def test_nothing_valid_gives_zero_with_a_finite_gradient() -> None:
     assert float(value) == 0.0 and all(not np.asarray(gradient).any() for gradient in gradients)
 
 
+def test_masked_pixels_frames_and_clips_have_no_gradient() -> None:
+    generator = np.random.default_rng(4)
+    shape = (3, 3, 4, 5)
+    depth, target, confidence = generator.uniform(1, 2, (3, *shape))
+    poses, wanted = generator.normal(size=(3, 3, 2, 9)), generator.normal(size=(3, 3, 9))
+    pixels, frames = generator.uniform(size=shape) < 0.7, np.ones((3, 3), bool)
+    frames[0, 2], frames[1] = False, False  # a frame of one clip, all of another
+    pixels &= frames[..., None, None]
+
+    def loss(depth: jax.Array, confidence: jax.Array, poses: jax.Array) -> jax.Array:
+        terms = depth_losses(depth, confidence, jnp.asarray(target), jnp.asarray(pixels), alpha=0.2)
+        camera = camera_loss(poses, jnp.asarray(wanted), jnp.asarray(frames), **WEIGHTS)
+        return camera.value() + sum(term.value() for term in terms.values())
+
+    of_depth, of_confidence, of_poses = jax.grad(loss, (0, 1, 2))(*map(jnp.asarray, (depth, confidence, poses)))
+    for gradient in (of_depth, of_confidence):
+        assert not np.asarray(gradient)[~pixels].any() and np.asarray(gradient)[pixels].any()
+    assert not np.asarray(of_poses)[~frames].any() and np.asarray(of_poses)[frames].all((-2, -1)).all()
+
+
 def test_invalid_pixels_have_no_influence() -> None:
     generator = np.random.default_rng(3)
     depth, target = generator.uniform(1, 2, (2, 1, 2, 4, 5))

@@ -65,7 +65,7 @@ def check_disjoint(name: str, sequences: Sequence[str], evaluated: Sequence[str]
     if shared:
         raise InputError(
             f"{name}: {len(shared)} sequences are trained on and validated on ({shown(shared)}): "
-            "choose other splits for data.sources and validation.source"
+            "choose other splits for data.sources and validation.sources"
         )
 
 
