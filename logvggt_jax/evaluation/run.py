@@ -2,14 +2,16 @@
 
 import dataclasses
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from logvggt_jax.evaluation.costs.by_length import measured_costs
 from logvggt_jax.evaluation.costs.throughput import measured_timings
 from logvggt_jax.evaluation.datasets import open_run
 from logvggt_jax.evaluation.methods.method import Checkpoint, model_row
 from logvggt_jax.evaluation.methods.variants import variant_methods
+from logvggt_jax.evaluation.protocols.images import Fit
 from logvggt_jax.evaluation.records import RECORDS_FILE
 from logvggt_jax.evaluation.report.report import write_report
 from logvggt_jax.evaluation.runner import evaluate
@@ -52,12 +54,26 @@ def run_evaluation(
     benchmarks, baselines = open_run(run, data_root, longer_edge)
     loaded = Checkpoint.load(checkpoint)
     rows = {method: model_row(method, loaded, run.settings_of(method)) for method in run.methods}
-    timings = None
-    if isinstance(run, PaperRun) and run.timings is not None and run.timings.lengths:
-        others = [row for method, row in rows.items() if method != "windows"]
-        timings = functools.partial(
-            measured_timings, loaded, others, run.timings, output, longer_edge=run.protocol.longer_edge, fresh=fresh
-        )
+    timings: Callable[[], Mapping[str, Any]] | None = None
+    if run.timings is not None and run.timings.lengths:
+        if isinstance(run, PaperRun):
+            others = [row for method, row in rows.items() if method != "windows"]
+            edge = run.protocol.longer_edge
+            timings = functools.partial(
+                measured_timings, loaded, others, run.timings, output, longer_edge=edge, fresh=fresh
+            )
+        else:
+            images = benchmarks[0].protocol.images
+            assert isinstance(images, Fit)  # clips'
+            timings = functools.partial(
+                measured_costs,
+                list(rows.values()),
+                run.timings,
+                output,
+                image_size=images.size,
+                dtype=loaded.model.config.dtype,
+                fresh=fresh,
+            )
     results = evaluate(
         benchmarks,
         [*rows.values(), *variant_methods(loaded, run.variants), *baselines(loaded.model)],

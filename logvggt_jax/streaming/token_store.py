@@ -54,6 +54,12 @@ class TokenStore:
         """Frames that fit without growing."""
         return 0 if self.camera is None else self.camera.shape[1]
 
+    @property
+    def filled_bytes(self) -> int:
+        """Bytes of the frames that are stored."""
+        buffers = jax.tree.leaves((self.camera, self.refined, self.registers))
+        return sum(buffer.nbytes * self.count // self.capacity for buffer in buffers)
+
     def append(self, camera: jax.Array, registers: RegisterKeys | None, valid: int) -> None:
         """Adds the first `valid` of n frames: `camera` [1, n, 2C] and their registers' keys and values."""
         if self.camera is None:
