@@ -9,6 +9,7 @@ from logvggt_jax.streaming.predictor import METHODS, Method, Predictor, open_pre
 from logvggt_jax.streaming.pruned import PrunedSettings
 from logvggt_jax.streaming.results import Cameras, FrameResult, PredictionError
 from logvggt_jax.streaming.rolling import RollingSettings
+from logvggt_jax.streaming.suitability import expectation
 from logvggt_jax.streaming.windows import StreamSession, WindowSettings
 
 __all__ = [
@@ -30,5 +31,6 @@ __all__ = [
     "RollingSettings",
     "StreamSession",
     "WindowSettings",
+    "expectation",
     "open_predictor",
 ]
