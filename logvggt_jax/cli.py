@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import argparse
+import ast
 import contextlib
 import json
 import shutil
@@ -14,14 +15,11 @@ import traceback
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from logvggt_jax.errors import InputError, disk_errors, one_line, printable
 from logvggt_jax.interruption import Interrupted
 from logvggt_jax.terminal import forgiving_streams
-
-if TYPE_CHECKING:
-    from logvggt_jax.streaming import ChunkPlan
 
 OUTPUT_LOST, BAD_INPUT, INTERRUPTED = 1, 2, 130
 SOURCE_OPTIONS = ("stride", "max_frames", "fps", "start", "end", "pattern", "size_mismatch", "strict")
@@ -147,17 +145,31 @@ def _reconstruct(options: argparse.Namespace) -> int:
     return 0 if result.complete else INTERRUPTED
 
 
-def _settings(options: argparse.Namespace, method: str) -> ChunkPlan | None:
-    """Settings of the method; None for its defaults."""
-    from logvggt_jax.streaming import ChunkPlan
+def _settings(options: argparse.Namespace, method: str) -> Any:
+    """Settings of the method, of its own class; None for its defaults."""
+    from logvggt_jax.config import from_mapping
+    from logvggt_jax.streaming import METHODS, ChunkPlan
 
-    if method == "chunks":
+    if method == "chunks" and not options.setting:
         size = ChunkPlan.size if options.chunk_size is None else options.chunk_size
         return ChunkPlan(size, size // 2 if options.chunk_overlap is None else options.chunk_overlap)
     for name, value in {"--chunk-size": options.chunk_size, "--chunk-overlap": options.chunk_overlap}.items():
         if value is not None:
-            raise InputError(f"{name} needs --mode chunks")
-    return None
+            raise InputError(f"{name} needs --mode chunks{' without --setting' if options.setting else ''}")
+    if not options.setting:
+        return None
+    given = dict(map(_setting, options.setting))
+    return from_mapping(METHODS[method].settings, given, method)
+
+
+def _setting(text: str) -> tuple[str, Any]:
+    """Name and value of NAME=VALUE: a number, True, False or None where the value reads as one, else its text."""
+    name, separator, value = text.partition("=")
+    if not separator or not name:
+        raise InputError(f"--setting {text}: expected NAME=VALUE, such as cap=4096")
+    with contextlib.suppress(ValueError, SyntaxError):
+        return name, ast.literal_eval(value)
+    return name, value
 
 
 def _render_room(options: argparse.Namespace) -> None:
@@ -219,9 +231,9 @@ def _doctor(options: argparse.Namespace) -> int:
     from logvggt_jax.doctor.examination import QUICK, SHARES, examine, part_findings
     from logvggt_jax.doctor.finding import Finding
 
-    if unknown := sorted(set(options.part or ()) - set(SHARES)):
-        raise InputError(f"doctor has no part {unknown[0]!r}; it has {', '.join(SHARES)}")
-    parts = options.part or (QUICK if options.quick else tuple(SHARES))
+    if unknown := sorted(set(options.part or ()) - {*SHARES, *MODES}):
+        raise InputError(f"doctor has no part {unknown[0]!r}; it has {', '.join((*SHARES, *MODES))}")
+    parts = options.part or (MODES if options.methods else QUICK if options.quick else tuple(SHARES))
     marks = {True: "ok", False: "WRONG", None: ""}
 
     with contextlib.ExitStack() as stack:
@@ -234,7 +246,7 @@ def _doctor(options: argparse.Namespace) -> int:
             if file is not None:
                 print(finding.to_json(), file=file, flush=True)
             line = (
-                f"{finding.part:12} {finding.what:42} {finding.value_text():>20}  {marks[finding.ok]:5} {finding.note}"
+                f"{finding.part:15} {finding.what:42} {finding.value_text():>20}  {marks[finding.ok]:5} {finding.note}"
             )
             print(finding.to_json() if options.json == "-" else line.rstrip(), flush=True)
 
@@ -370,6 +382,13 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument(
         "--chunk-overlap", type=int, default=None, metavar="N", help="frames that neighbours share (default: half)"
     )
+    sub.add_argument(
+        "--setting",
+        action="append",
+        metavar="NAME=VALUE",
+        help="a setting of the method, may be given several times: budget=600000 of rolling, cap=4096 or bits=16 of "
+        "pruned, window=8 of anchored-window, camera_cache=single of causal, rolling and pruned; see docs/methods.md",
+    )
     points = sub.add_argument_group("point cloud")
     points.add_argument(
         "--confidence-percentile",
@@ -453,11 +472,15 @@ def _parser() -> argparse.ArgumentParser:
         details=" Parts run one after the other, each in a process of its own, five minutes in all and one with "
         "--quick: environment (versions, devices, builds that do not belong together), parity (a small network "
         "against recorded values), inference (kernels, memory, time and utilisation of a step), training (the same "
-        "for the training step), whole (from files to files). On a CPU the model is a tiny one. Exit code 0: nothing "
-        "wrong, 1: something is.",
+        "for the training step), whole (from files to files). With --methods each method of `reconstruct --method` is "
+        "such a part: its frames a second at VGGT-1B's size, beside what the originals in PyTorch reach on one H100. "
+        "On a CPU the model is a tiny one, and nothing is compared. Exit code 0: nothing wrong, 1: something is.",
     )
     sub.add_argument("--quick", action="store_true", help="environment, parity and inference alone, in a minute")
-    sub.add_argument("--part", action="append", metavar="NAME", help="this part alone; may be given several times")
+    sub.add_argument("--methods", action="store_true", help="every method's frames a second instead of the other parts")
+    sub.add_argument(
+        "--part", action="append", metavar="NAME", help="this part, or method, alone; may be given several times"
+    )
     sub.add_argument("--tiny", action="store_true", help="the tiny model on an accelerator as well")
     sub.add_argument(
         "--json",

@@ -217,6 +217,18 @@ def test_bad_input_is_one_line_and_exit_code_2(
     assert_fails(capsys, reconstruct(room, checkpoint, "--chunk-size", "8"), "--chunk-size needs --mode chunks")
     chunks = ("--mode", "chunks", "--chunk-size", "8", "--chunk-overlap", "30")
     assert_fails(capsys, reconstruct(room, checkpoint, *chunks), "chunk overlap must be", "8, got 30")
+    both = ("--mode", "chunks", "--chunk-size", "8", "--setting", "overlap=2")
+    assert_fails(capsys, reconstruct(room, checkpoint, *both), "--chunk-size needs --mode chunks without --setting")
+    for method, setting, words in (
+        ("pruned", "cap", ("expected NAME=VALUE",)),
+        ("pruned", "caps=9", ("unknown field pruned.caps", "did you mean cap")),
+        ("pruned", "bits=8", ("pruned.bits must be one of 4, 16, got 8",)),
+        ("causal", "camera_cache=both", ("causal.camera_cache must be one of 'per_round', 'single'",)),
+        ("rolling", "budget=9", ("budget", "fewer than", "take at least")),
+        ("pruned", "cap=9", ("cap", "fewer than", "take at least")),
+    ):
+        given = ("--method", method, "--setting", setting, "--dry-run")
+        assert_fails(capsys, reconstruct(room, checkpoint, *given), *words)
     truncated = tmp_path / "truncated"
     truncated.mkdir()
     for file in sorted(room.glob("*.color.png"))[:2]:

@@ -10,6 +10,7 @@ from logvggt_jax.streaming.pruned import PrunedSettings
 from logvggt_jax.streaming.results import Cameras, FrameResult, PredictionError, Progress, Signals
 from logvggt_jax.streaming.rolling import RollingSettings
 from logvggt_jax.streaming.state_file import load_stream, save_stream
+from logvggt_jax.streaming.suitability import expectation
 from logvggt_jax.streaming.windows import StreamSession, WindowSettings
 
 __all__ = [
@@ -33,6 +34,7 @@ __all__ = [
     "Signals",
     "StreamSession",
     "WindowSettings",
+    "expectation",
     "load_stream",
     "open_predictor",
     "save_stream",

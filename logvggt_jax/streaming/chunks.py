@@ -100,6 +100,11 @@ class ChunkChain:
         self._images, self._shared = [], None
         return last
 
+    @property
+    def held_bytes(self) -> int:
+        """Bytes of the images held and of what the next chunk is aligned with."""
+        return sum(array.nbytes for array in (*self._images, *jax.tree.leaves(self._shared)))
+
     def arrays(self) -> dict[str, np.ndarray]:
         """The images held and the last chunk's prediction of those it shares, for `restore`."""
         arrays = {"images": np.stack(self._images), "first": np.array([self._first])} if self._images else {}
@@ -161,6 +166,11 @@ class ChunkSession:
     def num_frames(self) -> int:
         """Frames handed out so far; their depth and pose are final."""
         return len(self._final)
+
+    @property
+    def state_bytes(self) -> int:
+        """See `Predictor.state_bytes`: at most a chunk of images, and the prediction of an overlap."""
+        return self._chain.held_bytes
 
     def push(self, frames: np.ndarray | jax.Array | Sequence[np.ndarray]) -> list[FrameResult]:
         """Takes frames and returns those that became final; see `Predictor.push`."""

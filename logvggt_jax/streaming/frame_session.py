@@ -108,7 +108,7 @@ class FrameSession:
 
     @property
     def state_bytes(self) -> int:
-        """Bytes that count of what the stream keeps for the frames to come; waits for the device."""
+        """See `Predictor.state_bytes`: the filled part of all caches."""
         return sum(_bytes(cache) * _filled(cache) // cache.capacity for cache in _caches(self._memory))
 
     @property

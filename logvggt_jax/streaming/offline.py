@@ -166,6 +166,11 @@ class OfflineSession:
         """Frames handed out so far."""
         return len(self._final)
 
+    @property
+    def state_bytes(self) -> int:
+        """See `Predictor.state_bytes`: the images, all of them until the end."""
+        return sum(image.nbytes for image in self._images)
+
     def push(self, frames: np.ndarray | jax.Array | Sequence[np.ndarray]) -> list[FrameResult]:
         """Takes frames; see `Predictor.push`. Raises PredictionError for more than `max_frames`."""
         if self._closed:

@@ -127,6 +127,11 @@ class PoseStream:
         """Frames that fit on the device without growing."""
         return self._store.capacity
 
+    @property
+    def filled_bytes(self) -> int:
+        """Bytes of the tokens that are kept, without empty places."""
+        return self._store.filled_bytes
+
     def append(self, camera_tokens: jax.Array, register_tokens: jax.Array, valid: int) -> list[Poses]:
         """Adds the first `valid` of n frames, [1, n, 2C] and [1, n, 4, 2C]; the poses that are due, oldest first."""
         registers = None

@@ -38,6 +38,14 @@ class Predictor(Protocol):
         """Frames handed out so far."""
         ...
 
+    @property
+    def state_bytes(self) -> int:
+        """Bytes of what is kept for the frames to come, on the device and the host; waits for the device.
+
+        Empty places of buffers do not count, nor do parameters, what was handed out, and what a running program needs.
+        """
+        ...
+
     def push(self, frames: np.ndarray | jax.Array | Sequence[np.ndarray]) -> list[FrameResult]:
         """Takes frames and returns those that became final, oldest first.
 

@@ -105,6 +105,15 @@ class TokenStore:
         """Where a frame's tokens are, or will be, in `camera` and `refined`."""
         return frame - self._forgotten
 
+    @property
+    def filled_bytes(self) -> int:
+        """Bytes of the frames that are stored."""
+        if self.camera is None:
+            return 0
+        tokens = 2 * self.camera.nbytes * self.position(self.count) // self.capacity
+        kept = self.position(self.count) if self._max_frames is None else int((self._slots >= 0).sum())
+        return tokens + sum(x.nbytes * kept // x.shape[1] for x in jax.tree.leaves(self.registers))
+
     def append(self, camera: jax.Array, registers: RegisterKeys | None, valid: int) -> None:
         """Adds the first `valid` of n frames: `camera` [1, n, 2C] and their registers' keys and values."""
         if self.camera is None:

@@ -179,6 +179,12 @@ class StreamSession:
         """Frames handed out so far; their depth is final."""
         return self._handed_out
 
+    @property
+    def state_bytes(self) -> int:
+        """See `Predictor.state_bytes`: cache and held tokens, compact tokens, and frames not yet in a window."""
+        arrays = (*jax.tree.leaves(self._state), *self._pending)
+        return self._poses.filled_bytes + sum(array.nbytes for array in arrays)
+
     def push(self, frames: np.ndarray | jax.Array | Sequence[np.ndarray]) -> list[FrameResult]:
         """Takes frames and returns those that became final, oldest first.
 

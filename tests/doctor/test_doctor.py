@@ -17,9 +17,12 @@ import jax
 import numpy as np
 import pytest
 
-from logvggt_jax.cli import main
-from logvggt_jax.doctor import environment, examination, parity
+from logvggt_jax import LogVGGT
+from logvggt_jax.cli import MODES, main
+from logvggt_jax.doctor import environment, examination, methods, parity
 from logvggt_jax.doctor.finding import Finding
+from logvggt_jax.doctor.subject import Subject, tiny_config
+from logvggt_jax.streaming import METHODS
 
 
 @pytest.mark.parametrize("part", [part for part in examination.SHARES if part != "environment"])
@@ -36,6 +39,41 @@ def test_every_part_finds_a_cpu_sound(part: str) -> None:
         "whole": {"rate, files to files", "processor time a frame"},
     }
     assert wanted[part] <= names
+
+
+@pytest.mark.parametrize(("method", "rates"), [("rolling", 2), ("chunks", 1)])
+def test_a_method_is_timed_and_on_a_cpu_compared_with_nothing(method: str, rates: int) -> None:
+    findings = list(examination.part_findings(method, tiny=True, quick=True))
+    assert {finding.part for finding in findings} == {method}
+    found = [finding for finding in findings if finding.unit == "frames/s"]
+    assert len(found) == rates and all(isinstance(each.value, float) and each.value > 0 for each in found)
+    assert all(finding.ok is None and not finding.note for finding in findings)
+
+
+def test_rates_are_judged_where_the_originals_were_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    large = Subject(LogVGGT(tiny_config()), (392, 518), tiny=False, quick=False)
+
+    def judged(rate: float, frames: int, kind: str) -> Finding:
+        monkeypatch.setattr(jax, "devices", lambda: [SimpleNamespace(device_kind=kind)])
+        return methods._rate("causal", "rate", rate, frames, large)
+
+    last, h100 = methods.STREAMED - 1, "NVIDIA H100 80GB HBM3"
+    assert [judged(rate, last, h100).ok for rate in (4.9, 5.1)] == [False, True]
+    assert "2.00 x the 10.9 of StreamVGGT's PyTorch code" in judged(21.8, 0, h100).note
+    other = judged(4.9, last, "NVIDIA A10")
+    assert other.ok is None and "0.98 x the 5.0" in other.note
+    assert methods._rate("pruned", "rate", 1.0, 0, large) == Finding("pruned", "rate", 1.0, "frames/s")
+
+
+def test_every_method_has_a_part_and_time_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: dict[str, float] = {}
+    monkeypatch.setattr(
+        examination, "_in_own_process", lambda part, limit, **_: asked.update({part: limit}) or iter(())
+    )
+    assert main(["doctor", "--methods"]) == 0
+    assert list(asked) == list(MODES) and set(METHODS) == set(MODES)
+    shares = [examination.METHOD_SHARE[1] * (i + 1) for i in range(len(MODES))]
+    assert list(asked.values()) == pytest.approx(shares, abs=1), "what the ones before left is theirs"
 
 
 def test_a_machine_that_computes_otherwise_is_found(monkeypatch: pytest.MonkeyPatch) -> None:

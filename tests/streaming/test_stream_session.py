@@ -250,6 +250,21 @@ def test_programs_grow_with_the_logarithm_of_a_stream_that_reads_everything(
     assert pose_stream._fire._cache_size() - before <= 6
 
 
+def test_a_state_grows_by_compact_tokens_alone(
+    small_config: ModelConfig, small_variables: dict, frames: np.ndarray
+) -> None:
+    """A frame's camera token, the same refined, and keys and values of its four registers, of 2C numbers each."""
+    session, found = StreamSession(with_modes(small_config), small_variables), []
+    assert session.state_bytes == 0
+    for frame in frames[:12]:
+        session.push(frame)
+        found.append(session.state_bytes)
+    assert found[0] == HEIGHT * WIDTH * 3, "a picture that waits for its window"
+    compact = 4 * 2 * small_config.encoder.embed_dim * (1 + 1 + 2 * 4)
+    assert np.diff(found[3::2]).tolist() == [2 * compact] * 4
+    session.close()
+
+
 def test_an_empty_stream_has_no_frames(small_config: ModelConfig, small_variables: dict) -> None:
     session = StreamSession(with_modes(small_config), small_variables, first_capacity=16)
     assert session.close() == []
