@@ -36,7 +36,7 @@ class Recorder:
         self.frames.append(frame)
         return self.close() if len(self.frames) == 2 else []
 
-    def close(self) -> list[FrameResult]:
+    def close(self, progress: Progress | None = None) -> list[FrameResult]:
         results = []
         for frame in self.frames:
             generator = np.random.default_rng(self.num_frames)
