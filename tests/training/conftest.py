@@ -10,6 +10,7 @@ import pytest
 
 from logvggt_jax import ModelConfig, Predictions
 from logvggt_jax.geometry import decode_poses, quaternion_to_matrix
+from logvggt_jax.model.parameters import whole
 from logvggt_jax.training.config import DataConfig, LossConfig, OptimizerConfig, SourceConfig, StageConfig, TrainConfig
 
 ROOMS = (("height", 28), ("num_frames", 8), ("num_rooms", 8), ("width", 42))
@@ -73,6 +74,46 @@ def use_pixel_model(loop: Any) -> None:
 @pytest.fixture(scope="session")
 def pixel_params() -> dict[str, Any]:
     return pixel_parameters()
+
+
+@dataclasses.dataclass(frozen=True)
+class LayeredModel:
+    """A loop over stacked layers before the pixels' model, which compiles at once; the interface of `LogVGGT`."""
+
+    config: ModelConfig
+    pixels: PixelModel
+
+    def apply(
+        self, variables: Any, images: jax.Array, frame_mask: jax.Array | None = None, *, remat: bool = False
+    ) -> Predictions:
+        params = whole(variables["params"])
+
+        @jax.checkpoint
+        def layer(x: jax.Array, one: Any) -> tuple[jax.Array, None]:
+            one = whole(one)
+            return x + jnp.tanh(x @ one["kernel"] + one["bias"]), None
+
+        x = images.astype(jnp.float32) @ params["aggregator"]["embed"]["kernel"] / 255.0
+        x, _ = jax.lax.scan(layer, x, params["aggregator"]["frame_blocks"])
+        heads = {name: params[name] for name in ("depth_head", "camera_head")}
+        return self.pixels.apply({"params": heads}, 255.0 * x[..., :3], frame_mask)
+
+
+@pytest.fixture(scope="session")
+def layered(small_config: ModelConfig, pixel_model: PixelModel) -> LayeredModel:
+    return LayeredModel(small_config, pixel_model)
+
+
+@pytest.fixture(scope="session")
+def layered_params(pixel_params: Any) -> dict[str, Any]:
+    """Parameters of `LayeredModel`: four layers, sixteen wide."""
+    generator = np.random.default_rng(3)
+
+    def normal(*shape: int) -> np.ndarray:
+        return (0.2 * generator.standard_normal(shape)).astype(np.float32)
+
+    blocks = {"kernel": normal(4, 16, 16), "bias": normal(4, 16)}
+    return {**pixel_params, "aggregator": {"embed": {"kernel": normal(3, 16)}, "frame_blocks": blocks}}
 
 
 @pytest.fixture(scope="session")
