@@ -35,7 +35,31 @@ from logvggt_jax import (  # noqa: E402
 if not flags.FLAGS.is_parsed():
     flags.FLAGS.mark_as_parsed()
 
+# Files of more than twenty seconds of processor time: they come first, so that none is left to one process at the end.
+DEAREST = (
+    "model/test_logvggt.py",
+    "model/test_golden_pruned.py",
+    "model/test_golden_merged.py",
+    "training/test_train_script.py",
+    "training/test_processes.py",
+    "model/test_golden_causal.py",
+    "training/test_loop.py",
+    "doctor/test_doctor.py",
+    "training/test_sharding.py",
+    "evaluation/costs/test_throughput.py",
+    "model/test_golden_rolling.py",
+    "evaluation/test_eval_script.py",
+    "evaluation/costs/test_efficiency.py",
+    "training/test_step.py",
+    "evaluation/methods/test_variants.py",
+)
+
 SHARED = Path(os.environ.get("LOGVGGT_SHARED", Path(__file__).parents[2] / "shared"))
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    place = {Path(__file__).parent / name: number for number, name in enumerate(DEAREST)}
+    items.sort(key=lambda item: place.get(item.path, len(place)))
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import flax.linen as nn
-import jax.numpy as jnp
+import numpy as np
 from flax.errors import ScopeParamShapeError
 
 
@@ -25,8 +25,8 @@ class ShapeCheck:
         if not module.has_variable("params", name):
             return super().param(name, init_fn, *init_args, unbox=unbox, **init_kwargs)  # type: ignore[misc]
         value, shape = module.get_variable("params", name), init_args[0]
-        if jnp.shape(value) != tuple(shape):
-            raise ScopeParamShapeError(name, module.scope.path_text, jnp.shape(value), shape)
+        if np.shape(value) != tuple(shape):
+            raise ScopeParamShapeError(name, module.scope.path_text, np.shape(value), shape)
         return value
 
 
