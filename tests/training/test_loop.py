@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import Mesh
 
 from logvggt_jax.data.feeding.clips import ClipReader
 from logvggt_jax.errors import InputError
@@ -25,6 +26,7 @@ from logvggt_jax.training.device_batches import DeviceBatches
 from logvggt_jax.training.loop import NonFiniteTraining, train
 from logvggt_jax.training.metrics_log import MetricsLog, read_metrics
 from logvggt_jax.training.profile import ProfiledSteps
+from logvggt_jax.training.program import Program, make_program
 from logvggt_jax.training.sharding import data_mesh
 from logvggt_jax.training.state import TrainState
 from logvggt_jax.training.validation import Judgement
@@ -38,6 +40,7 @@ def quick(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, pixel
     """Runs use the model that compiles at once, but for the slow ones."""
     if request.node.get_closest_marker("slow") is None:
         _use(monkeypatch, pixel_model, pixel_params)
+        monkeypatch.setattr(loop, "make_program", _program)
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +51,7 @@ def straight(
     workdir = tmp_path_factory.mktemp("straight")
     with pytest.MonkeyPatch.context() as patch:
         _use(patch, pixel_model, pixel_params)
+        patch.setattr(loop, "make_program", _program)
         return train(run_config, workdir, mesh=data_mesh(2)), workdir
 
 
@@ -61,6 +65,18 @@ def _use(patch: pytest.MonkeyPatch, model: Any, params: Any) -> None:
     patch.setattr(loop, "LogVGGT", lambda _: model)
     patch.setattr(loop, "initial_parameters", lambda *_, **__: jax.tree.map(jnp.array, params))
     patch.setattr(loop, "abstract_parameters", lambda _: jax.eval_shape(lambda: params))
+
+
+_programs: dict[Any, Program] = {}
+
+
+def _program(model: Any, config: TrainConfig, params: Any, mesh: Mesh) -> Program:
+    """Runs whose steps are the same share one: most of a run's time is its compilation."""
+    settings = (config.optimizer, config.loss, config.stages, config.accumulate, config.average)
+    key = (model, mesh, config.model.encoder.frozen, config.shard_parameters, *settings)
+    if key not in _programs:
+        _programs[key] = make_program(model, config, params, mesh)
+    return _programs[key]
 
 
 def _at_step(monkeypatch: pytest.MonkeyPatch, step: int, action: Callable[[], None]) -> None:

@@ -24,23 +24,6 @@ from logvggt_jax.training.step import loss_and_gradients, make_loss_terms
 from logvggt_jax.training.watchdog import Watchdog
 
 Clips = dict[str, np.ndarray]
-WIDTH = 16
-
-
-@pytest.fixture(scope="module")
-def layered(small_config: ModelConfig, pixel_model: Any) -> LayeredModel:
-    return LayeredModel(small_config, pixel_model)
-
-
-@pytest.fixture(scope="module")
-def layered_params(pixel_params: Any) -> Any:
-    generator = np.random.default_rng(3)
-
-    def normal(*shape: int) -> np.ndarray:
-        return (0.2 * generator.standard_normal(shape)).astype(np.float32)
-
-    blocks = {"kernel": normal(4, WIDTH, WIDTH), "bias": normal(4, WIDTH)}
-    return {**pixel_params, "aggregator": {"embed": {"kernel": normal(3, WIDTH)}, "frame_blocks": blocks}}
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +50,7 @@ def _gradients(
 
 
 @pytest.fixture(scope="module")
-def alone(layered: LayeredModel, loss_config: LossConfig, layered_params: Any, sixteen: Clips) -> Any:
+def alone(layered: Any, loss_config: LossConfig, layered_params: Any, sixteen: Clips) -> Any:
     return _gradients(layered, loss_config, layered_params, sixteen, 1, shard=False, accumulate=1)
 
 
@@ -79,7 +62,7 @@ def test_first_gradient_is_that_of_one_device(
     devices: int,
     shard: bool,
     accumulate: int,
-    layered: LayeredModel,
+    layered: Any,
     loss_config: LossConfig,
     layered_params: Any,
     sixteen: Clips,
@@ -185,9 +168,7 @@ def test_matrices_are_split_along_no_axis_of_layers_and_vectors_stay_whole(layer
     assert not parameter_layout(layered_params, data_mesh(4), shard=False).axes
 
 
-def test_the_state_lies_in_its_place_from_the_start(
-    run_config: TrainConfig, layered: LayeredModel, layered_params: Any
-) -> None:
+def test_the_state_lies_in_its_place_from_the_start(run_config: TrainConfig, layered: Any, layered_params: Any) -> None:
     config = dataclasses.replace(run_config, shard_parameters=True, average=0.9)
     shapes = jax.eval_shape(lambda: layered_params)
     program = make_program(layered, config, shapes, data_mesh(4))
@@ -258,7 +239,7 @@ def test_no_device_ever_holds_a_second_copy_when_a_run_starts_or_goes_on(
 
 
 def test_steps_in_parts_are_those_of_whole_parameters(
-    run_config: TrainConfig, layered: LayeredModel, layered_params: Any, sixteen: Clips
+    run_config: TrainConfig, layered: Any, layered_params: Any, sixteen: Clips
 ) -> None:
     states = []
     for devices, shard, accumulate in ((1, False, 1), (4, True, 2)):
@@ -281,7 +262,7 @@ def test_steps_in_parts_are_those_of_whole_parameters(
 
 
 def test_the_average_follows_the_parameters(
-    run_config: TrainConfig, layered: LayeredModel, layered_params: Any, sixteen: Clips
+    run_config: TrainConfig, layered: Any, layered_params: Any, sixteen: Clips
 ) -> None:
     config, mesh = dataclasses.replace(run_config, average=0.75), data_mesh(1)
     program = make_program(layered, config, jax.eval_shape(lambda: layered_params), mesh)
@@ -300,7 +281,7 @@ def test_the_average_follows_the_parameters(
 
 def test_a_sharded_run_is_saved_on_sixteen_devices_and_goes_on_with_eight(
     run_config: TrainConfig,
-    layered: LayeredModel,
+    layered: Any,
     layered_params: Any,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
