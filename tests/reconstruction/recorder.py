@@ -12,7 +12,7 @@ import pytest
 
 from logvggt_jax import LogVGGT
 from logvggt_jax.reconstruction import Reconstruction, Source, reconstruct
-from logvggt_jax.streaming import METHODS, Cameras, FrameResult, Method, WindowSettings
+from logvggt_jax.streaming import METHODS, Cameras, FrameResult, Method, Progress, WindowSettings
 from logvggt_jax.streaming.results import decoded_cameras
 from logvggt_jax.streaming.windows import window_program
 
