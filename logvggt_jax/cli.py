@@ -21,12 +21,17 @@ from logvggt_jax.interruption import Interrupted
 from logvggt_jax.terminal import forgiving_streams
 
 if TYPE_CHECKING:
+    from logvggt_jax.reconstruction.result import Reconstruction
     from logvggt_jax.streaming import ChunkPlan
 
 OUTPUT_LOST, BAD_INPUT, INTERRUPTED = 1, 2, 130
 SOURCE_OPTIONS = ("stride", "max_frames", "fps", "start", "end", "pattern", "size_mismatch", "strict")
 # The registry of methods, which would load JAX.
 MODES = ("windows", "chunks", "offline", "merged", "causal", "anchored-window", "rolling", "pruned")
+FORMATS = (
+    *("colmap", "colmap-text", "nerfstudio", "glb", "ply", "tum", "kitti", "euroc"),
+    *("depth-png", "depth-exr", "depth-npz", "rosbag2"),
+)
 PROBLEMS_FOUND = 1
 
 
@@ -91,6 +96,7 @@ def _convert(options: argparse.Namespace) -> None:
 def _reconstruct(options: argparse.Namespace) -> int:
     from logvggt_jax.compile import check_devices, enable_compilation_cache
     from logvggt_jax.model.parameters import in_compute_type
+    from logvggt_jax.reconstruction.exporters import check_formats
     from logvggt_jax.reconstruction.method import choose_method
     from logvggt_jax.reconstruction.point_cloud import PointFilter
     from logvggt_jax.reconstruction.reconstruct import LONGER_EDGE, reconstruct
@@ -107,6 +113,7 @@ def _reconstruct(options: argparse.Namespace) -> int:
         pixel_stride=options.pixel_stride,
         max_points=options.max_points or None,
     )
+    check_formats(options.export)
     target = check_request(source, options.output, longer_edge=options.longer_edge, overwrite=options.overwrite)
     checkpoint = resolve(options.checkpoint)
     provenance = read_provenance(checkpoint)
@@ -144,7 +151,35 @@ def _reconstruct(options: argparse.Namespace) -> int:
     for note in source.notes[said:]:  # what only reading told
         print(f"logvggt: note: {printable(note)}", file=sys.stderr)
     print(result.summary())
-    return 0 if result.complete else INTERRUPTED
+    if not result.complete:
+        return INTERRUPTED
+    return _exports(result, options.export)
+
+
+def _exports(result: Reconstruction, formats: Sequence[str]) -> int:
+    """Exports of a result that is finished, each for itself: the result and the others stay, whatever fails."""
+    from logvggt_jax.reconstruction.exporters import export
+
+    code = 0
+    for name in formats:
+        try:
+            print(f"{name}: {printable(str(export(result, [name])[0]))}")
+        except InputError as error:
+            print(f"logvggt: error: the result is whole, its export {name} is not: {one_line(error)}", file=sys.stderr)
+            code = BAD_INPUT
+    return code
+
+
+def _export(options: argparse.Namespace) -> None:
+    from logvggt_jax.reconstruction.exporters import export
+    from logvggt_jax.reconstruction.point_cloud import PointFilter
+    from logvggt_jax.reconstruction.result import Reconstruction
+
+    points = None if options.max_points is None else PointFilter(max_points=options.max_points or None)
+    result = Reconstruction.open(options.result)
+    written = export(result, options.format, options.output, point_filter=points, overwrite=options.overwrite)
+    for name, path in zip(dict.fromkeys(options.format), written, strict=True):
+        print(f"{name}: {printable(str(path))}")
 
 
 def _settings(options: argparse.Namespace, method: str) -> ChunkPlan | None:
@@ -391,6 +426,15 @@ def _parser() -> argparse.ArgumentParser:
     )
     sub.add_argument("--previews", type=int, default=8, metavar="N", help="pictures of frames beside their depth")
     sub.add_argument(
+        "--export",
+        action="append",
+        default=[],
+        choices=FORMATS,
+        metavar="FORMAT",
+        help="write the finished result in this format too, into OUTPUT/exports; may be given several times "
+        "(`logvggt export --help` lists the formats)",
+    )
+    sub.add_argument(
         "--overwrite", action="store_true", help="begin anew and replace an earlier or unfinished reconstruction"
     )
     sub.add_argument(
@@ -406,6 +450,38 @@ def _parser() -> argparse.ArgumentParser:
         help="where compiled programs are kept between runs, 'none' for nowhere (default: $JAX_COMPILATION_CACHE_DIR "
         "or the user's cache folder)",
     )
+
+    sub = command(
+        "export",
+        _export,
+        "write a finished reconstruction in formats that other programs open",
+        "logvggt export runs/walk --format colmap --format glb --output scenes/walk",
+        details=" Every format becomes a file or folder of its own in the output: colmap/ and colmap-text/ (pictures, "
+        "model and cloud with tracks, as 3D Gaussian splatting starts from), nerfstudio/ (transforms.json), scene.glb, "
+        "points.ply, the camera's path as tum.txt, kitti.txt and euroc.csv, depth at the size of the original images "
+        "as depth-png/ (16 bits and a scale), depth-exr/ and depth-npz/, and rosbag2/. Pictures are read from the "
+        "source once more; where it is gone or has changed, those that the result keeps are taken, and that is said.",
+    )
+    sub.add_argument("result", type=Path, help="output of `logvggt reconstruct`")
+    sub.add_argument(
+        "--format",
+        action="append",
+        required=True,
+        choices=FORMATS,
+        metavar="FORMAT",
+        help=f"one of {', '.join(FORMATS)}; may be given several times",
+    )
+    sub.add_argument(
+        "--output", type=Path, default=None, metavar="DIR", help="folder for them (default: RESULT/exports)"
+    )
+    sub.add_argument(
+        "--max-points",
+        type=int,
+        default=None,
+        metavar="N",
+        help="thin the cloud to N points; 0 keeps all (default: 2,000,000 for ply, 500,000 for glb, else 100,000)",
+    )
+    sub.add_argument("--overwrite", action="store_true", help="replace earlier exports of these formats")
 
     sub = command(
         "render-room",

@@ -2,7 +2,7 @@
 
 from logvggt_jax.reconstruction.cameras_file import read_cameras, write_cameras
 from logvggt_jax.reconstruction.depth_files import read_depth, write_depth
-from logvggt_jax.reconstruction.exporters import EXPORTERS
+from logvggt_jax.reconstruction.exporters import EXPORTERS, export
 from logvggt_jax.reconstruction.exporters.tum import read_trajectory, write_trajectory
 from logvggt_jax.reconstruction.point_cloud import PointFilter
 from logvggt_jax.reconstruction.reconstruct import reconstruct
@@ -16,6 +16,7 @@ __all__ = [
     "Source",
     "SourceFrame",
     "SourceOptions",
+    "export",
     "open_source",
     "read_cameras",
     "read_depth",

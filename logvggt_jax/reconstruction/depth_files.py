@@ -81,11 +81,16 @@ def write_picture(path: str | Path, image: np.ndarray) -> None:
 
     JPEG has a quality that keeps nearly every pixel to a few grey levels.
     """
-    pixels = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-    suffix = Path(path).suffix
-    _, encoded = cv2.imencode(suffix, pixels, _JPEG if suffix == ".jpg" else ())
+    content = encode_picture(Path(path).suffix, image)
     with atomic_file(path) as temporary:
-        temporary.write_bytes(encoded.tobytes())
+        temporary.write_bytes(content)
+
+
+def encode_picture(suffix: str, image: np.ndarray) -> bytes:
+    """The content of a file with this suffix, see `write_picture`."""
+    pixels = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    _, encoded = cv2.imencode(suffix, pixels, _JPEG if suffix == ".jpg" else ())
+    return encoded.tobytes()
 
 
 def read_picture(path: str | Path, size: tuple[int, int] | None = None) -> np.ndarray:

@@ -37,7 +37,13 @@ from logvggt_jax.reconstruction.exporters.tum import export_tum
 from logvggt_jax.reconstruction.frame_pool import FramePool
 from logvggt_jax.reconstruction.point_cloud import PointFilter, PointSelection
 from logvggt_jax.reconstruction.request import check_request
-from logvggt_jax.reconstruction.result import POINTS_FILE, PREVIEW_FOLDER, TRAJECTORY_FILE, Reconstruction
+from logvggt_jax.reconstruction.result import (
+    EXPORT_FOLDER,
+    POINTS_FILE,
+    PREVIEW_FOLDER,
+    TRAJECTORY_FILE,
+    Reconstruction,
+)
 from logvggt_jax.reconstruction.run import Run
 from logvggt_jax.reconstruction.sources import Source, open_source
 from logvggt_jax.reconstruction.work_folder import WorkFolder
@@ -135,7 +141,8 @@ def reconstruct(
         seconds = time.monotonic() - started
         run.write_cameras(complete=complete)
         result = Reconstruction.with_cameras_of(work.path)
-        shutil.rmtree(work.path / PREVIEW_FOLDER, ignore_errors=True)  # of an incomplete result
+        for name in (PREVIEW_FOLDER, EXPORT_FOLDER):  # of an incomplete result
+            shutil.rmtree(work.path / name, ignore_errors=True)
         (work.path / PREVIEW_FOLDER).mkdir()
         for index in set(np.linspace(0, result.num_frames - 1, num_previews).round().astype(int).tolist()):
             pool.submit(_write_preview, result, index)

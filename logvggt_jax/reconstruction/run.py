@@ -20,6 +20,7 @@ from logvggt_jax.reconstruction.frame_pool import FramePool
 from logvggt_jax.reconstruction.point_cloud import PointSelection
 from logvggt_jax.reconstruction.result import DEPTH_FOLDER, IMAGE_FOLDER, depth_file, image_file
 from logvggt_jax.reconstruction.sources import SkippedFrame, Source, SourceFrame
+from logvggt_jax.reconstruction.sources.record import record_source
 from logvggt_jax.reconstruction.work_folder import Progress, WorkFolder
 from logvggt_jax.streaming import FrameResult, Predictor
 
@@ -145,6 +146,7 @@ class Run:
             complete=complete,
             skipped=self._source.skipped,
             noted_focal_length=self._focal_length,
+            source=record_source(self._source, self.num_taken),
         )
 
     def _pictures(self) -> Iterator[_Picture | None]:

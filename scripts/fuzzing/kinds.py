@@ -99,7 +99,7 @@ def _write_result(root: Path) -> None:
 
 def _read_result(root: Path, output: Path) -> None:
     from logvggt_jax.geometry import camera_centres, is_rotation, matrix_to_quaternion
-    from logvggt_jax.reconstruction.exporters import EXPORTERS
+    from logvggt_jax.reconstruction.exporters import export
     from logvggt_jax.reconstruction.exporters.tum import read_trajectory
     from logvggt_jax.reconstruction.point_cloud import read_points
     from logvggt_jax.reconstruction.result import Reconstruction
@@ -117,10 +117,9 @@ def _read_result(root: Path, output: Path) -> None:
         maps = result.depth_and_confidence(index)
         _expect(all(each.shape == result.depth_size for each in maps), "depth has another size than cameras")
     # What is written from it can be read.
-    for name, export in EXPORTERS.items():
-        export(result, output / name, progress=False)
-    read_points(output / "ply")
-    read_trajectory(output / "tum")
+    export(result, ["ply", "tum", "kitti", "euroc", "nerfstudio", "depth-png", "depth-npz"], output, progress=False)
+    read_points(output / "points.ply")
+    read_trajectory(output / "tum.txt")
 
 
 def _write_trajectory(root: Path) -> None:
