@@ -22,6 +22,11 @@ _MOST_FRUSTA = 500
 _FRUSTUM_SIZE = 1 / 40
 _FRAMES_PER_SECOND = 10.0
 _CAMERA = "camera"
+# The colours of points are linear in glTF, those of pictures are sRGB; shown as they are they would be pale.
+_LEVELS = np.arange(256) / 255
+_LINEAR = np.rint(255 * np.where(_LEVELS <= 0.04045, _LEVELS / 12.92, ((_LEVELS + 0.055) / 1.055) ** 2.4)).astype(
+    np.uint8
+)
 # Codes of the glTF specification.
 _FLOAT = 5126
 
@@ -51,7 +56,7 @@ def export_glb(
         vertices = np.concatenate(list(clouds))
     turn = OPENGL_FROM_OPENCV.diagonal()[:3]
     points = np.stack([vertices[axis] for axis in "xyz"], axis=-1) * turn
-    colours = np.stack([vertices[channel] for channel in ("red", "green", "blue")], axis=-1)
+    colours = _LINEAR[np.stack([vertices[channel] for channel in ("red", "green", "blue")], axis=-1)]
     poses = OPENGL_FROM_OPENCV @ np.asarray(invert(result.extrinsics)) @ OPENGL_FROM_OPENCV
     scene = trimesh.Scene()
     if len(points):
