@@ -14,6 +14,7 @@ from logvggt_jax.data.feeding.transforms import ResizeTransform, resize
 from logvggt_jax.errors import InputError
 from logvggt_jax.geometry import decode_poses
 from logvggt_jax.interruption import Interrupted, StopRequest
+from logvggt_jax.reconstruction.calibration import Calibration
 from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE, write_cameras
 from logvggt_jax.reconstruction.depth_files import write_depth, write_picture
 from logvggt_jax.reconstruction.frame_pool import FramePool
@@ -119,8 +120,8 @@ class Run:
             raise InputError(f"{self._source.path} gave no frame")
         return stop.reason is None
 
-    def write_cameras(self, *, complete: bool) -> None:
-        """Writes the cameras of all frames; their intrinsics are all finite."""
+    def write_cameras(self, calibration: Calibration, *, complete: bool) -> None:
+        """Writes the cameras of all frames, as far as they are known by the calibration; all numbers are finite."""
         cameras, transform = self._predictor.cameras(), self._transform
         assert transform is not None  # there are frames
         encodings = cameras.pose_encoding.copy()
@@ -133,7 +134,7 @@ class Run:
                 stacklevel=2,
             )
             encodings[:, 7:] = np.maximum(encodings[:, 7:], _NARROWEST_FIELD_OF_VIEW)
-        _, intrinsics = decode_poses(encodings, transform.size)
+        intrinsics = calibration.apply(decode_poses(encodings, transform.size)[1], transform)
         write_cameras(
             self._work.path / CAMERAS_FILE,
             names=self._names,

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,9 +19,9 @@ from logvggt_jax.reconstruction.result import POINTS_FILE, depth_file, image_fil
 from logvggt_jax.reconstruction.sources.record import record_source
 
 
-def room_frames(size: tuple[int, int], count: int, *, seed: int = 0) -> Frames:
+def room_frames(size: tuple[int, int], count: int, **options: Any) -> Frames:
     """Neighbouring frames of a room."""
-    rooms = Rooms("test", height=size[0], width=size[1], num_rooms=1, seed=seed)
+    rooms = Rooms("test", height=size[0], width=size[1], num_rooms=1, **options)
     return rooms.read(rooms.sequences[0], list(range(count)))
 
 
@@ -31,9 +33,14 @@ def write_room_result(
     image_size: tuple[int, int] = (96, 128),
     metric: bool = True,
     source: bool = True,
+    **options: Any,
 ) -> Reconstruction:
-    """Writes `folder/source` (PNG files of `image_size`) and `folder/result`, whose depth has `size`; both (H, W)."""
-    pictures, frames = room_frames(image_size, count), room_frames(size, count)
+    """Writes `folder/source` (PNG files of `image_size`) and `folder/result`, whose depth has `size`; both (H, W).
+
+    `options` are those of `Rooms`.
+    """
+    frames = room_frames(size, count, **options)
+    pictures = frames if size == image_size else room_frames(image_size, count, **options)
     transform = ResizeTransform(image_size, size)
     result, originals = folder / "result", folder / "source"
     for made in (originals, result / "depth", result / "images"):
@@ -59,3 +66,25 @@ def write_room_result(
     made = Reconstruction.with_cameras_of(result)
     export_ply(made, result / POINTS_FILE, point_filter=PointFilter(max_points=2000), progress=False)
     return Reconstruction.open(result)
+
+
+def changed(
+    result: Reconstruction, folder: Path, extrinsics: np.ndarray, growth: np.ndarray, focal: float = 1.0
+) -> Reconstruction:
+    """A copy of a result with other cameras and depth, its unit unknown."""
+    shutil.copytree(result.folder, folder)
+    zoom = np.array([[focal, 1, 1], [1, focal, 1], [1, 1, 1]])
+    write_cameras(
+        folder / "cameras.json",
+        names=result.names,
+        timestamps=result.timestamps.tolist(),
+        extrinsics=extrinsics,
+        intrinsics=zoom * result.intrinsics,
+        image_size=result.image_size,
+        model_intrinsics=zoom * result.depth_intrinsics,
+        model_size=result.depth_size,
+    )
+    for index, name in enumerate(result.names):
+        depth, confidence = result.depth_and_confidence(index)
+        write_depth(depth_file(folder, name), growth[index] * depth, confidence)
+    return Reconstruction.open(folder)
