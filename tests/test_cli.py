@@ -18,14 +18,25 @@ from logvggt_jax.cli import FORMATS, MODES, main
 from logvggt_jax.compile import default_cache_folder, enable_compilation_cache
 from logvggt_jax.data import DATASETS
 from logvggt_jax.errors import DiskError
-from logvggt_jax.reconstruction import EXPORTERS
+from logvggt_jax.reconstruction import EXPORTERS, Reconstruction
 from logvggt_jax.reconstruction.exporters import Format
 from logvggt_jax.reconstruction.point_cloud import read_points
 from logvggt_jax.streaming import METHODS
 from logvggt_jax.weights.checkpoints import save_model
 from logvggt_jax.weights.provenance import Provenance
 
-COMMANDS = ("convert", "reconstruct", "export", "render-room", "view", "info", "data check", "data list")
+COMMANDS = (
+    "convert",
+    "reconstruct",
+    "export",
+    "fuse",
+    "scale",
+    "render-room",
+    "view",
+    "info",
+    "data check",
+    "data list",
+)
 
 
 @pytest.fixture(scope="module")
@@ -130,6 +141,8 @@ def test_from_a_room_to_a_point_cloud_and_exports_of_which_one_fails(
     output = tmp_path / "out"
     arguments = ["reconstruct", str(room), "--checkpoint", str(checkpoint), "--output", str(output)]
     arguments += ["--max_points=500", "--compilation-cache", "none", "--previews", "1"]
+    assert_fails(capsys, [*arguments, "--intrinsics", "70,71,100,28"], "outside of images of 84 x 56 pixels")
+    arguments += ["--intrinsics", "70,71,41,28"]
     assert main([*arguments, "--export", "euroc", "--export", "tum", "--export", "nerfstudio"]) == 2
     shown = capsys.readouterr()
     assert "the result is whole, its export euroc is not: the disk is full" in shown.err
@@ -140,6 +153,10 @@ def test_from_a_room_to_a_point_cloud_and_exports_of_which_one_fails(
         assert str(output / name) in printed
     assert len(list((output / "depth").glob("*.npz"))) == 5
     assert_fails(capsys, arguments, str(output), "--overwrite")
+    known = [[70, 0, 41], [0, 71, 28], [0, 0, 1]]
+    result = Reconstruction.open(output)
+    np.testing.assert_allclose(result.intrinsics, np.tile(known, (5, 1, 1)), atol=1e-9)
+    np.testing.assert_allclose(result.depth_intrinsics[:, (0, 1), (0, 1)], np.tile([35, 35.5], (5, 1)), atol=1e-9)
     # The pictures are those of the source, at their own size.
     assert cv2.imread(str(next((output / "exports" / "nerfstudio" / "images").iterdir()))).shape == (56, 84, 3)
     export = ["export", str(output), "--format", "kitti", "--format", "ply", "--max-points", "50"]

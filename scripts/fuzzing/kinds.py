@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import importlib
+import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -140,6 +141,24 @@ def _read_trajectory(root: Path, output: Path) -> None:
     _expect(is_rotation(extrinsics[:, :3, :3]).all(), "rotations are none")
 
 
+def _write_transforms(root: Path) -> None:
+    frame = {"w": 64, "h": 48, "fl_x": 50.0, "fl_y": 50.0, "cx": 32.0, "cy": 24.0}
+    poses = np.tile(np.eye(4), (6, 1, 1))
+    poses[:, :3, 3] = np.random.default_rng(0).normal(size=(6, 3))
+    frames = [{"file_path": f"images/{i}.jpg", "transform_matrix": pose.tolist()} for i, pose in enumerate(poses)]
+    (root / "transforms.json").write_text(json.dumps({**frame, "frames": frames}))
+
+
+def _read_transforms(root: Path, output: Path) -> None:
+    from logvggt_jax.geometry import is_rotation
+    from logvggt_jax.reconstruction.fusion.pose_files import read_poses
+
+    poses = read_poses(root / "transforms.json")
+    extrinsics = np.stack([pose.extrinsics for pose in poses])
+    _expect_finite("poses", extrinsics, *(pose.intrinsics for pose in poses if pose.intrinsics is not None))
+    _expect(is_rotation(extrinsics[:, :3, :3]).all(), "rotations are none")
+
+
 def _record(number: int) -> dict[str, Any]:
     return {
         "benchmark": "rooms-clips-4",
@@ -262,6 +281,7 @@ KINDS = (
     Kind("shipped", functools.partial(_write_model, True), functools.partial(_read_model, True)),
     Kind("result", _write_result, _read_result),
     Kind("trajectory", _write_trajectory, _read_trajectory),
+    Kind("transforms", _write_transforms, _read_transforms),
     Kind("evaluation", _write_evaluation, _read_evaluation),
 )
 """All kinds, in the order in which cases take turns."""

@@ -8,13 +8,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from logvggt_jax.data.formats.calibration import world_to_camera
+from logvggt_jax.data.formats.calibration import check_intrinsics, world_to_camera
 from logvggt_jax.data.formats.colmap_model import read_cameras, read_images
 from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.errors import InputError, MissingInput, disk_errors
 from logvggt_jax.files import open_regular
 from logvggt_jax.reconstruction.exporters.nerfstudio import OPENGL_FROM_OPENCV, TRANSFORMS_FILE
 from logvggt_jax.reconstruction.exporters.tum import read_trajectory
+
+# The squares of larger numbers are infinite in float32.
+_LARGEST = 1e18
 
 
 class ExternalPose(NamedTuple):
@@ -58,6 +61,11 @@ def read_poses(path: str | Path) -> list[ExternalPose]:
             poses = [ExternalPose(None, float(time), pose) for time, pose in zip(timestamps, extrinsics, strict=True)]
     if not poses:
         raise InputError(f"{path} holds no pose")
+    for pose in poses:
+        if not (np.abs(pose.extrinsics) < _LARGEST).all():
+            raise InputError(f"{path}: the pose of {pose.name or pose.timestamp!r} is too large to be one")
+        if pose.intrinsics is not None and pose.size is not None:
+            check_intrinsics(pose.intrinsics, pose.size, Path(pose.name or ""), path)
     return poses
 
 
@@ -92,7 +100,7 @@ def _nerfstudio(path: Path) -> list[ExternalPose]:
         return [_nerfstudio_frame(document, frame, path) for frame in document["frames"]]
     except InputError:
         raise
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         reason = f"no {error}" if isinstance(error, KeyError) else error
         raise InputError(f"{path} is no transforms.json of nerfstudio, or damaged: {reason}") from error
 
@@ -100,7 +108,7 @@ def _nerfstudio(path: Path) -> list[ExternalPose]:
 def _nerfstudio_frame(document: dict[str, Any], frame: dict[str, Any], path: Path) -> ExternalPose:
     name = PurePosixPath(frame["file_path"]).stem
     pose = np.array(frame["transform_matrix"], np.float64)
-    if pose.shape not in ((3, 4), (4, 4)) or not np.isfinite(pose).all():
+    if pose.shape not in ((3, 4), (4, 4)) or not (np.abs(pose) < _LARGEST).all():
         raise InputError(f"{path}: transform_matrix of {name!r} must be [4, 4] finite numbers, got shape {pose.shape}")
     extrinsics = world_to_camera(pose @ OPENGL_FROM_OPENCV, f"{path}, {name!r}", stored="camera_to_world")
     assert extrinsics is not None  # it is finite
