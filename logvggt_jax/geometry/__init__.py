@@ -23,7 +23,7 @@ from logvggt_jax.geometry.rotations import (
     quaternion_to_matrix,
     rotation_angle,
 )
-from logvggt_jax.geometry.similarity import Similarity, robust_similarity, umeyama
+from logvggt_jax.geometry.similarity import Similarity, pose_similarity, robust_similarity, umeyama
 
 __all__ = [
     "Similarity",
@@ -36,6 +36,7 @@ __all__ = [
     "is_rotation",
     "matrix_to_quaternion",
     "nearest_rotation",
+    "pose_similarity",
     "project",
     "quaternion_to_matrix",
     "relative_to_first",

@@ -13,6 +13,7 @@ import numpy as np
 from logvggt_jax.errors import InputError, MissingInput
 from logvggt_jax.files import open_regular, write_text
 from logvggt_jax.geometry import is_rotation
+from logvggt_jax.reconstruction.sources.record import SourceRecord
 
 CAMERAS_FILE = "cameras.json"
 CAMERAS_FORMAT = "logvggt-cameras-1"
@@ -33,6 +34,8 @@ def write_cameras(
     complete: bool = True,
     skipped: Sequence[tuple[str, str]] = (),
     noted_focal_length: float | None = None,
+    source: SourceRecord | None = None,
+    metric: bool = False,
 ) -> None:
     """Writes all cameras as one JSON file.
 
@@ -48,6 +51,8 @@ def write_cameras(
       complete: whether the sequence was read to its end.
       skipped: frames that could not be read, with the reason.
       noted_focal_length: pixels of the original images, as the camera noted it; None where it is not known.
+      source: where the frames came from; None where they cannot be read again.
+      metric: whether lengths are metres.
     """
     frames: list[dict[str, Any]] = [
         {
@@ -62,13 +67,15 @@ def write_cameras(
     document = {
         "format": CAMERAS_FORMAT,
         "conventions": "extrinsics [3, 4] are world-to-camera, OpenCV axes (x right, y down, z forward); the world "
-        "is the first camera's frame as the model estimates it, lengths are up to one common scale; intrinsics are "
-        "in pixels of the original images, depth_intrinsics in pixels of the depth maps; pixel centres lie at "
-        "integers",
+        "is the first camera's frame as the model estimates it, or that of the poses that were fused in; lengths are "
+        "metres where metric is true, else up to one common scale; intrinsics are in pixels of the original images, "
+        "depth_intrinsics in pixels of the depth maps; pixel centres lie at integers",
         "image_size": list(image_size),
         "depth_size": list(model_size),
+        "metric": metric,
         "complete": complete,
         "noted_focal_length": noted_focal_length,
+        "source": None if source is None else source._asdict(),
         "skipped": [{"name": name, "reason": reason} for name, reason in skipped],
         "frames": frames,
     }
@@ -84,7 +91,7 @@ def is_complete(path: Path) -> bool:
 
 
 def read_cameras(path: str | Path) -> dict[str, Any]:
-    """Inverse of `write_cameras`: the document, with the frames' matrices as float64 arrays.
+    """Inverse of `write_cameras`: the document, with the frames' matrices as float64 arrays and the source's record.
 
     What is returned can be relied on: sizes are positive; names differ, are names of files and lead out of no folder;
     numbers are finite, also in float32; rotations are rotations; focal lengths are not zero.
@@ -123,9 +130,11 @@ def _checked(document: Any) -> dict[str, Any]:
         _require(valid, f"{key} must be height and width in pixels, got {shown(size)}")
     # Earlier versions wrote none of these.
     complete, skipped = document.setdefault("complete", True), document.setdefault("skipped", [])
-    noted = document.setdefault("noted_focal_length", None)
+    noted, metric = document.setdefault("noted_focal_length", None), document.setdefault("metric", False)
+    document["source"] = _source(document.get("source"))
     _require(noted is None or bool(_numbers(noted, (), "noted_focal_length") > 0), "noted_focal_length must be above 0")
-    _require(type(complete) is bool, f"complete must be true or false, got {shown(complete)}")
+    for key, value in (("complete", complete), ("metric", metric)):
+        _require(type(value) is bool, f"{key} must be true or false, got {shown(value)}")
     _require(
         isinstance(skipped, list)
         and all(isinstance(each, dict) and isinstance(each.get("name"), str) for each in skipped),
@@ -150,6 +159,13 @@ def _checked(document: Any) -> dict[str, Any]:
             pinhole = (matrix[2] == [0, 0, 1]).all() and matrix[1, 0] == 0 and (matrix.diagonal() != 0).all()
             _require(pinhole, f"the {key} {where} are not those of a pinhole camera")
     return document
+
+
+def _source(value: Any) -> SourceRecord | None:
+    kinds = {"path": str, "options": dict, "taken": int, "fingerprint": str}
+    valid = isinstance(value, dict) and all(type(value.get(key)) is kind for key, kind in kinds.items())
+    _require(value is None or valid, f"source must be null or say where frames came from, got {shown(value)}")
+    return None if value is None else SourceRecord(**{key: value[key] for key in kinds})
 
 
 def _require(condition: bool, complaint: str) -> None:

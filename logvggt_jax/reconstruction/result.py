@@ -11,12 +11,14 @@ from logvggt_jax.errors import InputError, disk_errors, printable
 from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE, read_cameras
 from logvggt_jax.reconstruction.depth_files import read_depth, read_picture
 from logvggt_jax.reconstruction.point_cloud import count_points, read_points
+from logvggt_jax.reconstruction.sources.record import SourceRecord
 
 TRAJECTORY_FILE = "trajectory.txt"
 POINTS_FILE = "points.ply"
 DEPTH_FOLDER = "depth"
 IMAGE_FOLDER = "images"
 PREVIEW_FOLDER = "previews"
+EXPORT_FOLDER = "exports"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -27,15 +29,17 @@ class Reconstruction:
       folder: where it lies.
       names: N frame names, in order.
       timestamps: [N] float64, seconds of a video, positions in a folder.
-      extrinsics: [N, 3, 4] float64, world-to-camera (OpenCV); the world is the first camera's frame, lengths are up to
-        one common scale.
+      extrinsics: [N, 3, 4] float64, world-to-camera (OpenCV); the world is the first camera's frame, or that of poses
+        that were fused in.
       intrinsics: [N, 3, 3] float64, pixels of the original images.
       depth_intrinsics: [N, 3, 3] float64, pixels of depth, confidence and image; centres at integers.
       image_size: (H, W) of the original images.
       depth_size: (h, w) of depth, confidence and image.
+      metric: whether lengths are metres; else they are up to one common scale.
       complete: False if the run was ended before the end of its source.
       skipped: names of frames that could not be read and are left out.
       noted_focal_length: pixels of the original images, as the camera noted it in EXIF; None where it did not.
+      source: where the frames came from; None where they cannot be read again.
       seconds: from the first frame to the last depth map, compilation included; None for a folder opened later.
     """
 
@@ -47,9 +51,11 @@ class Reconstruction:
     depth_intrinsics: np.ndarray
     image_size: tuple[int, int]
     depth_size: tuple[int, int]
+    metric: bool = False
     complete: bool = True
     skipped: tuple[str, ...] = ()
     noted_focal_length: float | None = None
+    source: SourceRecord | None = None
     seconds: float | None = None
 
     @classmethod
@@ -91,9 +97,11 @@ class Reconstruction:
             depth_intrinsics=stacked("depth_intrinsics"),
             image_size=tuple(document["image_size"]),
             depth_size=tuple(document["depth_size"]),
+            metric=document["metric"],
             complete=document["complete"],
             noted_focal_length=document["noted_focal_length"],
             skipped=tuple(frame["name"] for frame in document["skipped"]),
+            source=document["source"],
         )
 
     @property

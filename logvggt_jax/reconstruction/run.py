@@ -14,12 +14,14 @@ from logvggt_jax.data.feeding.transforms import ResizeTransform, resize
 from logvggt_jax.errors import InputError
 from logvggt_jax.geometry import decode_poses
 from logvggt_jax.interruption import Interrupted, StopRequest
+from logvggt_jax.reconstruction.calibration import Calibration
 from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE, write_cameras
 from logvggt_jax.reconstruction.depth_files import write_depth, write_picture
 from logvggt_jax.reconstruction.frame_pool import FramePool
 from logvggt_jax.reconstruction.point_cloud import PointSelection
 from logvggt_jax.reconstruction.result import DEPTH_FOLDER, IMAGE_FOLDER, depth_file, image_file
 from logvggt_jax.reconstruction.sources import SkippedFrame, Source, SourceFrame
+from logvggt_jax.reconstruction.sources.record import record_source
 from logvggt_jax.reconstruction.work_folder import WorkFolder
 from logvggt_jax.streaming import FrameResult, Predictor, Progress
 from logvggt_jax.streaming.state_file import State
@@ -124,8 +126,8 @@ class Run:
             raise InputError(f"{self._source.path} gave no frame")
         return stop.reason is None
 
-    def write_cameras(self, *, complete: bool) -> None:
-        """Writes the cameras of all frames; their intrinsics are all finite."""
+    def write_cameras(self, calibration: Calibration, *, complete: bool) -> None:
+        """Writes the cameras of all frames, as far as they are known by the calibration; all numbers are finite."""
         cameras, transform = self._predictor.cameras(), self._transform
         assert transform is not None  # there are frames
         encodings = cameras.pose_encoding.copy()
@@ -138,7 +140,7 @@ class Run:
                 stacklevel=2,
             )
             encodings[:, 7:] = np.maximum(encodings[:, 7:], _NARROWEST_FIELD_OF_VIEW)
-        _, intrinsics = decode_poses(encodings, transform.size)
+        intrinsics = calibration.apply(decode_poses(encodings, transform.size)[1], transform)
         write_cameras(
             self._work.path / CAMERAS_FILE,
             names=self._names,
@@ -151,6 +153,7 @@ class Run:
             complete=complete,
             skipped=self._source.skipped,
             noted_focal_length=self._focal_length,
+            source=record_source(self._source, self.num_taken),
         )
 
     def _pictures(self) -> Iterator[_Picture | None]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import importlib
+import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -99,7 +100,7 @@ def _write_result(root: Path) -> None:
 
 def _read_result(root: Path, output: Path) -> None:
     from logvggt_jax.geometry import camera_centres, is_rotation, matrix_to_quaternion
-    from logvggt_jax.reconstruction.exporters import EXPORTERS
+    from logvggt_jax.reconstruction.exporters import export
     from logvggt_jax.reconstruction.exporters.tum import read_trajectory
     from logvggt_jax.reconstruction.point_cloud import read_points
     from logvggt_jax.reconstruction.result import Reconstruction
@@ -117,10 +118,9 @@ def _read_result(root: Path, output: Path) -> None:
         maps = result.depth_and_confidence(index)
         _expect(all(each.shape == result.depth_size for each in maps), "depth has another size than cameras")
     # What is written from it can be read.
-    for name, export in EXPORTERS.items():
-        export(result, output / name, progress=False)
-    read_points(output / "ply")
-    read_trajectory(output / "tum")
+    export(result, ["ply", "tum", "kitti", "euroc", "nerfstudio", "depth-png", "depth-npz"], output, progress=False)
+    read_points(output / "points.ply")
+    read_trajectory(output / "tum.txt")
 
 
 def _write_trajectory(root: Path) -> None:
@@ -138,6 +138,24 @@ def _read_trajectory(root: Path, output: Path) -> None:
     timestamps, extrinsics = read_trajectory(root / "trajectory.txt")
     _expect(np.isfinite(timestamps).all(), "time stamps are not finite")
     _expect_finite("poses", extrinsics)
+    _expect(is_rotation(extrinsics[:, :3, :3]).all(), "rotations are none")
+
+
+def _write_transforms(root: Path) -> None:
+    frame = {"w": 64, "h": 48, "fl_x": 50.0, "fl_y": 50.0, "cx": 32.0, "cy": 24.0}
+    poses = np.tile(np.eye(4), (6, 1, 1))
+    poses[:, :3, 3] = np.random.default_rng(0).normal(size=(6, 3))
+    frames = [{"file_path": f"images/{i}.jpg", "transform_matrix": pose.tolist()} for i, pose in enumerate(poses)]
+    (root / "transforms.json").write_text(json.dumps({**frame, "frames": frames}))
+
+
+def _read_transforms(root: Path, output: Path) -> None:
+    from logvggt_jax.geometry import is_rotation
+    from logvggt_jax.reconstruction.fusion.pose_files import read_poses
+
+    poses = read_poses(root / "transforms.json")
+    extrinsics = np.stack([pose.extrinsics for pose in poses])
+    _expect_finite("poses", extrinsics, *(pose.intrinsics for pose in poses if pose.intrinsics is not None))
     _expect(is_rotation(extrinsics[:, :3, :3]).all(), "rotations are none")
 
 
@@ -263,6 +281,7 @@ KINDS = (
     Kind("shipped", functools.partial(_write_model, True), functools.partial(_read_model, True)),
     Kind("result", _write_result, _read_result),
     Kind("trajectory", _write_trajectory, _read_trajectory),
+    Kind("transforms", _write_transforms, _read_transforms),
     Kind("evaluation", _write_evaluation, _read_evaluation),
 )
 """All kinds, in the order in which cases take turns."""
