@@ -15,6 +15,7 @@ from logvggt_jax.data.readers.hypersim import HyperSim
 from logvggt_jax.data.readers.kitti import KITTI
 from logvggt_jax.data.readers.kitti_odometry import KITTIOdometry
 from logvggt_jax.data.readers.mvs_synth import MVSSynth
+from logvggt_jax.data.readers.nerfstudio import Nerfstudio
 from logvggt_jax.data.readers.nrgbd import NRGBD
 from logvggt_jax.data.readers.pointodyssey import PointOdyssey
 from logvggt_jax.data.readers.replica import Replica
@@ -51,6 +52,7 @@ _READERS: tuple[type[Reader], ...] = (
     KITTIOdometry,
     TUMRecording,
     Colmap,
+    Nerfstudio,
 )
 READERS: dict[str, type[Reader]] = {reader.name: reader for reader in _READERS}
 """Readers by name: the paper's training sets, those that it only evaluates on, rooms, those that it does not use."""

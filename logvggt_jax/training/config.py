@@ -61,7 +61,8 @@ class OptimizerConfig:
     The rate climbs linearly over `warmup_fraction` of the schedule and then follows a `cosine`, or stays and
     falls linearly over the last quarter (`linear_tail`), to `final_learning_rate`. With `restart_each_stage` every
     stage of the curriculum runs the schedule anew. `decay_all` applies weight decay to vectors (biases, norms,
-    gains) too.
+    gains) too. Parameters whose names match one of the patterns `frozen` (see `freezing`) are not trained; the encoder
+    is one of them where `model.encoder.frozen` says so.
     """
 
     learning_rate: float
@@ -74,8 +75,10 @@ class OptimizerConfig:
     weight_decay: float
     decay_all: bool
     clip_norm: float
+    frozen: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        freeze_lists(self)
         require_one_of(self, SCHEDULES, "schedule")
         require_within(self, "(0, inf)", "learning_rate", "clip_norm")
         require_within(self, "[0, inf)", "final_learning_rate", "weight_decay")
@@ -115,7 +118,9 @@ class SourceConfig:
     """One data set of a mixture.
 
     `weight` is its share of the clips relative to the others'. `stride`, smallest and largest, takes the place of
-    the stage's. `options` (sorted pairs) are further arguments of the set's reader.
+    the stage's. Of every sequence the `frames`, first and the one after the last, are taken, as a slice of Python does:
+    (None, 700) the first 700, (-200, None) the last 200. `options` (sorted pairs) are further arguments of the set's
+    reader.
     """
 
     name: str
@@ -123,6 +128,7 @@ class SourceConfig:
     split: str
     weight: float = 1.0
     stride: tuple[int, int] | None = None
+    frames: tuple[int | None, int | None] | None = None
     options: tuple[tuple[str, Any], ...] = ()
 
     def __post_init__(self) -> None:
@@ -168,7 +174,10 @@ class DataConfig:
 
 @dataclasses.dataclass(frozen=True)
 class ValidationConfig:
-    """Every `every` steps, `num_clips` fixed clips of `clip_length` frames, `stride` apart, of a held-out set."""
+    """Every `every` steps, `num_clips` fixed clips of `clip_length` frames, `stride` apart, of a held-out set.
+
+    They come from as many sequences as there are; where those are fewer, from several places of each.
+    """
 
     source: SourceConfig
     every: int

@@ -20,7 +20,8 @@ from logvggt_jax.types import Frames
 class Validation:
     """Fixed clips, read once, and the jitted model that is tried on them.
 
-    Clip i shows frames 0, stride, 2 stride, … of the i-th sequence that is long enough.
+    Clip i shows frames start, start + stride, … of a sequence that is long enough. As many sequences as there are have
+    clips; those of one sequence start evenly spaced, the first one at frame 0.
     """
 
     def __init__(self, model: LogVGGT, config: ValidationConfig, layout: Layout) -> None:
@@ -62,14 +63,22 @@ class Validation:
 
 def _read_clips(config: ValidationConfig) -> list[Frames]:
     dataset = open_source(config.source)
-    indices = [i * config.stride for i in range(config.clip_length)]
-    names = [name for name in dataset.sequences if dataset.num_frames(name) > indices[-1]]
-    if len(names) < config.num_clips:
+    span = (config.clip_length - 1) * config.stride + 1
+    # Starts that a sequence has room for.
+    room = {name: dataset.num_frames(name) - span + 1 for name in dataset.sequences}
+    names = [name for name in dataset.sequences if room[name] > 0][: config.num_clips]
+    counts = {name: len(range(place, config.num_clips, len(names))) for place, name in enumerate(names)}
+    if not names or any(counts[name] > room[name] for name in names):
         raise InputError(
-            f"validation: data set {config.source.name!r} has {len(names)} sequences of at least {indices[-1] + 1} "
-            f"frames, num_clips={config.num_clips} needs more; lower num_clips, clip_length or stride"
+            f"validation: data set {config.source.name!r} has {len(names)} sequences of at least {span} frames, "
+            f"num_clips={config.num_clips} needs more or longer ones; lower num_clips, clip_length or stride"
         )
-    return [fit(dataset.read(name, indices), config.size) for name in names[: config.num_clips]]
+    clips = []
+    for name in names:
+        for start in np.linspace(0, room[name] - 1, counts[name]).round().astype(int):
+            frames = dataset.read(name, range(start, start + span, config.stride))
+            clips.append(fit(frames, config.size))
+    return clips
 
 
 def _clip_metrics(depth: np.ndarray, extrinsics: np.ndarray, clip: Frames) -> dict[str, float]:

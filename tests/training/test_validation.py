@@ -1,11 +1,15 @@
 """Validation fetches what it judges, and judges once what knows nothing."""
 
+import dataclasses
 from typing import Any
 
 import jax
+import numpy as np
 import pytest
 
+from logvggt_jax.errors import InputError
 from logvggt_jax.training import validation as module
+from logvggt_jax.training.batches import open_source
 from logvggt_jax.training.config import SourceConfig, ValidationConfig
 from logvggt_jax.training.sharding import data_mesh, parameter_layout
 from logvggt_jax.training.validation import Validation
@@ -53,3 +57,17 @@ def test_any_number_of_clips_is_judged_on_any_number_of_devices(pixel_model: Any
     one = judged(1)
     for devices in (2, 8):
         assert judged(devices) == pytest.approx(one, rel=1e-5)
+
+
+def test_one_sequence_gives_clips_from_several_places() -> None:
+    source = SourceConfig("rooms", None, "val", options=(*ROOMS[:2], ("num_rooms", 2), ROOMS[3]))
+    config = ValidationConfig(source, every=1, num_clips=5, clip_length=3, stride=2, size=(28, 42))
+    rooms = open_source(source)
+    first, second = rooms.sequences
+    expected = [(first, 0), (first, 2), (first, 3), (second, 0), (second, 3)]
+    clips = module._read_clips(config)
+    assert len(clips) == len(expected)
+    for clip, (name, start) in zip(clips, expected, strict=True):
+        np.testing.assert_array_equal(clip.extrinsics, rooms.read(name, range(start, start + 5, 2)).extrinsics)
+    with pytest.raises(InputError, match="has 2 sequences of at least 5 frames, num_clips=9 needs more or longer"):
+        module._read_clips(dataclasses.replace(config, num_clips=9))

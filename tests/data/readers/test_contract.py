@@ -80,7 +80,7 @@ def test_frames_come_back_with_their_units_in_the_order_asked_for(layout: Layout
 
 
 # Metres as written here, but each sequence of the set has a scale of its own.
-UNSCALED = {layout_of(name).sequence for name in ("co3dv2", "blendedmvs", "colmap")}
+UNSCALED = {layout_of(name).sequence for name in ("co3dv2", "blendedmvs", "colmap", "nerfstudio")}
 
 
 @sets_with_poses
