@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from logvggt_jax.data.dataset import Reader
+from logvggt_jax.data.packed.index import is_packed
 from logvggt_jax.data.readers.arkitscenes import ARKitScenes
 from logvggt_jax.data.readers.blendedmvs import BlendedMVS
 from logvggt_jax.data.readers.bonn import Bonn
@@ -66,7 +67,7 @@ def open_dataset(name: str, root: str | Path | None, split: str = "all", **optio
 
     Args:
       name: for example `seven_scenes`.
-      root: the data set's folder; None for `rooms`, which are procedural.
+      root: the data set's folder, or one that `logvggt data pack` made of it; None for `rooms`, which are procedural.
       split: `train`, `val`, `test` or `all`, of those the set has; `all` needs no list file.
       **options: further arguments of the set's reader; `rooms` has several, `arkitscenes` one.
 
@@ -76,6 +77,11 @@ def open_dataset(name: str, root: str | Path | None, split: str = "all", **optio
     """
     check_options(name, options)
     reader = READERS[name]
+    if root is not None and is_packed(root):
+        # Grain, which reads shards, takes a second to load.
+        from logvggt_jax.data.packed.dataset import open_packed
+
+        return open_packed(root, split, reader, options)
     make: Any = reader
     if not reader.needs_root:
         if root is not None:
