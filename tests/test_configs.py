@@ -9,7 +9,6 @@ import sys
 from pathlib import Path
 
 import jax
-import numpy as np
 import pytest
 
 from logvggt_jax import LogVGGT, ModelConfig
@@ -21,9 +20,8 @@ from logvggt_jax.training.optimizer import learning_rate_schedule
 from logvggt_jax.training.program import abstract_parameters, make_program
 from logvggt_jax.training.sharding import check_batch_size, data_mesh
 from logvggt_jax.training.state import TrainState
-from logvggt_jax.weights.checkpoints import save_model
+from logvggt_jax.weights.folder import write_description
 from logvggt_jax.weights.provenance import Provenance
-from logvggt_jax.weights.vggt import parameter_shapes
 
 ROOT = Path(__file__).parents[1]
 
@@ -33,7 +31,7 @@ def _config(name: str, monkeypatch: pytest.MonkeyPatch) -> TrainConfig:
     return TrainConfig.from_dict(importlib.import_module(f"configs.{name}").get_config().to_dict())
 
 
-@pytest.mark.parametrize("name", ["tiny", "demo", "small", "h20", "finetune"])
+@pytest.mark.parametrize("name", ["tiny", "demo", "small", "h20", "finetune", "distill"])
 def test_configuration_builds_its_run(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     config = _config(name, monkeypatch)
     schedule = learning_rate_schedule(config.optimizer, config.stages)
@@ -105,8 +103,9 @@ def test_finetuning_takes_sizes_and_pictures_from_the_model_it_starts_from(
 ) -> None:
     vggt = _config("finetune", monkeypatch)
     assert vggt.model == ModelConfig(dtype="bfloat16") and vggt.stages[0].sizes[0] == (392, 518)
-    zeros = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), parameter_shapes(small_config))
-    save_model(tmp_path / "model", small_config, zeros, Provenance("windows", 70))
+    (tmp_path / "model").mkdir()
+    known = {"config": small_config.to_dict(), "digests": {}, "provenance": Provenance("windows", 70).to_dict()}
+    write_description(tmp_path / "model", known)
     own = TrainConfig.from_dict(importlib.import_module("configs.finetune").get_config(str(tmp_path)).to_dict())
     assert own.model == small_config and own.initial_weights == str(tmp_path)
     assert own.stages[0].sizes == ((56, 70), (42, 70), (70, 56), (70, 42))

@@ -13,6 +13,7 @@ from logvggt_jax.data.readers.bonn import Bonn
 from logvggt_jax.data.readers.co3dv2 import Co3Dv2
 from logvggt_jax.data.readers.colmap import Colmap
 from logvggt_jax.data.readers.hypersim import HyperSim
+from logvggt_jax.data.readers.images import Images
 from logvggt_jax.data.readers.kitti import KITTI
 from logvggt_jax.data.readers.kitti_odometry import KITTIOdometry
 from logvggt_jax.data.readers.mvs_synth import MVSSynth
@@ -54,6 +55,7 @@ _READERS: tuple[type[Reader], ...] = (
     TUMRecording,
     Colmap,
     Nerfstudio,
+    Images,
 )
 READERS: dict[str, type[Reader]] = {reader.name: reader for reader in _READERS}
 """Readers by name: the paper's training sets, those that it only evaluates on, rooms, those that it does not use."""

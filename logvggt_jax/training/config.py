@@ -24,17 +24,17 @@ from logvggt_jax.data.feeding.augmentation import ColourAugmentation
 from logvggt_jax.data.feeding.holdouts import HoldOut
 from logvggt_jax.errors import InputError
 
-LOSSES = ("log_vggt", "vggt")
+LOSSES = ("log_vggt", "vggt", "distillation")
 SCHEDULES = ("cosine", "linear_tail")
 
 
 @dataclasses.dataclass(frozen=True)
 class LossConfig:
-    """The objective: `name` is `log_vggt` (the paper's) or `vggt` (VGGT's released trainer).
+    """The objective: `name` is `log_vggt` (the paper's), `vggt` (VGGT's released trainer) or `distillation`.
 
     `translation_weight`, `rotation_weight` and `field_of_view_weight` weigh the parts of the camera loss, `gamma`
-    decays earlier rounds of the camera head, `alpha` rewards confidence. `quantile` (vggt only) drops the largest
-    depth errors, None keeps all.
+    decays earlier rounds of the camera head, `alpha` rewards confidence; in a distillation it weighs the distance to
+    the teacher's. `quantile` (vggt only) drops the largest depth errors, None keeps all.
     """
 
     name: str
@@ -195,6 +195,27 @@ class ValidationConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class TeacherConfig:
+    """Plain VGGT, whose predictions take the place of the truth in all sources of a run.
+
+    `weights` is what `from_pretrained` reads. Videos are cut into clips of `clip_length` frames, `stride` apart, each
+    of which the teacher sees as a whole: the longer, the more a student learns of what lies far apart, up to what a
+    device's memory holds. Its labels are kept in `data.cache_dir`. With `validation` the validation source is labelled
+    as well and the student compared with its teacher, else with that source's truth.
+    """
+
+    weights: str
+    clip_length: int
+    stride: int = 1
+    validation: bool = True
+
+    def __post_init__(self) -> None:
+        require_counts(self, "clip_length", "stride")
+        if self.clip_length < 2:
+            raise InputError("TeacherConfig.clip_length must be at least 2: one frame alone has no pose to be learned")
+
+
+@dataclasses.dataclass(frozen=True)
 class TrainConfig:
     """A whole run.
 
@@ -207,7 +228,7 @@ class TrainConfig:
     `accumulate` times as many devices. With `shard_parameters` a device holds its part of parameters, gradients and
     moments, and puts the parameters together layer by layer. `average`, such as 0.999, is the decay in a step of a
     moving average of the parameters, which validation and the model folder then have; None keeps none. The first two
-    may change when a run goes on.
+    may change when a run goes on. A `teacher` labels the data, for the objective `distillation`.
     """
 
     model: ModelConfig
@@ -226,10 +247,21 @@ class TrainConfig:
     accumulate: int = 1
     shard_parameters: bool = False
     average: float | None = None
+    teacher: TeacherConfig | None = None
 
     def __post_init__(self) -> None:
         if not self.stages:
             raise InputError("TrainConfig.stages is empty: a run needs at least one")
+        if (self.loss.name == "distillation") != (self.teacher is not None):
+            raise InputError("loss.name='distillation' and a teacher belong together: give both, or neither")
+        if self.teacher is not None:
+            if self.data.cache_dir is None:
+                raise InputError("a teacher's labels are kept on disk: give data.cache_dir a folder")
+            if longest := [s.name for s in self.stages if s.clip_length > self.teacher.clip_length]:
+                raise InputError(
+                    f"stages {', '.join(longest)}: clips are longer than the teacher's, "
+                    f"teacher.clip_length={self.teacher.clip_length}: raise it or shorten them"
+                )
         require_counts(self, "log_every", "save_every", "keep_checkpoints", "max_skipped_in_a_row", "accumulate")
         require_within(self, "[0, 1)", "average")
         require_within(self, "(0, inf)", "max_minutes")

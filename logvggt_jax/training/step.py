@@ -39,7 +39,8 @@ def make_loss_terms(model: LogVGGT, config: LossConfig, *, frozen: tuple[str, ..
         predictions = model.apply(variables, batch["images"], frame_mask, remat=True)
         targets = normalize_clips(batch["depth"], batch["intrinsics"], batch["extrinsics"], frame_mask=frame_mask)
         seen: Any = jax.lax.stop_gradient(predictions)
-        return loss_terms(predictions, targets, config), clip_errors(seen, targets), _finite_clips(seen, targets)
+        means = loss_terms(predictions, targets, config, batch.get("confidence"))
+        return means, clip_errors(seen, targets), _finite_clips(seen, targets)
 
     return terms
 
@@ -113,7 +114,8 @@ def make_train_step(
     mesh.
 
     A batch holds `images` uint8 [B, T, H, W, 3], `depth` [B, T, H, W], `intrinsics` [B, T, 3, 3], `extrinsics`
-    [B, T, 4, 4] and optionally `frame_mask` bool [B, T]. Metrics are float32 scalars, equal on all devices. A
+    [B, T, 4, 4], optionally `frame_mask` bool [B, T], and for a distillation the teacher's `confidence` [B, T, H, W].
+    Metrics are float32 scalars, equal on all devices. A
     non-finite loss or gradient leaves parameters and moments as they were and is counted in the state; where it comes
     from predictions or targets, `finite clips`, bool [B] and split as the batch is, says of which clips.
 

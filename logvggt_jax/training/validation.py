@@ -6,6 +6,7 @@ import jax
 import numpy as np
 from jax.sharding import PartitionSpec as P
 
+from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.data.feeding.transforms import fit
 from logvggt_jax.errors import InputError
 from logvggt_jax.metrics.depth import depth_metrics
@@ -21,12 +22,15 @@ class Validation:
     """Fixed clips, read once, and the jitted model that is tried on them.
 
     Clip i shows frames start, start + stride, … of a sequence that is long enough. As many sequences as there are have
-    clips; those of one sequence start evenly spaced, the first one at frame 0.
+    clips; those of one sequence start evenly spaced, the first one at frame 0. A `dataset` takes the place of the
+    source that the configuration names.
     """
 
-    def __init__(self, model: LogVGGT, config: ValidationConfig, layout: Layout) -> None:
+    def __init__(
+        self, model: LogVGGT, config: ValidationConfig, layout: Layout, dataset: Dataset | None = None
+    ) -> None:
         mesh = layout.mesh
-        self._clips = _read_clips(config)
+        self._clips = _read_clips(config, open_source(config.source) if dataset is None else dataset)
         self._without_learning = [_baselines(clip) for clip in self._clips]
         # The last clip again, as often as the devices need it for equal shares.
         shown = [*self._clips, *self._clips[-1:] * (-len(self._clips) % mesh.size)]
@@ -61,8 +65,7 @@ class Validation:
         return {f"validation/{name}": value for name, value in means.items()}
 
 
-def _read_clips(config: ValidationConfig) -> list[Frames]:
-    dataset = open_source(config.source)
+def _read_clips(config: ValidationConfig, dataset: Dataset) -> list[Frames]:
     span = (config.clip_length - 1) * config.stride + 1
     # Starts that a sequence has room for.
     room = {name: dataset.num_frames(name) - span + 1 for name in dataset.sequences}

@@ -65,9 +65,9 @@ def test_one_sequence_gives_clips_from_several_places() -> None:
     rooms = open_source(source)
     first, second = rooms.sequences
     expected = [(first, 0), (first, 2), (first, 3), (second, 0), (second, 3)]
-    clips = module._read_clips(config)
+    clips = module._read_clips(config, rooms)
     assert len(clips) == len(expected)
     for clip, (name, start) in zip(clips, expected, strict=True):
         np.testing.assert_array_equal(clip.extrinsics, rooms.read(name, range(start, start + 5, 2)).extrinsics)
     with pytest.raises(InputError, match="has 2 sequences of at least 5 frames, num_clips=9 needs more or longer"):
-        module._read_clips(dataclasses.replace(config, num_clips=9))
+        module._read_clips(dataclasses.replace(config, num_clips=9), rooms)
