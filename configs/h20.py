@@ -76,6 +76,7 @@ def get_config(data_root: str = "data") -> ConfigDict:
         "weight_decay": 0.05,
         "decay_all": False,
         "clip_norm": 1.0,
+        "frozen": (),
     }
     config.data = {
         "sources": {

@@ -75,6 +75,7 @@ def get_config() -> ConfigDict:
         "weight_decay": 0.02,
         "decay_all": False,
         "clip_norm": 1.0,
+        "frozen": (),
     }
     rooms = {"height": HEIGHT, "width": WIDTH, "num_frames": 48, "style": "compass", "speed": (0.7, 1.3)}
     config.data = {

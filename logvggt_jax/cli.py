@@ -313,6 +313,21 @@ def _check_data(options: argparse.Namespace) -> int:
     return PROBLEMS_FOUND if report.problems else 0
 
 
+def _pack_data(options: argparse.Namespace) -> None:
+    from logvggt_jax.data.packed.pack import pack
+
+    report = pack(
+        options.name,
+        options.root,
+        options.output,
+        split=options.split,
+        frames_per_shard=options.frames_per_shard,
+        workers=options.workers,
+        progress=True,
+    )
+    print("\n".join(map(printable, report.text().splitlines())))
+
+
 def _doctor(options: argparse.Namespace) -> int:
     from logvggt_jax.doctor.examination import QUICK, SHARES, examine, part_findings
     from logvggt_jax.doctor.finding import Finding
@@ -724,6 +739,28 @@ def _parser() -> argparse.ArgumentParser:
         help="PNG file to write: frames, their depth, and the cameras from above",
     )
     sub.add_argument("--json", action="store_true", help="print the whole report as JSON")
+
+    sub = command(
+        "pack",
+        _pack_data,
+        "write a data set's frames into shards that training reads in its folder's place",
+        "logvggt data pack scannet /data/scannet --split train --output /packed/scannet --workers 8",
+        group=data_commands,
+        details=" Training on the packed folder (--config.data.sources.scannet.root=/packed/scannet) draws the same "
+        "clips. Every frame is stored as the reader hands it out, without loss, so that nothing is decoded again. The "
+        "same command goes on after an interruption, and writes anew what is damaged. What cannot be read is named and "
+        "fails in training as it did before.",
+    )
+    sub.add_argument("name", help="data set, as `logvggt data list` names it")
+    sub.add_argument("root", type=Path, help="folder of the copy")
+    sub.add_argument("--output", type=Path, required=True, metavar="FOLDER", help="folder to write the shards to")
+    sub.add_argument(
+        "--split", choices=("train", "val", "test", "all"), default="all", help="only this split's sequences"
+    )
+    sub.add_argument(
+        "--frames-per-shard", type=int, default=2000, metavar="N", help="a sequence is never divided between shards"
+    )
+    sub.add_argument("--workers", type=int, default=1, metavar="N", help="processes that read and write shards")
 
     command(
         "list",

@@ -20,6 +20,8 @@ from logvggt_jax.training.optimizer import learning_rate_schedule
 from logvggt_jax.training.program import abstract_parameters, make_program
 from logvggt_jax.training.sharding import check_batch_size, data_mesh
 from logvggt_jax.training.state import TrainState
+from logvggt_jax.weights.folder import write_description
+from logvggt_jax.weights.provenance import Provenance
 
 ROOT = Path(__file__).parents[1]
 
@@ -29,7 +31,7 @@ def _config(name: str, monkeypatch: pytest.MonkeyPatch) -> TrainConfig:
     return TrainConfig.from_dict(importlib.import_module(f"configs.{name}").get_config().to_dict())
 
 
-@pytest.mark.parametrize("name", ["tiny", "demo", "small", "h20"])
+@pytest.mark.parametrize("name", ["tiny", "demo", "small", "h20", "finetune", "distill"])
 def test_configuration_builds_its_run(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     config = _config(name, monkeypatch)
     schedule = learning_rate_schedule(config.optimizer, config.stages)
@@ -94,6 +96,22 @@ def test_the_small_model_goes_on_from_weights_with_its_last_stage(monkeypatch: p
     shown = subprocess.run(script, cwd=ROOT, env={**os.environ, "PYTHON": "echo"}, capture_output=True, text=True)
     words = shown.stdout.split()
     assert words[:2] == ["train.py", "--config=configs/small.py:rooms"] and words[-1] == script[-1]
+
+
+def test_finetuning_takes_sizes_and_pictures_from_the_model_it_starts_from(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_config: ModelConfig
+) -> None:
+    vggt = _config("finetune", monkeypatch)
+    assert vggt.model == ModelConfig(dtype="bfloat16") and vggt.stages[0].sizes[0] == (392, 518)
+    (tmp_path / "model").mkdir()
+    known = {"config": small_config.to_dict(), "digests": {}, "provenance": Provenance("windows", 70).to_dict()}
+    write_description(tmp_path / "model", known)
+    own = TrainConfig.from_dict(importlib.import_module("configs.finetune").get_config(str(tmp_path)).to_dict())
+    assert own.model == small_config and own.initial_weights == str(tmp_path)
+    assert own.stages[0].sizes == ((56, 70), (42, 70), (70, 56), (70, 42))
+    assert own.optimizer.learning_rate > vggt.optimizer.learning_rate
+    trained, validated = own.data.sources[0], own.validation.sources[0]
+    assert (trained.frames, validated.frames) == ((None, -200), (-200, None)), "what is validated is not trained on"
 
 
 def test_h20_is_the_papers_training(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
 from collections.abc import Mapping
@@ -242,9 +243,11 @@ class RunCheckpoints:
         return Provenance("windows", longer_edge, source=f"trained from {start}{self._here()}", training=record)
 
     def _check_configuration(self, stored: StoredCheckpoint) -> None:
-        ours = self.config.to_dict()
+        ours, written = self.config.to_dict(), stored.config
+        with contextlib.suppress(InputError):  # with what an earlier version had no field for
+            written = TrainConfig.from_dict(written).to_dict()
         for part in ("model", "stages", "data", "loss", "optimizer", "seed", "average"):
-            theirs = stored.config.get(part)
+            theirs = written.get(part)
             if part == "data" and theirs is not None:
                 theirs, ours[part] = _what_decides_clips(theirs), _what_decides_clips(ours[part])
             difference = _first_difference(theirs, ours[part], part)

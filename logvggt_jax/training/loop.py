@@ -21,12 +21,13 @@ from logvggt_jax.errors import InputError, one_line
 from logvggt_jax.interruption import StopRequest
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.operations import matmul_flops_per_second
-from logvggt_jax.training.batches import open_sources, stage_batches
+from logvggt_jax.training.batches import stage_batches
 from logvggt_jax.training.checkpoint_files import Position
 from logvggt_jax.training.checkpoints import RunCheckpoints
 from logvggt_jax.training.compilation import compiled_steps
 from logvggt_jax.training.config import VALIDATION_METRICS, StageConfig, TrainConfig
 from logvggt_jax.training.device_batches import DeviceBatches
+from logvggt_jax.training.distillation import open_data
 from logvggt_jax.training.dry_run import step_flops
 from logvggt_jax.training.initialization import initial_parameters
 from logvggt_jax.training.metrics_log import MetricsLog, read_metrics
@@ -82,8 +83,8 @@ def train(
     with contextlib.ExitStack() as stack:
         watched = stack.enter_context(Watchdog(watchdog))
         # Before gigabytes of weights are read.
-        datasets = open_sources(config.data, () if config.validation is None else config.validation.sources)
-        run = _Run(config, workdir, mesh, watched)
+        datasets, validated = open_data(config)
+        run = _Run(config, workdir, mesh, watched, validated)
         run.profiler = stack.enter_context(Profiler(profile, workdir / "profile"))
         stack.enter_context(run.checkpoints)
         stop = stack.enter_context(StopRequest("SIGTERM", "SIGINT"))
@@ -106,7 +107,9 @@ class _Run:
     times: RunTimes
     profiler: Profiler
 
-    def __init__(self, config: TrainConfig, workdir: Path, mesh: Mesh, watchdog: Watchdog) -> None:
+    def __init__(
+        self, config: TrainConfig, workdir: Path, mesh: Mesh, watchdog: Watchdog, validated: Sequence[Dataset]
+    ) -> None:
         self.config, self.mesh, self.watchdog = config, mesh, watchdog
         self.deadline = None if config.max_minutes is None else time.monotonic() + 60 * config.max_minutes
         model = LogVGGT(config.model)
@@ -116,7 +119,7 @@ class _Run:
         self.programs: dict[tuple[int, ...], jax.stages.Compiled] = {}
         self.operations: dict[tuple[int, ...], float] = {}
         layout = self.program.layout
-        self.validation = None if config.validation is None else Validation(model, config.validation, layout)
+        self.validation = None if config.validation is None else Validation(model, config.validation, layout, validated)
         self.checkpoints = RunCheckpoints(workdir, config)
         self.peak = None
         if mesh.devices.flat[0].platform != "cpu":  # whose cores share one peak

@@ -1,18 +1,20 @@
 """Accuracy on a few fixed clips that training never sees."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from jax.sharding import PartitionSpec as P
 
+from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.data.feeding.transforms import fit
 from logvggt_jax.errors import InputError
 from logvggt_jax.metrics.depth import depth_metrics
 from logvggt_jax.metrics.pose import pose_accuracy, relative_pose_errors
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.training.batches import open_source
-from logvggt_jax.training.config import SourceConfig, ValidationConfig
+from logvggt_jax.training.config import ValidationConfig
 from logvggt_jax.training.pictures import clip_picture, trajectory_picture
 from logvggt_jax.training.sharding import DATA_AXIS, Layout, replicated, split
 from logvggt_jax.types import Frames
@@ -35,13 +37,19 @@ class Judgement(NamedTuple):
 class Validation:
     """Fixed clips, read once, and the jitted model that is tried on them.
 
-    Clip i of a source shows frames 0, stride, 2 stride, … of the i-th sequence that is long enough.
+    Clip i of a source shows frames start, start + stride, … of a sequence that is long enough. As many sequences as
+    there are have clips; those of one sequence start evenly spaced, the first one at frame 0. `datasets` take the place
+    of the sources that the configuration names.
     """
 
-    def __init__(self, model: LogVGGT, config: ValidationConfig, layout: Layout) -> None:
+    def __init__(
+        self, model: LogVGGT, config: ValidationConfig, layout: Layout, datasets: Sequence[Dataset] = ()
+    ) -> None:
         mesh = layout.mesh
         self._names = [source.name for source in config.sources]
-        self._clips = [clip for source in config.sources for clip in _read_clips(source, config)]
+        opened = datasets or [open_source(source) for source in config.sources]
+        each = zip(self._names, opened, strict=True)
+        self._clips = [clip for name, dataset in each for clip in _read_clips(name, dataset, config)]
         self._each = config.num_clips
         firsts = np.arange(0, len(self._clips), self._each)
         self._without_learning = [_baselines(clip) for clip in self._clips]
@@ -89,16 +97,23 @@ def _means(results: list[dict[str, float]], prefix: str) -> dict[str, float]:
     return {f"{prefix}/{name}": value for name, value in means.items()}
 
 
-def _read_clips(source: SourceConfig, config: ValidationConfig) -> list[Frames]:
-    dataset = open_source(source)
-    indices = [i * config.stride for i in range(config.clip_length)]
-    names = [name for name in dataset.sequences if dataset.num_frames(name) > indices[-1]]
-    if len(names) < config.num_clips:
+def _read_clips(name: str, dataset: Dataset, config: ValidationConfig) -> list[Frames]:
+    span = (config.clip_length - 1) * config.stride + 1
+    # Starts that a sequence has room for.
+    room = {sequence: dataset.num_frames(sequence) - span + 1 for sequence in dataset.sequences}
+    sequences = [sequence for sequence in dataset.sequences if room[sequence] > 0][: config.num_clips]
+    counts = {each: len(range(i, config.num_clips, len(sequences))) for i, each in enumerate(sequences)}
+    if not sequences or any(counts[each] > room[each] for each in sequences):
         raise InputError(
-            f"validation: data set {source.name!r} has {len(names)} sequences of at least {indices[-1] + 1} "
-            f"frames, num_clips={config.num_clips} needs more; lower num_clips, clip_length or stride"
+            f"validation: data set {name!r} has {len(sequences)} sequences of at least {span} frames, "
+            f"num_clips={config.num_clips} needs more or longer ones; lower num_clips, clip_length or stride"
         )
-    return [fit(dataset.read(name, indices), config.size) for name in names[: config.num_clips]]
+    clips = []
+    for sequence in sequences:
+        for start in np.linspace(0, room[sequence] - 1, counts[sequence]).round().astype(int):
+            frames = dataset.read(sequence, range(start, start + span, config.stride))
+            clips.append(fit(frames, config.size))
+    return clips
 
 
 def _clip_metrics(depth: np.ndarray, extrinsics: np.ndarray, clip: Frames) -> dict[str, float]:

@@ -10,6 +10,7 @@ import dataclasses
 import functools
 import importlib
 import json
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -55,6 +56,18 @@ def _read_dataset(name: str, root: Path, output: Path) -> None:
             check_frames(frames, sequence, poses=False)
         except InputError as error:
             raise Nonsense(f"read without complaint: {error}") from error
+
+
+def _write_packed(root: Path) -> None:
+    from logvggt_jax.data.packed.pack import pack
+
+    _write_dataset("seven_scenes", root / "originals")
+    pack("seven_scenes", root / "originals", root / "packed")
+    shutil.rmtree(root / "originals")
+
+
+def _read_packed(root: Path, output: Path) -> None:
+    _read_dataset("seven_scenes", root / "packed", output)
 
 
 def _pictures() -> np.ndarray:
@@ -273,6 +286,7 @@ KINDS = (
         Kind(name, functools.partial(_write_dataset, name), functools.partial(_read_dataset, name))
         for name in _datasets()
     ),
+    Kind("packed", _write_packed, _read_packed),
     Kind("images", _write_images, functools.partial(_read_source, "")),
     Kind("video", _write_video, functools.partial(_read_source, "walk.mp4")),
     Kind("safetensors", _write_safetensors, functools.partial(_read_checkpoint, "model.safetensors")),

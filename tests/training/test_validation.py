@@ -4,9 +4,12 @@ import dataclasses
 from typing import Any
 
 import jax
+import numpy as np
 import pytest
 
+from logvggt_jax.errors import InputError
 from logvggt_jax.training import validation as module
+from logvggt_jax.training.batches import open_source
 from logvggt_jax.training.config import SourceConfig, ValidationConfig
 from logvggt_jax.training.sharding import data_mesh, parameter_layout
 from logvggt_jax.training.validation import Validation
@@ -83,3 +86,17 @@ def test_each_source_has_its_clips_its_means_and_its_pictures(pixel_model: Any, 
 def _judged(model: Any, params: Any, sources: tuple[SourceConfig, ...]) -> module.Judgement:
     config = ValidationConfig(sources, every=1, num_clips=2, clip_length=3, stride=2, size=(28, 42))
     return Validation(model, config, parameter_layout(params, data_mesh(1), shard=False))(params)
+
+
+def test_one_sequence_gives_clips_from_several_places() -> None:
+    source = SourceConfig("rooms", None, "val", options=(*ROOMS[:2], ("num_rooms", 2), ROOMS[3]))
+    config = ValidationConfig((source,), every=1, num_clips=5, clip_length=3, stride=2, size=(28, 42))
+    rooms = open_source(source)
+    first, second = rooms.sequences
+    expected = [(first, 0), (first, 2), (first, 3), (second, 0), (second, 3)]
+    clips = module._read_clips("rooms", rooms, config)
+    assert len(clips) == len(expected)
+    for clip, (name, start) in zip(clips, expected, strict=True):
+        np.testing.assert_array_equal(clip.extrinsics, rooms.read(name, range(start, start + 5, 2)).extrinsics)
+    with pytest.raises(InputError, match="has 2 sequences of at least 5 frames, num_clips=9 needs more or longer"):
+        module._read_clips("rooms", rooms, dataclasses.replace(config, num_clips=9))
