@@ -19,6 +19,8 @@ from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.model.parameters import in_compute_type
 from logvggt_jax.model.refinement import Span
 from logvggt_jax.model.windows import WindowState
+from logvggt_jax.streaming.loops import LoopCloser, LoopSettings, frame_describer, loop_settings
+from logvggt_jax.streaming.offline import predict_plain
 from logvggt_jax.streaming.program import Program, abstract_variables, flops_of
 from logvggt_jax.streaming.results import Cameras, FrameResult, checked_frames, decoded_cameras, device_memory
 from logvggt_jax.streaming.token_store import TokenStore
@@ -119,11 +121,14 @@ class WindowSettings:
       ahead: windows that may be on the device when `push` returns. With 1 the device works while the caller does,
         and a window's results come with the next window; with 0 they come at once.
       first_capacity: frames that the token buffers hold at first; they double.
+      loops: close loops when the sequence ends: True, or how they are looked for. No pose is final before; both places
+        of a loop are predicted together in one window.
     """
 
     provisional: bool = False
     ahead: int = 1
     first_capacity: int = 256
+    loops: LoopSettings | bool = False
 
     def __post_init__(self) -> None:
         require_counts(self, "first_capacity")
@@ -170,6 +175,13 @@ class StreamSession:
         self._refined = 0
         self._encodings = np.zeros((0, 9), np.float32)
         self._handed_out = 0
+        self._loops: LoopCloser | None = None
+        if (loops := loop_settings(self._settings.loops)) is not None:
+            # No more than the model has ever seen at once.
+            loops = dataclasses.replace(loops, frames=min(loops.frames, max(1, model.config.windows.size // 2)))
+            predict = functools.partial(predict_plain, model, self._variables)
+            self._loops = LoopCloser(frame_describer(model, self._variables), predict, loops)
+        self._closed_loops: Cameras | None = None
         self._closed = False
 
     @property
@@ -198,6 +210,8 @@ class StreamSession:
                 self._pending.append(frame)
                 self._newest = frame
                 self._received += 1
+                if self._loops is not None:
+                    self._loops.see(frame)
                 if self._advance():
                     results += self._landed(self._settings.ahead)
         return results
@@ -217,7 +231,11 @@ class StreamSession:
             assert self._state is not None  # set by _begin
             self._take_off(_finish(self._windows, self._variables, self._state))
             self._state = self._newest = None
-            return self._landed(0)
+            results = self._landed(0)
+            if self._loops is not None:
+                cameras = decoded_cameras(self._encodings, self._image_size, final=len(self._encodings))
+                self._closed_loops = self._loops.close(cameras)
+            return results
 
     def snapshot(self) -> tuple[list[FrameResult], dict[str, np.ndarray]]:
         """See `Predictor.snapshot`: cache, held and compact tokens, poses, and frames not yet in a window."""
@@ -231,6 +249,8 @@ class StreamSession:
             arrays |= {f"state/{field.name}": np.asarray(getattr(self._state, field.name)) for field in fields}
         if self._pending:
             arrays["pending"] = np.stack(self._pending)
+        if self._loops is not None:
+            arrays |= {f"loops/{name}": array for name, array in self._loops.arrays().items()}
         counts = (self._received, self._refined, self._handed_out)
         return results, {
             **arrays,
@@ -248,6 +268,8 @@ class StreamSession:
         self._pending = list(arrays.get("pending", ()))
         self._received, self._refined, self._handed_out = (int(count) for count in arrays["counts"])
         self._encodings = arrays["encodings"]
+        if self._loops is not None:
+            self._loops.restore({name.removeprefix("loops/"): x for name, x in arrays.items() if name[:6] == "loops/"})
         if tokens := {name.removeprefix("tokens/"): x for name, x in arrays.items() if name.startswith("tokens/")}:
             self._store.restore(tokens)
         if fields := {name.removeprefix("state/"): x for name, x in arrays.items() if name.startswith("state/")}:
@@ -257,14 +279,17 @@ class StreamSession:
             )
 
     def cameras(self, *, provisional: bool = False) -> Cameras:
-        """Cameras of the frames whose pose is final; with `provisional` of all frames handed out."""
+        """Cameras of the frames whose pose is final, but for loops; with `provisional` of all frames handed out."""
+        if self._closed_loops is not None:
+            return self._closed_loops
         encodings = self._all_encodings(provisional=provisional)
-        return decoded_cameras(encodings, self._image_size, final=len(self._encodings))
+        return decoded_cameras(encodings, self._image_size, final=self._num_final)
 
     def cameras_with(self, refinement: RefinementConfig) -> Cameras:
         """Cameras of all frames of a closed stream, as another mode of refinement gives them.
 
-        Windows know nothing of refinement, so that modes are compared on one run of them.
+        Windows know nothing of refinement, so that modes are compared on one run of them. A stream that closes loops
+        closes them for these cameras.
 
         Raises:
           ValueError: the stream is not closed; it ran without refinement, so that it has kept no registers.
@@ -277,7 +302,13 @@ class StreamSession:
         model = LogVGGT(dataclasses.replace(self._model.config, refinement=refinement))
         registers = store.registers if refinement.enabled else None
         encodings = _fire_all(model, self._variables, store.camera, registers, jnp.int32(store.count))
-        return decoded_cameras(np.asarray(encodings)[: store.count], self._image_size, final=store.count)
+        cameras = decoded_cameras(np.asarray(encodings)[: store.count], self._image_size, final=store.count)
+        return cameras if self._loops is None else self._loops.close(cameras)
+
+    @property
+    def _num_final(self) -> int:
+        """Poses that nothing will change."""
+        return len(self._encodings) if self._loops is None else 0
 
     def _memory(self) -> AbstractContextManager[None]:
         height, width = self._image_size
@@ -391,15 +422,18 @@ class StreamSession:
         self._encodings = np.concatenate([self._encodings, *arrived])
         self._handed_out += flight.valid
         encodings = self._all_encodings(provisional=self._settings.provisional)
-        return [
+        results = [
             FrameResult(
                 index=index,
                 depth=depth[offset],
                 confidence=confidence[offset],
                 pose_encoding=encodings[index] if index < len(encodings) else None,
-                pose_is_final=index < len(self._encodings),
+                pose_is_final=index < self._num_final,
                 points=None if points is None else points[offset],
                 points_confidence=None if points_confidence is None else points_confidence[offset],
             )
             for offset, index in enumerate(range(first, self._handed_out))
         ]
+        if self._loops is not None:
+            self._loops.take(results)
+        return results
