@@ -21,7 +21,7 @@ from logvggt_jax.interruption import Interrupted
 from logvggt_jax.terminal import forgiving_streams
 
 if TYPE_CHECKING:
-    from logvggt_jax.streaming import ChunkPlan
+    from logvggt_jax.streaming import ChunkPlan, WindowSettings
 
 OUTPUT_LOST, BAD_INPUT, INTERRUPTED = 1, 2, 130
 SOURCE_OPTIONS = ("stride", "max_frames", "fps", "start", "end", "pattern", "size_mismatch", "strict")
@@ -147,17 +147,20 @@ def _reconstruct(options: argparse.Namespace) -> int:
     return 0 if result.complete else INTERRUPTED
 
 
-def _settings(options: argparse.Namespace, method: str) -> ChunkPlan | None:
+def _settings(options: argparse.Namespace, method: str) -> ChunkPlan | WindowSettings | None:
     """Settings of the method; None for its defaults."""
-    from logvggt_jax.streaming import ChunkPlan
+    from logvggt_jax.streaming import ChunkPlan, WindowSettings
 
     if method == "chunks":
         size = ChunkPlan.size if options.chunk_size is None else options.chunk_size
-        return ChunkPlan(size, size // 2 if options.chunk_overlap is None else options.chunk_overlap)
+        overlap = size // 2 if options.chunk_overlap is None else options.chunk_overlap
+        return ChunkPlan(size, overlap, options.loops)
     for name, value in {"--chunk-size": options.chunk_size, "--chunk-overlap": options.chunk_overlap}.items():
         if value is not None:
             raise InputError(f"{name} needs --mode chunks")
-    return None
+    if method != "windows" and options.loops:
+        raise InputError(f"--loops needs --method chunks or windows, not {method}")
+    return WindowSettings(loops=True) if options.loops else None
 
 
 def _render_room(options: argparse.Namespace) -> None:
@@ -369,6 +372,13 @@ def _parser() -> argparse.ArgumentParser:
     )
     sub.add_argument(
         "--chunk-overlap", type=int, default=None, metavar="N", help="frames that neighbours share (default: half)"
+    )
+    sub.add_argument(
+        "--loops",
+        action="store_true",
+        help="with chunks or windows: close loops when the sequence ends, where the camera comes back to a place after "
+        "60 frames or more. Both places are predicted together, and a loop is refused where that does not fit. Up to "
+        "512 frames are kept in memory",
     )
     points = sub.add_argument_group("point cloud")
     points.add_argument(

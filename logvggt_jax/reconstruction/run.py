@@ -145,6 +145,8 @@ class Run:
             complete=complete,
             skipped=self._source.skipped,
             noted_focal_length=self._focal_length,
+            depth_scale=cameras.depth_scale,
+            loops=cameras.loops,
         )
 
     def _pictures(self) -> Iterator[_Picture | None]:

@@ -12,13 +12,13 @@ from logvggt_jax.streaming.alignment import align, confident
 from logvggt_jax.streaming.offline import PlainPrediction
 
 # Points agree that differ by less than this share of their depth.
-_SAME = 0.05
+_SAME = 0.04
 # The joint prediction must give each place the shape that it has by itself, in this share of its pixels.
-_LEAST_SHAPE = 0.6
+_LEAST_SHAPE = 0.5
 # Of each place's pixels this share must be seen from the other place, with the same depth.
 _LEAST_OVERLAP = 0.25
 # Of the pixels that the other place's cameras look at, this share must have the same depth; what is hidden has not.
-_LEAST_AGREEMENT = 0.7
+_LEAST_AGREEMENT = 0.8
 
 
 class LoopCheck(NamedTuple):
@@ -68,9 +68,9 @@ def _compared(parts: Sequence[PlainPrediction], own: Sequence[PlainPrediction]) 
     """As `check_loop`; ValueError where a place's predictions cannot be aligned."""
     carried = [align(*each) for each in zip(parts, own, strict=True)]
     shape = min(_same_shape(*each) for each in zip(parts, own, carried, strict=True))
-    overlaps = [_seen_alike(parts[0], parts[1]), _seen_alike(parts[1], parts[0])]
+    one_way, other_way = _seen_alike(parts[0], parts[1]), _seen_alike(parts[1], parts[0])
     relative = carried[0].matrix @ np.linalg.inv(carried[1].matrix)
-    return LoopCheck(shape, *(min(each) for each in zip(*overlaps, strict=True)), relative)
+    return LoopCheck(shape, min(one_way[0], other_way[0]), min(one_way[1], other_way[1]), relative)
 
 
 def _same_shape(source: PlainPrediction, target: PlainPrediction, similarity: Similarity) -> float:

@@ -234,7 +234,7 @@ def candidates(
 
     Descriptors are compared by the cosine of what differs from their mean: what all frames of a sequence share says
     nothing of the place. A pair is a candidate if each is the other's best at a distance of `gap` frames or more; of
-    pairs whose both ends are closer than half of that, the best stays. The cost is P² · C operations for P places.
+    pairs whose both ends are closer than a quarter of that, the best stays. The cost is P² · C operations for P places.
 
     Args:
       descriptors: [P, C].
@@ -256,7 +256,7 @@ def candidates(
     for first in mutual[np.argsort(-alike[mutual, best[mutual]], kind="stable")].tolist():
         pair = first, int(best[first])
         taken = np.array([indices[list(other)] for other in chosen]).reshape(-1, 2)
-        if not (np.abs(taken - indices[list(pair)]) < gap / 2).all(1).any():
+        if not (np.abs(taken - indices[list(pair)]) < gap / 4).all(1).any():
             chosen.append(pair)
     return chosen[: settings.max_candidates]
 

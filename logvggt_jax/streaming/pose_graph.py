@@ -111,12 +111,11 @@ def _fit(nodes: np.ndarray, edges: Edges, weights: np.ndarray) -> np.ndarray:
 
 def _normal_equations(nodes: np.ndarray, edges: Edges, weights: np.ndarray) -> tuple[sparse.csc_array, np.ndarray]:
     """Hessian and gradient of half the cost for all nodes but the first."""
-    count, unknowns = len(edges.first), 7 * len(nodes)
-    blocks = np.stack(derivatives(nodes, edges), axis=1)  # [E, 2, 7, 7]
+    count, size = len(edges.first), 7 * len(nodes)
     root = np.sqrt(weights)
-    rows = np.arange(7 * count).reshape(count, 1, 7, 1)
-    columns = 7 * np.stack([edges.first, edges.second], axis=1)[:, :, None, None] + np.arange(7)
-    rows, columns = (np.broadcast_to(x, blocks.shape).ravel() for x in (rows, columns))
-    values = (root[:, None, None, None] * blocks).ravel()
-    jacobian = sparse.csc_array((values, (rows, columns)), shape=(7 * count, unknowns))[:, 7:]
+    values = root[:, None, None, None] * np.stack(derivatives(nodes, edges), axis=1)  # [E, 2, 7, 7]
+    rows = np.broadcast_to(np.arange(7 * count).reshape(count, 1, 7, 1), values.shape)
+    starts = 7 * np.stack([edges.first, edges.second], axis=1)
+    columns = np.broadcast_to(starts[:, :, None, None] + np.arange(7), values.shape)
+    jacobian = sparse.csc_array((values.ravel(), (rows.ravel(), columns.ravel())), shape=(7 * count, size))[:, 7:]
     return (jacobian.T @ jacobian).tocsc(), jacobian.T @ (root[:, None] * residuals(nodes, edges)).ravel()

@@ -47,6 +47,8 @@ def write_cloud(
 
     def vertices(index: int) -> np.ndarray:
         points = selection.choose(index, lambda: _read(result, index))
+        # Chosen by the depth as it is stored, since frames are seen before their scale is known.
+        points = points._replace(depth=points.depth * np.float32(result.depth_scale[index]))
         return frame_vertices(points, result.depth_size, result.depth_intrinsics[index], result.extrinsics[index])
 
     def advancing() -> Iterator[np.ndarray]:
@@ -58,4 +60,4 @@ def write_cloud(
 
 
 def _read(result: Reconstruction, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    return *result.depth_and_confidence(index), result.image(index)
+    return *result.stored_depth(index), result.image(index)
