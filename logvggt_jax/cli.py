@@ -199,14 +199,17 @@ def _settings(options: argparse.Namespace, method: str) -> Any:
 
     if method == "chunks" and not options.setting:
         size = ChunkPlan.size if options.chunk_size is None else options.chunk_size
-        return ChunkPlan(size, size // 2 if options.chunk_overlap is None else options.chunk_overlap)
+        overlap = size // 2 if options.chunk_overlap is None else options.chunk_overlap
+        return ChunkPlan(size, overlap, options.loops)
     for name, value in {"--chunk-size": options.chunk_size, "--chunk-overlap": options.chunk_overlap}.items():
         if value is not None:
             raise InputError(f"{name} needs --mode chunks{' without --setting' if options.setting else ''}")
-    if not options.setting:
-        return None
-    given = dict(map(_setting, options.setting))
-    return from_mapping(METHODS[method].settings, given, method)
+    if method not in ("chunks", "windows") and options.loops:
+        raise InputError(f"--loops needs --method chunks or windows, not {method}")
+    given = dict(map(_setting, options.setting or ()))
+    if options.loops:
+        given["loops"] = True
+    return from_mapping(METHODS[method].settings, given, method) if given else None
 
 
 def _setting(text: str) -> tuple[str, Any]:
@@ -489,6 +492,13 @@ def _parser() -> argparse.ArgumentParser:
         metavar="NAME=VALUE",
         help="a setting of the method, may be given several times: budget=600000 of rolling, cap=4096 or bits=16 of "
         "pruned, window=8 of anchored-window, camera_cache=single of causal, rolling and pruned; see docs/methods.md",
+    )
+    sub.add_argument(
+        "--loops",
+        action="store_true",
+        help="with chunks or windows: close loops when the sequence ends, where the camera comes back to a place after "
+        "60 frames or more. Both places are predicted together, and a loop is refused where that does not fit. Up to "
+        "512 frames are kept in memory",
     )
     known = sub.add_argument_group("camera").add_mutually_exclusive_group()
     known.add_argument(

@@ -175,8 +175,10 @@ def test_public_weights_run_in_chunks_unless_told_otherwise(
     arguments = ["reconstruct", str(room), "--checkpoint", str(tmp_path / "vggt"), "--output", str(tmp_path / "out")]
     arguments += ["--compilation-cache", "none", "--previews", "0"]
     # Only chunks take a size.
-    assert main([*arguments, "--chunk-size", "4"]) == 0
-    assert "warning" not in capsys.readouterr().err
+    assert main([*arguments, "--chunk-size", "4", "--loops"]) == 0
+    printed = capsys.readouterr()
+    assert "warning" not in printed.err
+    assert "loops closed: 0" in printed.out
     assert main([*arguments, "--method", "windows", "--overwrite"]) == 0
     assert "logvggt: warning: these weights are public VGGT's, which never learned" in capsys.readouterr().err
     assert main([*arguments, "--method", "rolling", "--overwrite"]) == 0
@@ -267,6 +269,8 @@ def test_bad_input_is_one_line_and_exit_code_2(
     ):
         given = ("--method", method, "--setting", setting, "--dry-run")
         assert_fails(capsys, reconstruct(room, checkpoint, *given), *words)
+    loops = ("--mode", "offline", "--loops")
+    assert_fails(capsys, reconstruct(room, checkpoint, *loops), "--loops needs --method chunks or windows, not offline")
     truncated = tmp_path / "truncated"
     truncated.mkdir()
     for file in sorted(room.glob("*.color.png"))[:2]:

@@ -24,6 +24,13 @@ from logvggt_jax.geometry.rotations import (
     rotation_angle,
 )
 from logvggt_jax.geometry.similarity import Similarity, pose_similarity, robust_similarity, umeyama
+from logvggt_jax.geometry.similarity_group import (
+    log_derivative,
+    scale_of,
+    similarity_adjoint,
+    similarity_exp,
+    similarity_log,
+)
 
 __all__ = [
     "Similarity",
@@ -34,6 +41,7 @@ __all__ = [
     "encode_poses",
     "invert",
     "is_rotation",
+    "log_derivative",
     "matrix_to_quaternion",
     "nearest_rotation",
     "pose_similarity",
@@ -42,6 +50,10 @@ __all__ = [
     "relative_to_first",
     "robust_similarity",
     "rotation_angle",
+    "scale_of",
+    "similarity_adjoint",
+    "similarity_exp",
+    "similarity_log",
     "transform_points",
     "umeyama",
     "unproject",

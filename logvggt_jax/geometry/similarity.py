@@ -15,6 +15,13 @@ class Similarity(NamedTuple):
     rotation: np.ndarray
     translation: np.ndarray
 
+    @property
+    def matrix(self) -> np.ndarray:
+        """[4, 4] float64."""
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = self.scale * self.rotation, self.translation
+        return matrix
+
     def apply(self, points: np.ndarray) -> np.ndarray:
         """Transforms points [..., 3]."""
         return self.scale * points @ self.rotation.T + self.translation

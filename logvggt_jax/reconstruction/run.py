@@ -154,6 +154,8 @@ class Run:
             skipped=self._source.skipped,
             noted_focal_length=self._focal_length,
             source=record_source(self._source, self.num_taken),
+            depth_scale=cameras.depth_scale,
+            loops=cameras.loops,
         )
 
     def _pictures(self) -> Iterator[_Picture | None]:

@@ -3,6 +3,7 @@
 from logvggt_jax.streaming.anchored_window import AnchoredWindowSettings
 from logvggt_jax.streaming.causal import CausalSettings
 from logvggt_jax.streaming.chunks import ChunkPlan, ChunkSession
+from logvggt_jax.streaming.loops import LoopSettings
 from logvggt_jax.streaming.merged import MergedSession, MergedSettings
 from logvggt_jax.streaming.offline import OfflineSession, OfflineSettings
 from logvggt_jax.streaming.predictor import METHODS, Method, Predictor, open_predictor
@@ -21,6 +22,7 @@ __all__ = [
     "ChunkPlan",
     "ChunkSession",
     "FrameResult",
+    "LoopSettings",
     "MergedSession",
     "MergedSettings",
     "Method",

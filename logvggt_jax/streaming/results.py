@@ -26,7 +26,8 @@ class FrameResult:
 
     Attributes:
       index: position in the stream, from 0.
-      depth: [H, W] float32, z-depth in the unit of the poses' translations.
+      depth: [H, W] float32, z-depth in the unit of the poses' translations. Where loops are closed when the sequence
+        ends, `Cameras.depth_scale` then says by which factor it changes.
       confidence: [H, W] float32, at least 1.
       pose_encoding: [9] float32, see `logvggt_jax.geometry.decode_poses`; None while the frame has no pose.
       pose_is_final: whether `pose_encoding` stays as it is.
@@ -72,12 +73,17 @@ class Cameras(NamedTuple):
       extrinsics: [N, 3, 4] float32, world-to-camera (OpenCV); the world is the first camera's frame.
       intrinsics: [N, 3, 3] float32, pixels of the model's input.
       is_final: bool [N], False where later frames may still move the pose.
+      depth_scale: [N] float32, the factors that the depth of the frames, as it was handed out, needs to fit these
+        cameras; None where it fits as it is.
+      loops: int64 [L, 2], the frames at which the sequence came back to a place; None where nobody looked for them.
     """
 
     pose_encoding: np.ndarray
     extrinsics: np.ndarray
     intrinsics: np.ndarray
     is_final: np.ndarray
+    depth_scale: np.ndarray | None = None
+    loops: np.ndarray | None = None
 
 
 def decoded_cameras(encodings: np.ndarray, image_size: tuple[int, int], *, final: int) -> Cameras:

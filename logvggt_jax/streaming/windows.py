@@ -19,6 +19,8 @@ from logvggt_jax.config import RefinementConfig, require_counts
 from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.model.parameters import in_compute_type
 from logvggt_jax.model.windows import WindowState
+from logvggt_jax.streaming.loops import LoopCloser, LoopSettings, frame_describer, loop_settings
+from logvggt_jax.streaming.offline import predict_plain
 from logvggt_jax.streaming.pose_stream import Poses, PoseStream, relative_change
 from logvggt_jax.streaming.program import Program, abstract_variables, flops_of
 from logvggt_jax.streaming.results import (
@@ -110,11 +112,14 @@ class WindowSettings:
       ahead: windows that may be on the device when `push` returns. With 1 the device works while the caller does,
         and a window's results come with the next window; with 0 they come at once.
       first_capacity: frames that the token buffers hold at first; they double.
+      loops: close loops when the sequence ends: True, or how they are looked for. No pose is final before; both places
+        of a loop are predicted together in one window.
     """
 
     provisional: bool = False
     ahead: int = 1
     first_capacity: int = 256
+    loops: LoopSettings | bool = False
 
     def __post_init__(self) -> None:
         require_counts(self, "first_capacity")
@@ -172,6 +177,13 @@ class StreamSession:
         self._final = Rows(np.zeros((0, 10), np.float32))
         self._overlap = Rows(np.zeros(0, np.float32))
         self._handed_out = 0
+        self._loops: LoopCloser | None = None
+        if (loops := loop_settings(self._settings.loops)) is not None:
+            # No more than the model has ever seen at once.
+            loops = dataclasses.replace(loops, frames=min(loops.frames, max(1, model.config.windows.size // 2)))
+            predict = functools.partial(predict_plain, model, self._variables)
+            self._loops = LoopCloser(frame_describer(model, self._variables), predict, loops)
+        self._closed_loops: Cameras | None = None
         self._closed = False
 
     @property
@@ -207,6 +219,8 @@ class StreamSession:
                 self._newest = frame
                 self._received += 1
                 self._arrivals.append(time.monotonic())
+                if self._loops is not None:
+                    self._loops.see(frame)
                 if self._advance():
                     results += self._landed(self._settings.ahead)
         return results
@@ -229,7 +243,12 @@ class StreamSession:
             assert self._state is not None  # set by _begin
             self._take_off(_finish(self._windows, self._variables, self._state), None, progress)
             self._state = self._newest = None
-            return self._landed(0)
+            results = self._landed(0)
+            if self._loops is not None:
+                encodings = self._final.array[:, :9]
+                cameras = decoded_cameras(encodings, self._image_size, final=len(encodings))
+                self._closed_loops = self._loops.close(cameras)
+            return results
 
     def provisional(self) -> list[FrameResult]:
         """What is known of the newest frames, which later ones may still change: those that no `push` has handed out.
@@ -262,6 +281,8 @@ class StreamSession:
             arrays |= {f"state/{field.name}": np.asarray(getattr(self._state, field.name)) for field in fields}
         if self._pending:
             arrays["pending"] = np.stack(self._pending)
+        if self._loops is not None:
+            arrays |= {f"loops/{name}": array for name, array in self._loops.arrays().items()}
         return results, {
             **arrays,
             "newest": self._newest,
@@ -283,6 +304,8 @@ class StreamSession:
         self._poses.restore(
             {name.removeprefix("tokens/"): x for name, x in arrays.items() if name.startswith("tokens/")}
         )
+        if self._loops is not None:
+            self._loops.restore({name.removeprefix("loops/"): x for name, x in arrays.items() if name[:6] == "loops/"})
         if fields := {name.removeprefix("state/"): x for name, x in arrays.items() if name.startswith("state/")}:
             del fields["image_size"]
             self._state = WindowState(
@@ -290,14 +313,17 @@ class StreamSession:
             )
 
     def cameras(self, *, provisional: bool = False) -> Cameras:
-        """Cameras of the frames whose pose is final; with `provisional` of all frames handed out."""
+        """Cameras of the frames whose pose is final, but for loops; with `provisional` of all frames handed out."""
+        if self._closed_loops is not None:
+            return self._closed_loops
         encodings = self._all_encodings(provisional=provisional)
-        return decoded_cameras(encodings, self._image_size, final=len(self._final))
+        return decoded_cameras(encodings, self._image_size, final=self._num_final)
 
     def cameras_with(self, refinement: RefinementConfig) -> Cameras:
         """Cameras of all frames of a closed stream, as another mode of refinement gives them.
 
-        Windows know nothing of refinement, so that modes are compared on one run of them.
+        Windows know nothing of refinement, so that modes are compared on one run of them. A stream that closes loops
+        closes them for these cameras.
 
         Raises:
           ValueError: the stream is not closed; it had no frames, or has not kept what that mode reads.
@@ -305,7 +331,13 @@ class StreamSession:
         if not self._closed:
             raise ValueError("cameras_with is for a stream that is closed")
         encodings = self._poses.all_with(refinement)
-        return decoded_cameras(encodings, self._image_size, final=len(encodings))
+        cameras = decoded_cameras(encodings, self._image_size, final=len(encodings))
+        return cameras if self._loops is None else self._loops.close(cameras)
+
+    @property
+    def _num_final(self) -> int:
+        """Poses that nothing will change."""
+        return len(self._final) if self._loops is None else 0
 
     def _memory(self) -> AbstractContextManager[None]:
         height, width = self._image_size
@@ -396,13 +428,13 @@ class StreamSession:
         self._handed_out += flight.valid
         now = time.monotonic()
         encodings = self._all_encodings(provisional=self._settings.provisional)
-        return [
+        results = [
             FrameResult(
                 index=index,
                 depth=depth[offset],
                 confidence=confidence[offset],
                 pose_encoding=encodings[index] if index < len(encodings) else None,
-                pose_is_final=index < len(self._final),
+                pose_is_final=index < self._num_final,
                 points=None if points is None else points[offset],
                 points_confidence=None if points_confidence is None else points_confidence[offset],
                 latency=None if (arrival := self._arrivals.popleft()) is None else now - arrival,
@@ -410,3 +442,6 @@ class StreamSession:
             )
             for offset, index in enumerate(range(first, self._handed_out))
         ]
+        if self._loops is not None:
+            self._loops.take(results)
+        return results

@@ -10,8 +10,10 @@ import pytest
 
 from logvggt_jax import LogVGGT, ModelConfig, Predictions, RefinementConfig, WindowConfig
 from logvggt_jax.errors import InputError
-from logvggt_jax.streaming import pose_stream
+from logvggt_jax.streaming import LoopSettings, pose_stream
 from logvggt_jax.streaming import windows as session_module
+from logvggt_jax.streaming.loops import LoopCloser
+from logvggt_jax.streaming.results import Cameras
 from logvggt_jax.streaming.windows import FrameResult, StreamSession, WindowSettings
 
 HEIGHT, WIDTH = 28, 42
@@ -173,6 +175,34 @@ def test_other_modes_on_the_same_windows_are_streams_of_their_own(
     np.testing.assert_allclose(cameras.pose_encoding, own.cameras().pose_encoding, rtol=1e-4, atol=2e-5)
     assert cameras.is_final.all()
     assert len(session.cameras().extrinsics) == len(frames)
+
+
+def test_loops_are_closed_beside_refinement(
+    small_config: ModelConfig, small_variables: dict, frames: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What the closer makes of the stream's cameras is what comes out, whichever the refinement."""
+    closers: list[LoopCloser] = []
+
+    def close(self: LoopCloser, cameras: Cameras) -> Cameras:
+        closers.append(self)
+        assert all(place.depth is not None for place in self._places.values())
+        return cameras._replace(depth_scale=cameras.extrinsics[:, 0, 3])
+
+    monkeypatch.setattr(LoopCloser, "close", close)
+    model = with_modes(small_config)
+    plain = StreamSession(model, small_variables, first_capacity=16)
+    session = StreamSession(model, small_variables, first_capacity=16, loops=LoopSettings(spacing=3))
+    expected, results = stream(plain, frames), stream(session, frames)
+    np.testing.assert_array_equal([r.depth for r in results], [r.depth for r in expected])
+    assert not any(result.pose_is_final for result in results)
+    for refinement in (model.config.refinement, with_modes(small_config, context=4).config.refinement):
+        found, without = session.cameras_with(refinement), plain.cameras_with(refinement)
+        np.testing.assert_array_equal(found.extrinsics, without.extrinsics)
+        np.testing.assert_array_equal(found.depth_scale, without.extrinsics[:, 0, 3])
+    np.testing.assert_array_equal(session.cameras().depth_scale, plain.cameras().extrinsics[:, 0, 3])
+    assert session.cameras().is_final.all()
+    # Both places in one window of four.
+    assert list(closers[0]._places) == [0, 3, 6, 9, 12] and closers[0]._settings.frames == 2
 
 
 def test_online_poses_are_final_with_the_depth_and_never_move(

@@ -29,7 +29,9 @@ def select_points(
 
 def chosen_points(result: Reconstruction, selection: PointSelection, index: int) -> FramePoints:
     """The points of one frame."""
-    return selection.choose(index, lambda: _read(result, index))
+    points = selection.choose(index, lambda: _read(result, index))
+    # Chosen by the depth as it is stored, since frames may be seen before their scale is known.
+    return points._replace(depth=points.depth * np.float32(result.depth_scale[index]))
 
 
 def frame_cloud(result: Reconstruction, selection: PointSelection, index: int) -> np.ndarray:
@@ -45,4 +47,4 @@ def tracked(items: Iterable[Item], what: str, total: int, *, progress: bool) -> 
 
 
 def _read(result: Reconstruction, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    return *result.depth_and_confidence(index), result.image(index)
+    return *result.stored_depth(index), result.image(index)
