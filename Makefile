@@ -8,7 +8,7 @@ JOBS ?= 2
 # The demo is small: it runs on the CPU wherever it is started.
 CPU := JAX_PLATFORMS=cpu
 
-.PHONY: help install demo test test-all lint clean
+.PHONY: help install demo test test-all lint docs clean
 .DEFAULT_GOAL := help
 
 help:
@@ -16,6 +16,7 @@ help:
 	@echo "make test      linter, type checker and tests (about a quarter of an hour on two cores)"
 	@echo "make test-all  the slow tests as well: 1B parity, compilation for TPUs, long streams"
 	@echo "make lint      linter, formatter check and type checker alone"
+	@echo "make docs      the documentation as a site, runs/site/index.html; make test builds it too"
 
 install: $(VENV)/.installed
 
@@ -23,7 +24,7 @@ $(VENV)/.installed: pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed, for example: make PYTHON=python3.12")'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet --editable ".[colmap,data,eval,export,formats,heic,hub,video,viewer,dev]"
+	$(BIN)/python -m pip install --quiet --editable ".[colmap,data,docs,eval,export,formats,heic,hub,video,viewer,dev]"
 	@touch $@
 
 demo: install
@@ -52,6 +53,10 @@ test-all: test
 	$(BIN)/python -m pip install --quiet "libtpu>=0.0.30"
 	$(BIN)/python -m pytest -m slow --durations=20 -rA --junitxml=runs/test-all/report.xml
 	@echo "Test reports: runs/test/report.xml, and of the slow tests runs/test-all/report.xml"
+
+docs: install
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+	@echo "The documentation: runs/site/index.html"
 
 clean:
 	rm -rf $(VENV) runs
