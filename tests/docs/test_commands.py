@@ -7,12 +7,16 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from absl import app, flags
 from absl.testing import flagsaver
 from shell_lines import PAGES, ROOT, Command, commands, shell_lines
 
+from logvggt_jax import ModelConfig
 from logvggt_jax.cli import _parser, _with_dashes
+from logvggt_jax.weights.checkpoints import save_model
+from logvggt_jax.weights.provenance import Provenance
 
 # ml_collections loads configurations by a method that newer versions of Python do not have.
 pytestmark = pytest.mark.filterwarnings("ignore:the load_module:DeprecationWarning")
@@ -26,8 +30,18 @@ def chosen(*programs: str, whole: bool) -> pytest.MarkDecorator:
     return pytest.mark.parametrize("command", found, ids=[f"{each.page}: {' '.join(each.arguments)}" for each in found])
 
 
+@pytest.fixture(scope="module")
+def small_model(small_config: ModelConfig, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A model folder whose description alone is a model's: configurations do not look at parameters."""
+    folder = tmp_path_factory.mktemp("weights") / "model"
+    save_model(folder, small_config, {"any": np.zeros(1, np.float32)}, Provenance("vggt", 42))
+    return folder
+
+
 @pytest.fixture
-def parse_flags(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str, tuple[str, ...]], None]]:
+def parse_flags(
+    small_model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Callable[[str, tuple[str, ...]], None]]:
     """Reads a script's command line as the script does, with its configuration, and goes no further."""
 
     def parse(script: str, arguments: tuple[str, ...]) -> None:
@@ -43,7 +57,14 @@ def parse_flags(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str, tupl
             runpy.run_path(str(ROOT / script), run_name="__main__")
         assert not rest, f"unknown arguments: {rest}"
 
-    monkeypatch.chdir(ROOT)
+    # Beside the configurations lies what they start from, which some look at: here one small model for all.
+    (tmp_path / "configs").symlink_to(ROOT / "configs")
+    for command in COMMANDS:
+        for path in re.findall(r"--config=\S+\.py:([^/\s]\S*)", " ".join(command.arguments)):
+            if not (tmp_path / path).is_symlink():
+                (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+                (tmp_path / path).symlink_to(small_model)
+    monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(ROOT))
     parsed = flags.FLAGS.is_parsed()
     yield parse
