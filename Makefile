@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 DEMO := runs/demo
-# Test processes; tests of one file stay together, since they share what they compile.
+# Test processes; tests of one file stay together, since they share what they compile. tests/conftest.py orders them.
 JOBS ?= 2
 # The demo is small: it runs on the CPU wherever it is started.
 CPU := JAX_PLATFORMS=cpu
@@ -23,7 +23,7 @@ $(VENV)/.installed: pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed, for example: make PYTHON=python3.12")'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet --editable ".[data,eval,heic,hub,video,viewer,dev]"
+	$(BIN)/python -m pip install --quiet --editable ".[colmap,data,eval,export,formats,heic,hub,video,viewer,dev]"
 	@touch $@
 
 demo: install
@@ -45,7 +45,7 @@ lint: install
 	$(BIN)/mypy
 
 test: lint
-	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --durations=10 --junitxml=runs/test/report.xml
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder --durations=10 --junitxml=runs/test/report.xml
 	@echo "Test report: runs/test/report.xml"
 
 test-all: test

@@ -5,7 +5,9 @@
 Run the same command again to go on after an interruption. On several machines start it on each of them with
 --distributed (docs/clusters.md). With --dry_run nothing is trained: the step of every stage and size is compiled, and
 what it needs is printed. With --preflight the same command tries network, data, folder and step beforehand. Any field
-of the configuration can be changed on the command line: --config.optimizer.learning_rate=5e-4.
+of the configuration can be changed on the command line: --config.optimizer.learning_rate=5e-4; other data with
+--source=tum_recording=/data/mine,frames=:700 and --validation_source=tum_recording=/data/mine,frames=-200: (see
+docs/own-sequences.md).
 """
 
 from __future__ import annotations
@@ -33,8 +35,15 @@ from logvggt_jax.training.preflight import preflight
 from logvggt_jax.training.processes import JOIN_SECONDS, LOSS_SECONDS, check_processes, join_processes
 from logvggt_jax.training.profile import ProfiledSteps
 from logvggt_jax.training.sharding import data_mesh, use_cpu_cores
+from logvggt_jax.training.source_text import with_sources
 
 _CONFIG = config_flags.DEFINE_config_file("config", None, "File with the run's settings.", lock_config=True)
+_SOURCES = flags.DEFINE_multi_string(
+    "source", [], "Data to train on instead of the configuration's: NAME=FOLDER,split=…,frames=FIRST:STOP; repeatable."
+)
+_VALIDATION_SOURCE = flags.DEFINE_string(
+    "validation_source", None, "Data to validate on instead of the configuration's, in the same form."
+)
 _WORKDIR = flags.DEFINE_string("workdir", None, "Folder for checkpoints, the model and logs.")
 _RESUME_STEP = flags.DEFINE_integer(
     "resume_step", None, "Checkpoint to go back to, once; later ones are moved aside. By default the latest."
@@ -50,6 +59,9 @@ _WATCHDOG = flags.DEFINE_float(
     "watchdog", 30.0, "End the process, with all stacks, when no step ended in so many median steps; 0: never."
 )
 _PROFILE = flags.DEFINE_string("profile", None, "Steps to write a trace of to WORKDIR/profile, such as 20:25.")
+_WANDB = flags.DEFINE_string(
+    "wandb", None, "Project of Weights & Biases to show the run in (WANDB_MODE=offline works)."
+)
 _DRY_RUN = flags.DEFINE_bool("dry_run", False, "Say what every step needs and how many clips fit; train nothing.")
 _PREFLIGHT = flags.DEFINE_bool("preflight", False, "Try network, data, folder and step in minutes; train nothing.")
 _DESCRIBED = flags.DEFINE_string(
@@ -67,7 +79,7 @@ def main(arguments: Sequence[str]) -> None:
     enable_compilation_cache(_CACHE.value)
     watched: Lifeline | None = None
     try:
-        config = TrainConfig.from_dict(_settings())
+        config = TrainConfig.from_dict(with_sources(_settings(), _SOURCES.value, _VALIDATION_SOURCE.value))
         profile = ProfiledSteps.parse(_PROFILE.value) if _PROFILE.value else None
         use_cpu_cores(config, num_processes=_NUM_PROCESSES.value or 1)
         check_nccl()
@@ -92,6 +104,7 @@ def main(arguments: Sequence[str]) -> None:
                 resume_step=_RESUME_STEP.value,
                 watchdog=_WATCHDOG.value,
                 profile=profile,
+                wandb=_WANDB.value,
             )
     except BaseException as error:
         _fail(error, watched)

@@ -25,7 +25,7 @@ from logvggt_jax import LogVGGT
 from logvggt_jax.geometry import encode_poses
 from logvggt_jax.reconstruction import reconstruct
 from logvggt_jax.streaming import METHODS, Method, WindowSettings
-from logvggt_jax.streaming.results import Cameras, FrameResult, decoded_cameras
+from logvggt_jax.streaming.results import Cameras, FrameResult, Progress, decoded_cameras
 from logvggt_jax.streaming.windows import window_program
 
 SIZE = (392, 518)
@@ -66,7 +66,7 @@ class ClockPredictor:
         self._left = time.perf_counter()
         return results
 
-    def close(self) -> list[FrameResult]:
+    def close(self, progress: Progress | None = None) -> list[FrameResult]:
         """The frames still held."""
         self._enter()
         if self._pending:

@@ -76,6 +76,7 @@ def get_config(data_root: str = "data") -> ConfigDict:
         "weight_decay": 0.05,
         "decay_all": False,
         "clip_norm": 1.0,
+        "frozen": (),
     }
     config.data = {
         "sources": {
@@ -112,12 +113,14 @@ def get_config(data_root: str = "data") -> ConfigDict:
         "cache_dir": placeholder(str),
     }
     config.validation = {
-        "source": {"name": "scannet", "root": f"{data_root}/scannet", "split": "val"},
+        "sources": {name: {"root": f"{data_root}/{name}", "split": "val"} for name in ("scannet", "arkitscenes")},
         "every": 5 * STEPS_PER_EPOCH,
-        "num_clips": 2 * NUM_DEVICES,
+        # Of each source.
+        "num_clips": NUM_DEVICES,
         "clip_length": 12,
         "stride": 10,
         "size": LANDSCAPE[0],
+        "best": "abs_rel",
     }
     config.log_every = 50
     config.save_every = STEPS_PER_EPOCH

@@ -75,6 +75,7 @@ def get_config() -> ConfigDict:
         "weight_decay": 0.02,
         "decay_all": False,
         "clip_norm": 1.0,
+        "frozen": (),
     }
     rooms = {"height": HEIGHT, "width": WIDTH, "num_frames": 48, "style": "compass", "speed": (0.7, 1.3)}
     config.data = {
@@ -92,17 +93,13 @@ def get_config() -> ConfigDict:
         "cache_dir": placeholder(str),
     }
     config.validation = {
-        "source": {
-            "name": "rooms",
-            "root": None,
-            "split": "val",
-            "options": {**rooms, "num_rooms": 16, "speed": 1.0},
-        },
+        "sources": {"rooms": {"root": None, "split": "val", "options": {**rooms, "num_rooms": 16, "speed": 1.0}}},
         "every": 500,
         "num_clips": 16,
         "clip_length": 12,
         "stride": 2,
         "size": (HEIGHT, WIDTH),
+        "best": "abs_rel",
     }
     config.log_every = 50
     config.save_every = 500

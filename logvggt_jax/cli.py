@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import argparse
+import ast
 import contextlib
 import json
 import shutil
@@ -21,12 +22,17 @@ from logvggt_jax.interruption import Interrupted
 from logvggt_jax.terminal import forgiving_streams
 
 if TYPE_CHECKING:
-    from logvggt_jax.streaming import ChunkPlan
+    from logvggt_jax.reconstruction.fusion.fuse import Fused
+    from logvggt_jax.reconstruction.result import Reconstruction
 
 OUTPUT_LOST, BAD_INPUT, INTERRUPTED = 1, 2, 130
 SOURCE_OPTIONS = ("stride", "max_frames", "fps", "start", "end", "pattern", "size_mismatch", "strict")
 # The registry of methods, which would load JAX.
 MODES = ("windows", "chunks", "offline", "merged", "causal", "anchored-window", "rolling", "pruned")
+FORMATS = (
+    *("colmap", "colmap-text", "nerfstudio", "glb", "ply", "tum", "kitti", "euroc"),
+    *("depth-png", "depth-exr", "depth-npz", "rosbag2"),
+)
 PROBLEMS_FOUND = 1
 
 
@@ -91,6 +97,8 @@ def _convert(options: argparse.Namespace) -> None:
 def _reconstruct(options: argparse.Namespace) -> int:
     from logvggt_jax.compile import check_devices, enable_compilation_cache
     from logvggt_jax.model.parameters import in_compute_type
+    from logvggt_jax.reconstruction.calibration import Calibration
+    from logvggt_jax.reconstruction.exporters import check_formats
     from logvggt_jax.reconstruction.method import choose_method
     from logvggt_jax.reconstruction.point_cloud import PointFilter
     from logvggt_jax.reconstruction.reconstruct import LONGER_EDGE, reconstruct
@@ -107,7 +115,15 @@ def _reconstruct(options: argparse.Namespace) -> int:
         pixel_stride=options.pixel_stride,
         max_points=options.max_points or None,
     )
-    target = check_request(source, options.output, longer_edge=options.longer_edge, overwrite=options.overwrite)
+    check_formats(options.export)
+    calibration = Calibration(options.intrinsics, options.shared_intrinsics)
+    target = check_request(
+        source,
+        options.output,
+        longer_edge=options.longer_edge,
+        overwrite=options.overwrite,
+        calibration=calibration,
+    )
     checkpoint = resolve(options.checkpoint)
     provenance = read_provenance(checkpoint)
     longer_edge = options.longer_edge or provenance.longer_edge or LONGER_EDGE
@@ -138,26 +154,111 @@ def _reconstruct(options: argparse.Namespace) -> int:
         settings=settings,
         longer_edge=longer_edge,
         point_filter=point_filter,
+        calibration=calibration,
         num_previews=options.previews,
         overwrite=options.overwrite,
     )
     for note in source.notes[said:]:  # what only reading told
         print(f"logvggt: note: {printable(note)}", file=sys.stderr)
     print(result.summary())
-    return 0 if result.complete else INTERRUPTED
+    if not result.complete:
+        return INTERRUPTED
+    return _exports(result, options.export)
 
 
-def _settings(options: argparse.Namespace, method: str) -> ChunkPlan | None:
-    """Settings of the method; None for its defaults."""
-    from logvggt_jax.streaming import ChunkPlan
+def _exports(result: Reconstruction, formats: Sequence[str]) -> int:
+    """Exports of a result that is finished, each for itself: the result and the others stay, whatever fails."""
+    from logvggt_jax.reconstruction.exporters import export
 
-    if method == "chunks":
+    code = 0
+    for name in formats:
+        try:
+            print(f"{name}: {printable(str(export(result, [name])[0]))}")
+        except InputError as error:
+            print(f"logvggt: error: the result is whole, its export {name} is not: {one_line(error)}", file=sys.stderr)
+            code = BAD_INPUT
+    return code
+
+
+def _export(options: argparse.Namespace) -> None:
+    from logvggt_jax.reconstruction.exporters import export
+    from logvggt_jax.reconstruction.point_cloud import PointFilter
+    from logvggt_jax.reconstruction.result import Reconstruction
+
+    points = None if options.max_points is None else PointFilter(max_points=options.max_points or None)
+    result = Reconstruction.open(options.result)
+    written = export(result, options.format, options.output, point_filter=points, overwrite=options.overwrite)
+    for name, path in zip(dict.fromkeys(options.format), written, strict=True):
+        print(f"{name}: {printable(str(path))}")
+
+
+def _settings(options: argparse.Namespace, method: str) -> Any:
+    """Settings of the method, of its own class; None for its defaults."""
+    from logvggt_jax.config import from_mapping
+    from logvggt_jax.streaming import METHODS, ChunkPlan
+
+    if method == "chunks" and not options.setting:
         size = ChunkPlan.size if options.chunk_size is None else options.chunk_size
-        return ChunkPlan(size, size // 2 if options.chunk_overlap is None else options.chunk_overlap)
+        overlap = size // 2 if options.chunk_overlap is None else options.chunk_overlap
+        return ChunkPlan(size, overlap, options.loops)
     for name, value in {"--chunk-size": options.chunk_size, "--chunk-overlap": options.chunk_overlap}.items():
         if value is not None:
-            raise InputError(f"{name} needs --mode chunks")
-    return None
+            raise InputError(f"{name} needs --mode chunks{' without --setting' if options.setting else ''}")
+    if method not in ("chunks", "windows") and options.loops:
+        raise InputError(f"--loops needs --method chunks or windows, not {method}")
+    given = dict(map(_setting, options.setting or ()))
+    if options.loops:
+        given["loops"] = True
+    return from_mapping(METHODS[method].settings, given, method) if given else None
+
+
+def _setting(text: str) -> tuple[str, Any]:
+    """Name and value of NAME=VALUE: a number, True, False or None where the value reads as one, else its text."""
+    name, separator, value = text.partition("=")
+    if not separator or not name:
+        raise InputError(f"--setting {text}: expected NAME=VALUE, such as cap=4096")
+    with contextlib.suppress(ValueError, SyntaxError):
+        return name, ast.literal_eval(value)
+    return name, value
+
+
+def _fuse(options: argparse.Namespace) -> None:
+    from logvggt_jax.reconstruction.fusion.fuse import fuse
+    from logvggt_jax.reconstruction.result import Reconstruction
+
+    fused = fuse(
+        Reconstruction.open(options.result),
+        options.output,
+        poses=options.poses,
+        adjust=options.bundle_adjust,
+        metric=options.metric,
+        overwrite=options.overwrite,
+    )
+    _print_fused(fused)
+
+
+def _scale(options: argparse.Namespace) -> None:
+    from logvggt_jax.reconstruction.fusion.rescale import rescale
+    from logvggt_jax.reconstruction.result import Reconstruction
+
+    scaled = rescale(
+        Reconstruction.open(options.result),
+        options.output,
+        poses=options.poses,
+        depth=options.depth,
+        depth_unit=options.depth_unit,
+        frames=options.between_frames,
+        pixels=options.between_pixels,
+        distance=options.distance,
+        overwrite=options.overwrite,
+    )
+    _print_fused(scaled)
+
+
+def _print_fused(fused: Fused) -> None:
+    for note in fused.notes:
+        print(printable(note))
+    print(fused.result.summary())
 
 
 def _render_room(options: argparse.Namespace) -> None:
@@ -215,13 +316,28 @@ def _check_data(options: argparse.Namespace) -> int:
     return PROBLEMS_FOUND if report.problems else 0
 
 
+def _pack_data(options: argparse.Namespace) -> None:
+    from logvggt_jax.data.packed.pack import pack
+
+    report = pack(
+        options.name,
+        options.root,
+        options.output,
+        split=options.split,
+        frames_per_shard=options.frames_per_shard,
+        workers=options.workers,
+        progress=True,
+    )
+    print("\n".join(map(printable, report.text().splitlines())))
+
+
 def _doctor(options: argparse.Namespace) -> int:
     from logvggt_jax.doctor.examination import QUICK, SHARES, examine, part_findings
     from logvggt_jax.doctor.finding import Finding
 
-    if unknown := sorted(set(options.part or ()) - set(SHARES)):
-        raise InputError(f"doctor has no part {unknown[0]!r}; it has {', '.join(SHARES)}")
-    parts = options.part or (QUICK if options.quick else tuple(SHARES))
+    if unknown := sorted(set(options.part or ()) - {*SHARES, *MODES}):
+        raise InputError(f"doctor has no part {unknown[0]!r}; it has {', '.join((*SHARES, *MODES))}")
+    parts = options.part or (MODES if options.methods else QUICK if options.quick else tuple(SHARES))
     marks = {True: "ok", False: "WRONG", None: ""}
 
     with contextlib.ExitStack() as stack:
@@ -234,7 +350,7 @@ def _doctor(options: argparse.Namespace) -> int:
             if file is not None:
                 print(finding.to_json(), file=file, flush=True)
             line = (
-                f"{finding.part:12} {finding.what:42} {finding.value_text():>20}  {marks[finding.ok]:5} {finding.note}"
+                f"{finding.part:15} {finding.what:42} {finding.value_text():>20}  {marks[finding.ok]:5} {finding.note}"
             )
             print(finding.to_json() if options.json == "-" else line.rstrip(), flush=True)
 
@@ -370,6 +486,34 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument(
         "--chunk-overlap", type=int, default=None, metavar="N", help="frames that neighbours share (default: half)"
     )
+    sub.add_argument(
+        "--setting",
+        action="append",
+        metavar="NAME=VALUE",
+        help="a setting of the method, may be given several times: budget=600000 of rolling, cap=4096 or bits=16 of "
+        "pruned, window=8 of anchored-window, camera_cache=single of causal, rolling and pruned; see docs/methods.md",
+    )
+    sub.add_argument(
+        "--loops",
+        action="store_true",
+        help="with chunks or windows: close loops when the sequence ends, where the camera comes back to a place after "
+        "60 frames or more. Both places are predicted together, and a loop is refused where that does not fit. Up to "
+        "512 frames are kept in memory",
+    )
+    known = sub.add_argument_group("camera").add_mutually_exclusive_group()
+    known.add_argument(
+        "--intrinsics",
+        type=_pinhole,
+        default=None,
+        metavar="FX,FY,CX,CY",
+        help="focal lengths and principal point of all frames where they are known, in pixels of the original images "
+        "with centres at integers, instead of the model's",
+    )
+    known.add_argument(
+        "--shared-intrinsics",
+        action="store_true",
+        help="all frames have one camera: take the median of the model's focal lengths for all",
+    )
     points = sub.add_argument_group("point cloud")
     points.add_argument(
         "--confidence-percentile",
@@ -391,6 +535,15 @@ def _parser() -> argparse.ArgumentParser:
     )
     sub.add_argument("--previews", type=int, default=8, metavar="N", help="pictures of frames beside their depth")
     sub.add_argument(
+        "--export",
+        action="append",
+        default=[],
+        choices=FORMATS,
+        metavar="FORMAT",
+        help="write the finished result in this format too, into OUTPUT/exports; may be given several times "
+        "(`logvggt export --help` lists the formats)",
+    )
+    sub.add_argument(
         "--overwrite", action="store_true", help="begin anew and replace an earlier or unfinished reconstruction"
     )
     sub.add_argument(
@@ -406,6 +559,99 @@ def _parser() -> argparse.ArgumentParser:
         help="where compiled programs are kept between runs, 'none' for nowhere (default: $JAX_COMPILATION_CACHE_DIR "
         "or the user's cache folder)",
     )
+
+    sub = command(
+        "export",
+        _export,
+        "write a finished reconstruction in formats that other programs open",
+        "logvggt export runs/walk --format colmap --format glb --output scenes/walk",
+        details=" Every format becomes a file or folder of its own in the output: colmap/ and colmap-text/ (pictures, "
+        "model and cloud with tracks, as 3D Gaussian splatting starts from), nerfstudio/ (transforms.json), scene.glb, "
+        "points.ply, the camera's path as tum.txt, kitti.txt and euroc.csv, depth at the size of the original images "
+        "as depth-png/ (16 bits and a scale), depth-exr/ and depth-npz/, and rosbag2/. Pictures are read from the "
+        "source once more; where it is gone or has changed, those that the result keeps are taken, and that is said.",
+    )
+    sub.add_argument("result", type=Path, help="output of `logvggt reconstruct`")
+    sub.add_argument(
+        "--format",
+        action="append",
+        required=True,
+        choices=FORMATS,
+        metavar="FORMAT",
+        help=f"one of {', '.join(FORMATS)}; may be given several times",
+    )
+    sub.add_argument(
+        "--output", type=Path, default=None, metavar="DIR", help="folder for them (default: RESULT/exports)"
+    )
+    sub.add_argument(
+        "--max-points",
+        type=int,
+        default=None,
+        metavar="N",
+        help="thin the cloud to N points; 0 keeps all (default: 2,000,000 for ply, 500,000 for glb, else 100,000)",
+    )
+    sub.add_argument("--overwrite", action="store_true", help="replace earlier exports of these formats")
+
+    sub = command(
+        "fuse",
+        _fuse,
+        "rebuild a reconstruction from better cameras, as a new one",
+        "logvggt fuse runs/walk --poses colmap/sparse/0 --output runs/walk-colmap",
+        details=" Depth is scaled frame by frame to agree with the cameras and with its neighbours, points are made "
+        "anew. How well cameras and depth agree, before and after, is printed. Intrinsics that come with the poses are "
+        "taken if they are pinholes; else they stay.",
+    )
+    sub.add_argument("result", type=Path, help="output of `logvggt reconstruct`, which is only read")
+    sub.add_argument(
+        "--poses",
+        default=None,
+        metavar="FILE",
+        help="cameras of another program: a folder with COLMAP's images.bin or .txt (also in sparse/0), nerfstudio's "
+        "transforms.json, or a trajectory in TUM's format. Pictures are found by name, times to half a frame's step; "
+        "frames without a pose are left out",
+    )
+    sub.add_argument("--metric", action="store_true", help="lengths of these poses are metres")
+    sub.add_argument(
+        "--bundle-adjust",
+        action="store_true",
+        help="move the cameras until corners of the images, found again with the help of depth, agree with them "
+        "(needs the extra `colmap`)",
+    )
+    sub.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder to make")
+    sub.add_argument("--overwrite", action="store_true", help="replace an earlier reconstruction")
+
+    sub = command(
+        "scale",
+        _scale,
+        "turn a reconstruction's lengths into metres, as a new one",
+        "logvggt scale runs/walk --between-frames 0 120 --distance 4.5 --output runs/walk-metres",
+        details=" One way to know the scale is given. The factor is printed, and how well what it was found from "
+        "agrees.",
+    )
+    sub.add_argument("result", type=Path, help="output of `logvggt reconstruct`, which is only read")
+    ways = sub.add_mutually_exclusive_group(required=True)
+    ways.add_argument("--poses", default=None, metavar="FILE", help="cameras in metres, files as for `logvggt fuse`")
+    ways.add_argument(
+        "--depth",
+        type=Path,
+        default=None,
+        metavar="DIR",
+        help="depth of a sensor, 16-bit PNG files whose names begin as the frames'",
+    )
+    ways.add_argument(
+        "--between-frames", nargs=2, default=None, metavar="FRAME", help="two frames (name or number) --distance apart"
+    )
+    ways.add_argument(
+        "--between-pixels",
+        nargs=2,
+        default=None,
+        metavar="FRAME,U,V",
+        help="two pixels of original images that show points --distance apart",
+    )
+    sub.add_argument("--distance", type=float, default=None, metavar="METRES", help="between the two frames or pixels")
+    sub.add_argument("--depth-unit", type=float, default=0.001, metavar="METRES", help="what a level of the depth is")
+    sub.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder to make")
+    sub.add_argument("--overwrite", action="store_true", help="replace an earlier reconstruction")
 
     sub = command(
         "render-room",
@@ -453,11 +699,15 @@ def _parser() -> argparse.ArgumentParser:
         details=" Parts run one after the other, each in a process of its own, five minutes in all and one with "
         "--quick: environment (versions, devices, builds that do not belong together), parity (a small network "
         "against recorded values), inference (kernels, memory, time and utilisation of a step), training (the same "
-        "for the training step), whole (from files to files). On a CPU the model is a tiny one. Exit code 0: nothing "
-        "wrong, 1: something is.",
+        "for the training step), whole (from files to files). With --methods each method of `reconstruct --method` is "
+        "such a part: its frames a second at VGGT-1B's size, beside what the originals in PyTorch reach on one H100. "
+        "On a CPU the model is a tiny one, and nothing is compared. Exit code 0: nothing wrong, 1: something is.",
     )
     sub.add_argument("--quick", action="store_true", help="environment, parity and inference alone, in a minute")
-    sub.add_argument("--part", action="append", metavar="NAME", help="this part alone; may be given several times")
+    sub.add_argument("--methods", action="store_true", help="every method's frames a second instead of the other parts")
+    sub.add_argument(
+        "--part", action="append", metavar="NAME", help="this part, or method, alone; may be given several times"
+    )
     sub.add_argument("--tiny", action="store_true", help="the tiny model on an accelerator as well")
     sub.add_argument(
         "--json",
@@ -500,6 +750,28 @@ def _parser() -> argparse.ArgumentParser:
     )
     sub.add_argument("--json", action="store_true", help="print the whole report as JSON")
 
+    sub = command(
+        "pack",
+        _pack_data,
+        "write a data set's frames into shards that training reads in its folder's place",
+        "logvggt data pack scannet /data/scannet --split train --output /packed/scannet --workers 8",
+        group=data_commands,
+        details=" Training on the packed folder (--config.data.sources.scannet.root=/packed/scannet) draws the same "
+        "clips. Every frame is stored as the reader hands it out, without loss, so that nothing is decoded again. The "
+        "same command goes on after an interruption, and writes anew what is damaged. What cannot be read is named and "
+        "fails in training as it did before.",
+    )
+    sub.add_argument("name", help="data set, as `logvggt data list` names it")
+    sub.add_argument("root", type=Path, help="folder of the copy")
+    sub.add_argument("--output", type=Path, required=True, metavar="FOLDER", help="folder to write the shards to")
+    sub.add_argument(
+        "--split", choices=("train", "val", "test", "all"), default="all", help="only this split's sequences"
+    )
+    sub.add_argument(
+        "--frames-per-shard", type=int, default=2000, metavar="N", help="a sequence is never divided between shards"
+    )
+    sub.add_argument("--workers", type=int, default=1, metavar="N", help="processes that read and write shards")
+
     command(
         "list",
         _list_data,
@@ -535,6 +807,14 @@ def _size(text: str) -> tuple[int, int]:
     if not (separator and height.isdecimal() and width.isdecimal() and int(height) and int(width)):
         raise argparse.ArgumentTypeError(f"expected height x width such as 120x160, got {text!r}")
     return int(height), int(width)
+
+
+def _pinhole(text: str) -> tuple[float, ...]:
+    try:
+        fx, fy, cx, cy = (float(number) for number in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected FX,FY,CX,CY such as 1400,1400,960,540, got {text!r}") from None
+    return fx, fy, cx, cy
 
 
 def _with_dashes(arguments: Sequence[str]) -> list[str]:

@@ -1,18 +1,23 @@
-"""Before anything compiles: the devices that were asked for, and a cache of compiled programs."""
+"""Compilation: the devices that were asked for, a cache of compiled programs, and how many were made."""
 
+import contextlib
 import importlib.metadata
 import os
 import re
 import shutil
 import warnings
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import jax
+import jax.monitoring
 
 from logvggt_jax.errors import InputError, install_line, one_line
 from logvggt_jax.files import user_cache_folder
 
+# What JAX reports for every program it makes.
+_COMPILATION = "/jax/core/compile/backend_compile_duration"
 # Of each of these one build may be installed, for one version of CUDA; JAX loads whichever it finds first.
 _BUILD = re.compile(r"(nvidia-(?:nccl|cudnn|cublas)-cu|jax-cuda)\d+(-plugin|-pjrt)?")
 
@@ -69,6 +74,23 @@ def check_devices() -> None:
             "JAX_PLATFORMS=cpu",
             stacklevel=2,
         )
+
+
+@contextlib.contextmanager
+def counted_compilations() -> Iterator[Callable[[], int]]:
+    """Gives a function that says how many programs XLA has made for this process since, small ones of single operations
+    among them, compiled or taken from the cache."""
+    count = 0
+
+    def listen(event: str, duration_secs: float, **_: Any) -> None:
+        nonlocal count
+        count += event == _COMPILATION
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        yield lambda: count
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
 
 
 def out_of_device_memory(error: jax.errors.JaxRuntimeError) -> bool:

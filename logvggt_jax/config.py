@@ -348,15 +348,19 @@ class RefinementConfig:
     `enabled=False` leaves camera tokens as they are. `period=None` refines once at the end, `period=n` every n
     frames against the past only, freezing what was refined (online: the window stride). `context=None` lets the
     camera head's trunk see all frames, `context=m` frame 0 and the m frames up to the group being decoded.
+    `max_registers=None` lets GCCR read the registers of all frames, `max_registers=n` at most n register tokens (a
+    frame has four): those of the first frame, of the newest, and of frames evenly between. With a period and a
+    context besides, a stream costs the same at any length.
     """
 
     enabled: bool = True
     period: int | None = None
     context: int | None = None
+    max_registers: int | None = None
     num_heads: int = 16
 
     def __post_init__(self) -> None:
-        require_counts(self, "period", "context", "num_heads")
+        require_counts(self, "period", "context", "max_registers", "num_heads")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -391,6 +395,12 @@ class ModelConfig:
             raise InputError(
                 f"RefinementConfig.context={context} must be at least the window stride {stride}: poses are decoded "
                 "in groups of one stride"
+            )
+        bound, a_frame = self.refinement.max_registers, self.aggregator.num_registers
+        if bound is not None and bound < 2 * a_frame:
+            raise InputError(
+                f"RefinementConfig.max_registers={bound} must be at least {2 * a_frame}: GCCR keeps the {a_frame} "
+                "registers of the first frame and those of the newest"
             )
 
     def to_dict(self) -> dict[str, Any]:

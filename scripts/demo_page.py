@@ -211,7 +211,10 @@ def _training(folder: Path, figures_folder: Path) -> list[str]:
     figures.curves_plot(path, curves, "Error of depth", x_label="steps", y_label="Abs Rel")
     return [
         page.heading("Training from nothing"),
-        page.figure(path, "How the error of depth falls while a tiny model, another one than above, learns from random numbers on."),
+        page.figure(
+            path,
+            "How the error of depth falls while a tiny model, another one than above, learns from random numbers on.",
+        ),
         page.paragraph(f"{sentence}. Camera poses take hours: the model above had them."),
     ]
 

@@ -35,7 +35,31 @@ from logvggt_jax import (  # noqa: E402
 if not flags.FLAGS.is_parsed():
     flags.FLAGS.mark_as_parsed()
 
+# Files of more than twenty seconds of processor time: they come first, so that none is left to one process at the end.
+DEAREST = (
+    "model/test_logvggt.py",
+    "model/test_golden_pruned.py",
+    "model/test_golden_merged.py",
+    "training/test_train_script.py",
+    "training/test_processes.py",
+    "model/test_golden_causal.py",
+    "training/test_loop.py",
+    "doctor/test_doctor.py",
+    "training/test_sharding.py",
+    "evaluation/costs/test_throughput.py",
+    "model/test_golden_rolling.py",
+    "evaluation/test_eval_script.py",
+    "evaluation/costs/test_efficiency.py",
+    "training/test_step.py",
+    "evaluation/methods/test_variants.py",
+)
+
 SHARED = Path(os.environ.get("LOGVGGT_SHARED", Path(__file__).parents[2] / "shared"))
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    place = {Path(__file__).parent / name: number for number, name in enumerate(DEAREST)}
+    items.sort(key=lambda item: place.get(item.path, len(place)))
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -43,6 +67,23 @@ def _own_user_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Nothing that a test keeps lands in the developer's own cache."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _programs_are_compiled_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """What one test compiled, another one, the other workers and the processes that tests start only read."""
+    own = tmp_path_factory.getbasetemp()
+    shared = own.parent if "PYTEST_XDIST_WORKER" in os.environ else own
+    settings = {
+        "jax_compilation_cache_dir": str(shared / "programs"),
+        "jax_persistent_cache_min_compile_time_secs": 0.0,
+        "jax_persistent_cache_min_entry_size_bytes": -1,
+    }
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in settings.items():
+            jax.config.update(name, value)
+            patch.setenv(name.upper(), str(value))
         yield
 
 

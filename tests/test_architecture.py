@@ -7,7 +7,18 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "logvggt_jax"
 
-GROUND_FLOOR = {"types", "frames", "config", "files", "errors", "compile", "operations", "interruption", "terminal"}
+GROUND_FLOOR = {
+    "types",
+    "frames",
+    "colours",
+    "config",
+    "files",
+    "errors",
+    "compile",
+    "operations",
+    "interruption",
+    "terminal",
+}
 # What each part may import besides itself and the ground floor.
 ALLOWED: dict[str, set[str]] = {
     "geometry": set(),

@@ -8,19 +8,35 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import jax
 import numpy as np
 import pytest
 
 from logvggt_jax import LogVGGT, ModelConfig
-from logvggt_jax.cli import MODES, main
+from logvggt_jax.cli import FORMATS, MODES, main
 from logvggt_jax.compile import default_cache_folder, enable_compilation_cache
 from logvggt_jax.data import DATASETS
+from logvggt_jax.errors import DiskError
+from logvggt_jax.reconstruction import EXPORTERS, Reconstruction
+from logvggt_jax.reconstruction.exporters import Format
+from logvggt_jax.reconstruction.point_cloud import read_points
 from logvggt_jax.streaming import METHODS
 from logvggt_jax.weights.checkpoints import save_model
 from logvggt_jax.weights.provenance import Provenance
 
-COMMANDS = ("convert", "reconstruct", "render-room", "view", "info", "data check", "data list")
+COMMANDS = (
+    "convert",
+    "reconstruct",
+    "export",
+    "fuse",
+    "scale",
+    "render-room",
+    "view",
+    "info",
+    "data check",
+    "data list",
+)
 
 
 @pytest.fixture(scope="module")
@@ -60,8 +76,9 @@ def test_help_names_every_command_and_each_shows_an_example(capsys: pytest.Captu
         assert f"logvggt {command}" in capsys.readouterr().out.split("example:")[1]
 
 
-def test_every_method_is_a_mode() -> None:
+def test_every_method_is_a_mode_and_every_exporter_a_format() -> None:
     assert set(MODES) == set(METHODS)
+    assert tuple(EXPORTERS) == FORMATS
 
 
 def test_help_does_not_wait_for_jax() -> None:
@@ -114,19 +131,40 @@ def test_module_runs_as_a_program() -> None:
 
 
 @pytest.mark.filterwarnings("ignore:.*field of view")  # the model is not trained
-def test_from_a_room_to_a_point_cloud(
-    checkpoint: Path, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_from_a_room_to_a_point_cloud_and_exports_of_which_one_fails(
+    checkpoint: Path, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    def fails(*_: object, **__: object) -> None:
+        raise DiskError("the disk is full")
+
+    monkeypatch.setitem(EXPORTERS, "euroc", Format(fails, "euroc.csv"))
     output = tmp_path / "out"
     arguments = ["reconstruct", str(room), "--checkpoint", str(checkpoint), "--output", str(output)]
     arguments += ["--max_points=500", "--compilation-cache", "none", "--previews", "1"]
-    assert main(arguments) == 0
-    printed = capsys.readouterr().out.replace("\n", "")
-    for name in ("cameras.json", "trajectory.txt", "points.ply"):
+    assert_fails(capsys, [*arguments, "--intrinsics", "70,71,100,28"], "outside of images of 84 x 56 pixels")
+    arguments += ["--intrinsics", "70,71,41,28"]
+    assert main([*arguments, "--export", "euroc", "--export", "tum", "--export", "nerfstudio"]) == 2
+    shown = capsys.readouterr()
+    assert "the result is whole, its export euroc is not: the disk is full" in shown.err
+    assert {path.name for path in (output / "exports").iterdir()} == {"tum.txt", "nerfstudio"}
+    printed = shown.out.replace("\n", "")
+    for name in ("cameras.json", "trajectory.txt", "points.ply", "exports/tum.txt", "exports/nerfstudio"):
         assert (output / name).stat().st_size > 0
         assert str(output / name) in printed
     assert len(list((output / "depth").glob("*.npz"))) == 5
     assert_fails(capsys, arguments, str(output), "--overwrite")
+    known = [[70, 0, 41], [0, 71, 28], [0, 0, 1]]
+    result = Reconstruction.open(output)
+    np.testing.assert_allclose(result.intrinsics, np.tile(known, (5, 1, 1)), atol=1e-9)
+    np.testing.assert_allclose(result.depth_intrinsics[:, (0, 1), (0, 1)], np.tile([35, 35.5], (5, 1)), atol=1e-9)
+    # The pictures are those of the source, at their own size.
+    assert cv2.imread(str(next((output / "exports" / "nerfstudio" / "images").iterdir()))).shape == (56, 84, 3)
+    export = ["export", str(output), "--format", "kitti", "--format", "ply", "--max-points", "50"]
+    assert main([*export, "--output", str(tmp_path / "exported")]) == 0
+    assert len(read_points(tmp_path / "exported" / "points.ply")[0]) == 50
+    assert_fails(capsys, [*export, "--output", str(tmp_path / "exported")], "kitti.txt exists", "--overwrite")
+    (output / "cameras.json").write_text('{"format": "logvggt-cameras-9"}')
+    assert_fails(capsys, ["export", str(output), "--format", "tum"], "cameras.json", "'logvggt-cameras-9'")
 
 
 @pytest.mark.filterwarnings("ignore:.*field of view", "always:these weights are public")
@@ -137,8 +175,10 @@ def test_public_weights_run_in_chunks_unless_told_otherwise(
     arguments = ["reconstruct", str(room), "--checkpoint", str(tmp_path / "vggt"), "--output", str(tmp_path / "out")]
     arguments += ["--compilation-cache", "none", "--previews", "0"]
     # Only chunks take a size.
-    assert main([*arguments, "--chunk-size", "4"]) == 0
-    assert "warning" not in capsys.readouterr().err
+    assert main([*arguments, "--chunk-size", "4", "--loops"]) == 0
+    printed = capsys.readouterr()
+    assert "warning" not in printed.err
+    assert "loops closed: 0" in printed.out
     assert main([*arguments, "--method", "windows", "--overwrite"]) == 0
     assert "logvggt: warning: these weights are public VGGT's, which never learned" in capsys.readouterr().err
     assert main([*arguments, "--method", "rolling", "--overwrite"]) == 0
@@ -217,6 +257,20 @@ def test_bad_input_is_one_line_and_exit_code_2(
     assert_fails(capsys, reconstruct(room, checkpoint, "--chunk-size", "8"), "--chunk-size needs --mode chunks")
     chunks = ("--mode", "chunks", "--chunk-size", "8", "--chunk-overlap", "30")
     assert_fails(capsys, reconstruct(room, checkpoint, *chunks), "chunk overlap must be", "8, got 30")
+    both = ("--mode", "chunks", "--chunk-size", "8", "--setting", "overlap=2")
+    assert_fails(capsys, reconstruct(room, checkpoint, *both), "--chunk-size needs --mode chunks without --setting")
+    for method, setting, words in (
+        ("pruned", "cap", ("expected NAME=VALUE",)),
+        ("pruned", "caps=9", ("unknown field pruned.caps", "did you mean cap")),
+        ("pruned", "bits=8", ("pruned.bits must be one of 4, 16, got 8",)),
+        ("causal", "camera_cache=both", ("causal.camera_cache must be one of 'per_round', 'single'",)),
+        ("rolling", "budget=9", ("budget", "fewer than", "take at least")),
+        ("pruned", "cap=9", ("cap", "fewer than", "take at least")),
+    ):
+        given = ("--method", method, "--setting", setting, "--dry-run")
+        assert_fails(capsys, reconstruct(room, checkpoint, *given), *words)
+    loops = ("--mode", "offline", "--loops")
+    assert_fails(capsys, reconstruct(room, checkpoint, *loops), "--loops needs --method chunks or windows, not offline")
     truncated = tmp_path / "truncated"
     truncated.mkdir()
     for file in sorted(room.glob("*.color.png"))[:2]:

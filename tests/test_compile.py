@@ -25,6 +25,18 @@ def test_a_platform_that_does_not_start_is_one_line(monkeypatch: pytest.MonkeyPa
         module.check_devices()
 
 
+def test_programs_are_counted_as_they_are_made() -> None:
+    double = jax.jit(lambda x: 2 * x)
+    number = jax.numpy.ones(3)
+    with module.counted_compilations() as compilations:
+        double(number)
+        first = compilations()
+        double(number)
+        assert compilations() == first > 0
+    double(jax.numpy.ones(4))
+    assert compilations() == first, "what came after is not counted"
+
+
 @pytest.mark.parametrize(("asked", "refused"), [(None, True), ("cuda,cpu", True), ("cpu", False)])
 def test_two_builds_of_nccl_are_refused(monkeypatch: pytest.MonkeyPatch, asked: str | None, refused: bool) -> None:
     names = {"nvidia-nccl-cu12": "2", "nvidia-nccl-cu13": "2", "nvidia-cudnn-cu13": "9"}

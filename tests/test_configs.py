@@ -20,6 +20,8 @@ from logvggt_jax.training.optimizer import learning_rate_schedule
 from logvggt_jax.training.program import abstract_parameters, make_program
 from logvggt_jax.training.sharding import check_batch_size, data_mesh
 from logvggt_jax.training.state import TrainState
+from logvggt_jax.weights.folder import write_description
+from logvggt_jax.weights.provenance import Provenance
 
 ROOT = Path(__file__).parents[1]
 
@@ -29,7 +31,7 @@ def _config(name: str, monkeypatch: pytest.MonkeyPatch) -> TrainConfig:
     return TrainConfig.from_dict(importlib.import_module(f"configs.{name}").get_config().to_dict())
 
 
-@pytest.mark.parametrize("name", ["tiny", "demo", "rooms", "small", "h20"])
+@pytest.mark.parametrize("name", ["tiny", "demo", "rooms", "small", "h20", "finetune", "distill"])
 def test_configuration_builds_its_run(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     config = _config(name, monkeypatch)
     schedule = learning_rate_schedule(config.optimizer, config.stages)
@@ -53,7 +55,7 @@ def test_rooms_start_at_their_mean_field_of_view(name: str, monkeypatch: pytest.
 def test_training_and_validation_share_no_room(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     config = _config(name, monkeypatch)
     assert config.validation is not None
-    sources = (*config.data.sources, config.validation.source)
+    sources = (*config.data.sources, *config.validation.sources)
     train, held_out = (set(Rooms(source.split, **dict(source.options)).sequences) for source in sources)
     assert not train & held_out
 
@@ -84,16 +86,38 @@ def test_the_small_models_step_is_traced_at_its_shortest_and_longest_clips(
         assert all(value.shape == () for value in metrics.values())
 
 
-def test_the_small_model_goes_on_from_weights_with_its_last_stage(monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = _config("small", monkeypatch)
-    more = TrainConfig.from_dict(importlib.import_module("configs.small").get_config("rooms").to_dict())
-    assert more.initial_weights == "rooms" and whole.initial_weights is None
-    assert more.stages == whole.stages[-1:] and more.model == whole.model
+@pytest.mark.parametrize(("name", "kept"), [("small", 1), ("rooms", 2)])
+def test_a_model_of_rooms_goes_on_from_weights_with_its_last_stages(
+    name: str, kept: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = _config(name, monkeypatch)
+    more = TrainConfig.from_dict(importlib.import_module(f"configs.{name}").get_config("weights").to_dict())
+    assert more.initial_weights == "weights" and whole.initial_weights is None
+    assert more.stages == whole.stages[-kept:] and more.model == whole.model
     assert more.optimizer.learning_rate < whole.optimizer.learning_rate
+
+
+def test_what_ships_is_trained_on_by_a_script() -> None:
     script = ["scripts/train_small.sh", "--config.max_minutes=120"]
     shown = subprocess.run(script, cwd=ROOT, env={**os.environ, "PYTHON": "echo"}, capture_output=True, text=True)
     words = shown.stdout.split()
-    assert words[:2] == ["train.py", "--config=configs/small.py:rooms"] and words[-1] == script[-1]
+    assert words[:2] == ["train.py", "--config=configs/rooms.py:rooms"] and words[-1] == script[-1]
+
+
+def test_finetuning_takes_sizes_and_pictures_from_the_model_it_starts_from(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_config: ModelConfig
+) -> None:
+    vggt = _config("finetune", monkeypatch)
+    assert vggt.model == ModelConfig(dtype="bfloat16") and vggt.stages[0].sizes[0] == (392, 518)
+    (tmp_path / "model").mkdir()
+    known = {"config": small_config.to_dict(), "digests": {}, "provenance": Provenance("windows", 70).to_dict()}
+    write_description(tmp_path / "model", known)
+    own = TrainConfig.from_dict(importlib.import_module("configs.finetune").get_config(str(tmp_path)).to_dict())
+    assert own.model == small_config and own.initial_weights == str(tmp_path)
+    assert own.stages[0].sizes == ((56, 70), (42, 70), (70, 56), (70, 42))
+    assert own.optimizer.learning_rate > vggt.optimizer.learning_rate
+    trained, validated = own.data.sources[0], own.validation.sources[0]
+    assert (trained.frames, validated.frames) == ((None, -200), (-200, None)), "what is validated is not trained on"
 
 
 def test_h20_is_the_papers_training(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,8 @@
 """What a plain `pip install` brings may be distributed with an Apache-2.0 package: none of it is under the GPL.
 
 The LGPL is allowed, since its libraries may be used by programs under other licences. evo (GPL) is in the extra `eval`,
-PyAV, whose wheels bundle FFmpeg with parts under the GPL, in the extra `video`.
+PyAV, whose wheels bundle FFmpeg with parts under the GPL, in the extra `video`, pycolmap, whose wheels bundle CHOLMOD
+with parts under the GPL, in the extra `colmap`.
 """
 
 import re
@@ -59,7 +60,7 @@ def test_nothing_that_a_plain_install_brings_is_gpl() -> None:
     assert [name for name, metadata in found.items() if not licences(metadata)] == [], "no licence stated"
 
 
-@pytest.mark.parametrize(("package", "extra"), [("evo", "eval"), ("av", "video")])
+@pytest.mark.parametrize(("package", "extra"), [("evo", "eval"), ("av", "video"), ("pycolmap", "colmap")])
 def test_what_brings_gpl_stays_in_its_extra(package: str, extra: str) -> None:
     extras = {
         name: {Requirement(text).name for text in texts} for name, texts in PROJECT["optional-dependencies"].items()

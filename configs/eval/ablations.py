@@ -33,6 +33,8 @@ def get_config() -> ConfigDict:
         "gccr_every_50",
         "gccr_every_100",
         "gccr_online",
+        "gccr_loops",
+        "windows_chained",
         "no_cwa",
         "no_cwa_no_gccr",
         "cache_output",

@@ -70,6 +70,15 @@ class DrawnOnDevice(Protocol):
         ...
 
 
+@runtime_checkable
+class ConfidentDataset(Protocol):
+    """A data set that says how far its depth is to be trusted; its frames have the size that they are trained at."""
+
+    def confidence(self, sequence: str, indices: Sequence[int]) -> np.ndarray:
+        """[T, H, W] float32, at least 1, for frames `indices` of `sequence`."""
+        ...
+
+
 @dataclass(frozen=True)
 class About:
     """What people need to know of a data set before they fetch it.

@@ -6,15 +6,18 @@ from pathlib import Path
 from typing import Any
 
 from logvggt_jax.data.dataset import Reader
+from logvggt_jax.data.packed.index import is_packed
 from logvggt_jax.data.readers.arkitscenes import ARKitScenes
 from logvggt_jax.data.readers.blendedmvs import BlendedMVS
 from logvggt_jax.data.readers.bonn import Bonn
 from logvggt_jax.data.readers.co3dv2 import Co3Dv2
 from logvggt_jax.data.readers.colmap import Colmap
 from logvggt_jax.data.readers.hypersim import HyperSim
+from logvggt_jax.data.readers.images import Images
 from logvggt_jax.data.readers.kitti import KITTI
 from logvggt_jax.data.readers.kitti_odometry import KITTIOdometry
 from logvggt_jax.data.readers.mvs_synth import MVSSynth
+from logvggt_jax.data.readers.nerfstudio import Nerfstudio
 from logvggt_jax.data.readers.nrgbd import NRGBD
 from logvggt_jax.data.readers.pointodyssey import PointOdyssey
 from logvggt_jax.data.readers.replica import Replica
@@ -51,6 +54,8 @@ _READERS: tuple[type[Reader], ...] = (
     KITTIOdometry,
     TUMRecording,
     Colmap,
+    Nerfstudio,
+    Images,
 )
 READERS: dict[str, type[Reader]] = {reader.name: reader for reader in _READERS}
 """Readers by name: the paper's training sets, those that it only evaluates on, rooms, those that it does not use."""
@@ -64,7 +69,7 @@ def open_dataset(name: str, root: str | Path | None, split: str = "all", **optio
 
     Args:
       name: for example `seven_scenes`.
-      root: the data set's folder; None for `rooms`, which are procedural.
+      root: the data set's folder, or one that `logvggt data pack` made of it; None for `rooms`, which are procedural.
       split: `train`, `val`, `test` or `all`, of those the set has; `all` needs no list file.
       **options: further arguments of the set's reader; `rooms` has several, `arkitscenes` one.
 
@@ -74,6 +79,11 @@ def open_dataset(name: str, root: str | Path | None, split: str = "all", **optio
     """
     check_options(name, options)
     reader = READERS[name]
+    if root is not None and is_packed(root):
+        # Grain, which reads shards, takes a second to load.
+        from logvggt_jax.data.packed.dataset import open_packed
+
+        return open_packed(root, split, reader, options)
     make: Any = reader
     if not reader.needs_root:
         if root is not None:

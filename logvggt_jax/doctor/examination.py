@@ -24,6 +24,8 @@ SHARES: Mapping[str, tuple[int, int]] = {
 }
 TOTAL = (60, 300)
 QUICK = ("environment", "parity", "inference")
+# A method of `logvggt_jax.streaming` is a part of its own name. Each is sure of so many seconds, quick and in full.
+METHOD_SHARE = (60, 150)
 
 
 def part_findings(part: str, *, tiny: bool, quick: bool) -> Iterator[Finding]:
@@ -38,9 +40,12 @@ def part_findings(part: str, *, tiny: bool, quick: bool) -> Iterator[Finding]:
 
         yield from parity.examine()
         return
-    from logvggt_jax.doctor import inference, training, whole
+    from logvggt_jax.doctor import inference, methods, training, whole
     from logvggt_jax.doctor.subject import subject
 
+    if part not in SHARES:
+        yield from methods.examine(part, subject(tiny=tiny, quick=quick))
+        return
     module = {"inference": inference, "training": training, "whole": whole}[part]
     yield from module.examine(subject(tiny=tiny, quick=quick))
 
@@ -51,9 +56,10 @@ def examine(parts: Sequence[str], *, tiny: bool, quick: bool, show: Callable[[Fi
     A part that fails or takes too long is a finding of its own, and the others go on.
     """
     sound, column = True, 0 if quick else 1
-    end = time.monotonic() + TOTAL[column]
+    shares = [SHARES.get(part, METHOD_SHARE)[column] for part in parts]
+    end = time.monotonic() + max(TOTAL[column], sum(shares))
     for index, part in enumerate(parts):
-        limit = end - time.monotonic() - sum(SHARES[later][column] for later in parts[index + 1 :])
+        limit = end - time.monotonic() - sum(shares[index + 1 :])
         for finding in _in_own_process(part, limit, tiny=tiny, quick=quick):
             sound &= finding.ok is not False
             show(finding)

@@ -17,6 +17,7 @@ from logvggt_jax.model.parameters import stack_layers
 from logvggt_jax.operations import matmul_flops_per_second
 from logvggt_jax.training.config import LossConfig, OptimizerConfig
 from logvggt_jax.training.dry_run import step_flops
+from logvggt_jax.training.freezing import ENCODER
 from logvggt_jax.training.optimizer import make_optimizer
 from logvggt_jax.training.sharding import data_mesh, parameter_layout, replicated, split
 from logvggt_jax.training.state import TrainState, initial_state
@@ -55,7 +56,7 @@ def examine(subject: Subject) -> Iterator[Finding]:
     length = 3 if subject.tiny else 12
     # On the host: the device holds one state at a time.
     params = jax.tree.map(np.asarray, stack_layers(random_variables(model))["params"])
-    optimizer = make_optimizer(_OPTIMIZER, params, frozen=("encoder",))
+    optimizer = make_optimizer(_OPTIMIZER, params, frozen=(ENCODER,))
     layout = parameter_layout(params, mesh, shard=False)
     step = make_train_step(make_loss_terms(model, _LOSS), _LOSS, optimizer, lambda _: 1e-6, layout)
     peak = matmul_flops_per_second("bfloat16", size=256 if subject.tiny else None)

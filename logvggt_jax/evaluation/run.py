@@ -2,19 +2,23 @@
 
 import dataclasses
 import functools
-from collections.abc import Mapping
+import warnings
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from logvggt_jax.evaluation.costs.by_length import measured_costs
 from logvggt_jax.evaluation.costs.throughput import measured_timings
 from logvggt_jax.evaluation.datasets import open_run
-from logvggt_jax.evaluation.methods.method import Checkpoint, model_row
+from logvggt_jax.evaluation.methods.method import Checkpoint, Method, model_row
 from logvggt_jax.evaluation.methods.variants import variant_methods
+from logvggt_jax.evaluation.protocols.images import Fit
 from logvggt_jax.evaluation.records import RECORDS_FILE
 from logvggt_jax.evaluation.report.report import write_report
 from logvggt_jax.evaluation.runner import evaluate
 from logvggt_jax.evaluation.settings import ClipRun, PaperRun, read_run
 from logvggt_jax.files import check_output
+from logvggt_jax.streaming import METHODS, expectation
 from logvggt_jax.weights.checkpoints import read_provenance
 
 
@@ -51,13 +55,29 @@ def run_evaluation(
     longer_edge = read_provenance(checkpoint).longer_edge if asks else None
     benchmarks, baselines = open_run(run, data_root, longer_edge)
     loaded = Checkpoint.load(checkpoint)
-    rows = {method: model_row(method, loaded, run.settings_of(method)) for method in run.methods}
-    timings = None
-    if isinstance(run, PaperRun) and run.timings is not None and run.timings.lengths:
-        others = [row for method, row in rows.items() if method != "windows"]
-        timings = functools.partial(
-            measured_timings, loaded, others, run.timings, output, longer_edge=run.protocol.longer_edge, fresh=fresh
-        )
+    trained_for = read_provenance(checkpoint).trained_for
+    rows = {method: _row(method, loaded, run.settings_of(method), trained_for) for method in run.methods}
+    _warn_of_unsuited(trained_for, run.methods)
+    timings: Callable[[], Mapping[str, Any]] | None = None
+    if run.timings is not None and run.timings.lengths:
+        if isinstance(run, PaperRun):
+            others = [row for method, row in rows.items() if method != "windows"]
+            edge = run.protocol.longer_edge
+            timings = functools.partial(
+                measured_timings, loaded, others, run.timings, output, longer_edge=edge, fresh=fresh
+            )
+        else:
+            images = benchmarks[0].protocol.images
+            assert isinstance(images, Fit)  # clips'
+            timings = functools.partial(
+                measured_costs,
+                list(rows.values()),
+                run.timings,
+                output,
+                image_size=images.size,
+                dtype=loaded.model.config.dtype,
+                fresh=fresh,
+            )
     results = evaluate(
         benchmarks,
         [*rows.values(), *variant_methods(loaded, run.variants), *baselines(loaded.model)],
@@ -73,3 +93,20 @@ def run_evaluation(
     )
     write_report(results, output)
     return results
+
+
+def _row(method: str, checkpoint: Checkpoint, settings: Any, trained_for: str | None) -> Method:
+    """A row of the model, which says what to expect of weights that are not the method's."""
+    row, expected = model_row(method, checkpoint, settings), expectation(trained_for, method)
+    return row if expected is None else dataclasses.replace(row, knows=f"{row.knows}; {expected}")
+
+
+def _warn_of_unsuited(trained_for: str | None, methods: Sequence[str]) -> None:
+    """One warning for all methods that the weights were not trained for; plain VGGT is a reference row of every run."""
+    unsuited = [name for name in methods if METHODS[name].trained_for != "vggt" and expectation(trained_for, name)]
+    if unsuited:
+        warnings.warn(
+            f"these weights were trained for {trained_for}, not for {', '.join(unsuited)}: expect worse cameras and "
+            "depth of these rows; the report says why",
+            stacklevel=3,
+        )

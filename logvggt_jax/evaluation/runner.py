@@ -162,7 +162,7 @@ def _replace_results(results: Mapping[str, Any], records: ClipRecords, output: P
     write_text(output / "results.json", json.dumps(results, indent=1) + "\n")
     records.keep_asked()
     old = [output / "report.md", output / "report.html"]
-    for pattern in ("*_frames_*.png", "ate_against_views_*.png"):
+    for pattern in ("*_frames_*.png", "ate_against_views_*.png", "by_length.png"):
         old += (output / FIGURES_FOLDER).glob(pattern)
     for path in old:
         if str(path.relative_to(output)) not in results["figures"]:

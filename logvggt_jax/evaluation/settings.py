@@ -24,6 +24,8 @@ class Run:
     settings: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
     # Names of `logvggt_jax.evaluation.methods.variants.VARIANTS` that are evaluated beside the methods.
     variants: tuple[str, ...] = ()
+    # Sequences that are timed, for the paper's tables of cost or beside the metrics of clips; None leaves them out.
+    timings: TimingConfig | None = None
 
     def __post_init__(self) -> None:
         for field, names in {"methods": self.methods, "settings": self.settings}.items():
@@ -69,7 +71,6 @@ class PaperRun(Run):
     # Only that many first sequences of each benchmark; None takes all. The tables say so.
     max_sequences: int | None = None
     figures: int = 1  # clips of each benchmark that are drawn, for the first method
-    timings: TimingConfig | None = None  # sequences that are timed for the paper's tables of cost; None leaves them out
 
     def __post_init__(self) -> None:
         super().__post_init__()

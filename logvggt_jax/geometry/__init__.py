@@ -23,7 +23,14 @@ from logvggt_jax.geometry.rotations import (
     quaternion_to_matrix,
     rotation_angle,
 )
-from logvggt_jax.geometry.similarity import Similarity, robust_similarity, umeyama
+from logvggt_jax.geometry.similarity import Similarity, pose_similarity, robust_similarity, umeyama
+from logvggt_jax.geometry.similarity_group import (
+    log_derivative,
+    scale_of,
+    similarity_adjoint,
+    similarity_exp,
+    similarity_log,
+)
 
 __all__ = [
     "Similarity",
@@ -34,13 +41,19 @@ __all__ = [
     "encode_poses",
     "invert",
     "is_rotation",
+    "log_derivative",
     "matrix_to_quaternion",
     "nearest_rotation",
+    "pose_similarity",
     "project",
     "quaternion_to_matrix",
     "relative_to_first",
     "robust_similarity",
     "rotation_angle",
+    "scale_of",
+    "similarity_adjoint",
+    "similarity_exp",
+    "similarity_log",
     "transform_points",
     "umeyama",
     "unproject",

@@ -4,6 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from logvggt_jax.geometry.cameras import camera_centres
+from logvggt_jax.geometry.rotations import nearest_rotation, rotation_angle
+
 
 class Similarity(NamedTuple):
     """y = scale * rotation @ x + translation; rotation [3, 3], translation [3], float64."""
@@ -11,6 +14,13 @@ class Similarity(NamedTuple):
     scale: float
     rotation: np.ndarray
     translation: np.ndarray
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """[4, 4] float64."""
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = self.scale * self.rotation, self.translation
+        return matrix
 
     def apply(self, points: np.ndarray) -> np.ndarray:
         """Transforms points [..., 3]."""
@@ -75,3 +85,58 @@ def robust_similarity(
         residual = np.linalg.norm(similarity.apply(np.asarray(source, np.float64)) - target, axis=1)
         similarity = umeyama(source, target, base * np.minimum(1.0, threshold / np.maximum(residual, 1e-12)))
     return similarity
+
+
+def pose_similarity(source: np.ndarray, target: np.ndarray, *, iterations: int = 20) -> Similarity:
+    """The similarity that moves the world so that cameras `source` come to lie where cameras `target` are.
+
+    Robust: a minority of wrong poses loses its weight. Rotations give the rotation and centres the rest, so that a
+    straight path, on which centres alone leave a rotation open, is enough. Noise of the others counts as the source's.
+
+    Args:
+      source: [N, 3|4, 4] world-to-camera.
+      target: [N, 3|4, 4] of the same cameras in another world.
+      iterations: of the reweighting.
+
+    Raises:
+      ValueError: fewer than two cameras, or centres that coincide, which have no scale.
+    """
+    source, target = np.asarray(source, np.float64), np.asarray(target, np.float64)
+    if len(source) < 2:
+        raise ValueError(f"a similarity of cameras needs at least 2, got {len(source)}")
+    rotation = _central_rotation(np.swapaxes(target[:, :3, :3], -1, -2) @ source[:, :3, :3], iterations)
+    turned, centres = camera_centres(source) @ rotation.T, camera_centres(target)
+    # Of camera i and the one half the sequence on: long ways, of which most are right.
+    partner = np.roll(np.arange(len(source)), len(source) // 2)
+    lengths = np.linalg.norm(turned - turned[partner], axis=1)
+    moved = lengths > 1e-9 * max(float(np.abs(turned).max()), np.finfo(np.float64).tiny)
+    if not moved.any():
+        raise ValueError("no similarity: the cameras are all at one place, which leaves the scale open")
+    scale = float(np.median(np.linalg.norm(centres - centres[partner], axis=1)[moved] / lengths[moved]))
+    translation = np.median(centres - scale * turned, axis=0)
+    for _ in range(iterations):
+        residual = np.linalg.norm(scale * turned + translation - centres, axis=1)
+        # Where most fit exactly, the others have no weight worth the name.
+        limit = max(1.5 * float(np.median(residual)), 1e-12 * float(np.abs(centres).max()), np.finfo(np.float64).tiny)
+        weights = np.minimum(1.0, limit / np.maximum(residual, limit)) ** 2
+        weights /= weights.sum()
+        mean_source, mean_target = weights @ turned, weights @ centres
+        # Of `target` on `source` the scale would come out too small, by as much as the source's centres are noisy.
+        alike = float(weights @ ((turned - mean_source) * (centres - mean_target)).sum(1))
+        spread = float(weights @ ((centres - mean_target) ** 2).sum(1))
+        if not (alike > 0 and spread > 0):
+            raise ValueError("no similarity: the cameras of the two worlds do not move alike")
+        scale = spread / alike
+        translation = mean_target - scale * mean_source
+    return Similarity(scale, rotation, translation)
+
+
+def _central_rotation(rotations: np.ndarray, iterations: int) -> np.ndarray:
+    """The rotation [3, 3] that is nearest to most of `rotations` [N, 3, 3]: a mean with weights one over the angle."""
+    candidates = rotations[np.unique(np.linspace(0, len(rotations) - 1, 64).round().astype(int))]
+    between = rotation_angle(candidates[:, None], rotations[None])
+    centre = candidates[np.median(between, axis=1).argmin()]
+    for _ in range(iterations):
+        weights = 1 / np.maximum(rotation_angle(centre[None], rotations), 1e-6)
+        centre = nearest_rotation((weights[:, None, None] * rotations).sum(0) / weights.sum())
+    return centre

@@ -16,6 +16,7 @@ from logvggt_jax.model.layers import Block
 from logvggt_jax.model.memory import LayerMemory, Memory
 from logvggt_jax.model.parameters import run
 from logvggt_jax.model.rope import rope_table
+from logvggt_jax.model.shape_check import ShapeCheck
 
 BlockFunction = Callable[..., tuple[jax.Array, LayerMemory | None]]
 
@@ -33,7 +34,7 @@ class WindowTokens(NamedTuple):
     special: jax.Array
 
 
-class Aggregator(nn.Module):
+class Aggregator(ShapeCheck, nn.Module):
     """VGGT's trunk, alternating attention. With H^(l) the window's tokens [B, K, P, C] before layer l:
 
         F^(l)   = frame block l of H^(l)     tokens of one frame see one another

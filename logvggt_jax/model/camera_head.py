@@ -10,9 +10,10 @@ from logvggt_jax.config import CameraHeadConfig
 from logvggt_jax.model.initializers import constant
 from logvggt_jax.model.layers import MLP, Block, dense, layer_norm
 from logvggt_jax.model.memory import Memory, RoundMemory
+from logvggt_jax.model.shape_check import ShapeCheck
 
 
-class CameraHead(nn.Module):
+class CameraHead(ShapeCheck, nn.Module):
     """The camera tokens of a sequence to its poses, in rounds: each embeds the pose of the round before, lets it shift,
     scale and gate the tokens (adaptive LayerNorm), runs the trunk, and adds a correction to the pose.
 

@@ -7,6 +7,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+# What rounding may take values of floating point beyond [0, 1].
+_SLACK = 1e-2
+
 
 def check_array(name: str, array: jax.Array, shape: tuple[int | None, ...], kind: Any) -> None:
     """Raises ValueError unless an array has this shape (None: any size) and its dtype is of this kind."""
@@ -27,7 +30,10 @@ def check_images(images: jax.Array, patch_size: int, name: str = "images") -> No
 
 
 def check_pixels(images: Any, patch_size: int, name: str) -> None:
-    """Raises ValueError unless images [..., H, W, 3] are uint8 or floating point, H and W multiples of a patch."""
+    """Raises ValueError unless images [..., H, W, 3] are uint8 or floating point, H and W multiples of a patch.
+
+    Outside of `jit` values of floating point are looked at, too: they must lie in [0, 1].
+    """
     height, width = images.shape[-3:-1]
     if height % patch_size or width % patch_size:
         raise ValueError(
@@ -36,6 +42,13 @@ def check_pixels(images: Any, patch_size: int, name: str) -> None:
         )
     if images.dtype != jnp.uint8 and not jnp.issubdtype(images.dtype, jnp.floating):
         raise ValueError(f"{name} must be uint8 or floating point in [0, 1], got dtype {images.dtype}")
+    if images.dtype != jnp.uint8 and not isinstance(images, jax.core.Tracer | jax.ShapeDtypeStruct):
+        low, high = float(images.min()), float(images.max())
+        if not (low >= -_SLACK and high <= 1 + _SLACK):  # NaN as well
+            raise ValueError(
+                f"{name} must be floating point in [0, 1], got values from {low:g} to {high:g}; divide those of 0 to "
+                "255 by 255, or give uint8"
+            )
 
 
 def checked_mask(images: jax.Array, mask: jax.Array | None) -> jax.Array:

@@ -13,9 +13,10 @@ import jax.numpy as jnp
 
 from logvggt_jax.model.initializers import constant, fan_in_normal
 from logvggt_jax.model.precision import product_precision
+from logvggt_jax.model.shape_check import ShapeCheck
 
 
-class Convolution(nn.Module):
+class Convolution(ShapeCheck, nn.Module):
     """[N, H, W, C] -> [N, ⌈H / strides⌉, ⌈W / strides⌉, features], `size` odd.
 
     Padding is explicit: "SAME" pads strided convolutions on one side only.

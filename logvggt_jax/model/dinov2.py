@@ -14,12 +14,13 @@ from logvggt_jax.model.initializers import constant, fan_in_normal, normal
 from logvggt_jax.model.layers import Block, layer_norm
 from logvggt_jax.model.parameters import run
 from logvggt_jax.model.precision import product_precision
+from logvggt_jax.model.shape_check import ShapeCheck
 
 _IMAGE_MEAN = np.array([0.485, 0.456, 0.406], np.float32)
 _IMAGE_STD = np.array([0.229, 0.224, 0.225], np.float32)
 
 
-class PatchEmbedding(nn.Module):
+class PatchEmbedding(ShapeCheck, nn.Module):
     """Convolution with kernel = stride = patch, as one matrix product over flattened patches."""
 
     features: int
@@ -41,7 +42,7 @@ class PatchEmbedding(nn.Module):
         return jnp.matmul(patches.astype(dtype), matrix, precision=product_precision(dtype)) + bias.astype(dtype)
 
 
-class DinoV2(nn.Module):
+class DinoV2(ShapeCheck, nn.Module):
     """Images [N, H, W, 3], float32 in [0, 1], to patch tokens [N, h * w, C] float32 (h = H/14, w = W/14).
 
     Blocks run one after the other or, where their parameters come stacked, as one loop; see `Aggregator`.

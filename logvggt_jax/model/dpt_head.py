@@ -16,6 +16,7 @@ from logvggt_jax.model.convolution import Convolution
 from logvggt_jax.model.initializers import constant, normal
 from logvggt_jax.model.layers import layer_norm
 from logvggt_jax.model.precision import product_precision
+from logvggt_jax.model.shape_check import ShapeCheck
 
 
 class DPTHead(nn.Module):
@@ -55,7 +56,7 @@ class DPTHead(nn.Module):
         return Fusion(self.config.features, self.dtype, name=f"refine_{level}")(x, lateral, size)
 
 
-class UpConv(nn.Module):
+class UpConv(ShapeCheck, nn.Module):
     """Transposed convolution with kernel = stride: every pixel becomes a k x k tile."""
 
     features: int

@@ -15,6 +15,7 @@ from logvggt_jax.model.initializers import constant, fan_in_normal
 from logvggt_jax.model.memory import Keys, LayerMemory, OwnTokens
 from logvggt_jax.model.precision import product_precision
 from logvggt_jax.model.rope import RopeTable, apply_rope
+from logvggt_jax.model.shape_check import Dense, LayerNorm, ShapeCheck
 
 
 def dense(
@@ -22,7 +23,7 @@ def dense(
 ) -> nn.Dense:
     """Linear layer: products of `dtype`, summed in float32 and handed out in `out`, float32 unless what follows would
     round it anyway. Wide sums that leave the matrix unit in 16 bits are half of the memory traffic."""
-    return nn.Dense(
+    return Dense(
         features,
         dtype=dtype,
         precision=product_precision(dtype),
@@ -39,7 +40,7 @@ def layer_norm(epsilon: float, name: str, dtype: str = "float32", *, affine: boo
     For float32 products PyTorch's variance; for 16-bit ones the shortcut E[x²] − E[x]², whose error their rounding
     hides and which reads the tokens once less.
     """
-    return nn.LayerNorm(
+    return LayerNorm(
         epsilon=epsilon,
         dtype=jnp.float32,
         use_bias=affine,
@@ -51,7 +52,7 @@ def layer_norm(epsilon: float, name: str, dtype: str = "float32", *, affine: boo
     )
 
 
-class LayerScale(nn.Module):
+class LayerScale(ShapeCheck, nn.Module):
     """A learned gain for each channel of a residual branch [..., C]; float32 out."""
 
     initial: float

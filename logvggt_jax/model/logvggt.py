@@ -13,6 +13,7 @@ from logvggt_jax.config import ModelConfig
 from logvggt_jax.geometry.pose_encoding import decode_poses
 from logvggt_jax.model.checks import check_images, checked_mask
 from logvggt_jax.model.cross_window import CrossWindowMemory
+from logvggt_jax.model.explicit_axes import splits_as_its_batch
 from logvggt_jax.model.parameters import Variables, stack_layers
 from logvggt_jax.model.refinement import Refinement
 from logvggt_jax.model.windows import Windows, WindowState
@@ -81,6 +82,7 @@ class LogVGGT:
             modules["point_head"] = windows.point_head.lazy_init(next(keys), levels, **dense)
         return {"params": {name: variables["params"] for name, variables in modules.items()}}
 
+    @splits_as_its_batch
     def apply(
         self,
         variables: Variables,
@@ -121,10 +123,12 @@ class LogVGGT:
             points_confidence=out.points_confidence,
         )
 
+    @splits_as_its_batch
     def start(self, variables: Variables, frames: jax.Array, frame_mask: jax.Array | None = None) -> WindowState:
         """The state of a stream before its first window, of its first K − s frames [B, K − s, H, W, 3]."""
         return self.windows.start(variables, frames, frame_mask)
 
+    @splits_as_its_batch
     def step(
         self,
         variables: Variables,
@@ -138,10 +142,12 @@ class LogVGGT:
         """
         return self.windows.step(variables, state, frames, frame_mask)
 
+    @splits_as_its_batch
     def finish(self, variables: Variables, state: WindowState) -> WindowOutput:
         """The K − s frames that the last window still holds."""
         return self.windows.finish(variables, state)
 
+    @splits_as_its_batch
     def refine(
         self,
         variables: Variables,

@@ -1,6 +1,6 @@
 """When GCCR runs and which frames the camera head sees: full sequence, periodic, online, limited context.
 
-A trigger refines a span of frames against the registers of all frames so far and decodes their poses. `fire` is the
+A trigger refines a span of frames against the registers of the frames so far and decodes their poses. `fire` is the
 only one: `LogVGGT.apply` loops over it, streams call it when it is due, and operations are counted on its halves.
 """
 
@@ -16,6 +16,7 @@ from logvggt_jax.config import ModelConfig
 from logvggt_jax.model.camera_head import CameraHead
 from logvggt_jax.model.checks import check_array
 from logvggt_jax.model.gccr import GCCR, RegisterKeys
+from logvggt_jax.model.kept_registers import is_kept
 from logvggt_jax.model.parameters import Variables, run
 
 
@@ -31,11 +32,13 @@ class Span(NamedTuple):
       start: int32 scalar.
       stop: int32 scalar.
       lengths: int32 [B], the sequences' numbers of frames.
+      seen: the frames whose registers count: the first so many, int32 [B], or bool [B, M].
     """
 
     start: jax.Array
     stop: jax.Array
     lengths: jax.Array
+    seen: jax.Array
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,7 +66,7 @@ class Refinement:
         Args:
           variables: {"params": …}.
           camera_tokens: [B, N, 2C], N at least start + size.
-          registers: of N frames, see `project_registers`; None where GCCR is off.
+          registers: of M frames, see `project_registers`; None where GCCR is off.
           refined: [B, N, 2C], the refined tokens of frames before the span.
           span: the frames.
           size: static, at least the span's length.
@@ -87,7 +90,7 @@ class Refinement:
         """GCCR's half of `fire`."""
         fresh = jax.lax.dynamic_slice_in_dim(camera_tokens, span.start, size, axis=1)
         if registers is not None:
-            fresh = self.attend_registers(variables, fresh, registers, jnp.minimum(span.lengths, span.stop))
+            fresh = self.attend_registers(variables, fresh, registers, span.seen)
         return jax.lax.dynamic_update_slice_in_dim(refined, fresh, span.start, axis=1)
 
     def decode_span(self, variables: Variables, refined: jax.Array, span: Span, *, size: int) -> jax.Array:
@@ -99,7 +102,7 @@ class Refinement:
 
         def one_group(first: jax.Array) -> jax.Array:
             last = jnp.minimum(first + group, span.stop)
-            return self._decode_group(variables, refined, Span(first, last, span.lengths))
+            return self._decode_group(variables, refined, span._replace(start=first, stop=last))
 
         decoded = jax.lax.map(one_group, span.start + group * jnp.arange(-(-size // group)))
         decoded = jnp.moveaxis(decoded, 0, 1)
@@ -160,7 +163,8 @@ class Refinement:
         )
 
         def one_trigger(refined: jax.Array, start: jax.Array) -> tuple[jax.Array, jax.Array]:
-            span = Span(start, jnp.minimum(start + size, num_frames), lengths)
+            stop = jnp.minimum(start + size, num_frames)
+            span = Span(start, stop, lengths, self.registers_seen(jnp.minimum(lengths, stop), camera_tokens.shape[1]))
             return self.fire(variables, camera_tokens, registers, refined, span, size=size)
 
         _, encodings = jax.lax.scan(one_trigger, camera_tokens, size * jnp.arange(triggers))
@@ -178,6 +182,15 @@ class Refinement:
         """GCCR and camera head over the tokens at hand; see `LogVGGT.refine`."""
         refined = self.refine_tokens(variables, camera_tokens, register_tokens, register_mask)
         return self.decode_cameras(variables, refined, camera_mask)
+
+    def registers_seen(self, counts: jax.Array, num_frames: int) -> jax.Array:
+        """The frames whose registers count once the first `counts`, int32 [B], of `num_frames` are there.
+
+        As `attend_registers` takes them: the first so many, or bool [B, num_frames] where their number is bounded.
+        """
+        if self.max_frames is None or num_frames <= self.max_frames:
+            return counts
+        return is_kept(jnp.arange(num_frames), counts[:, None], self.max_frames)
 
     # The parts of a trigger.
 
@@ -233,6 +246,12 @@ class Refinement:
     @property
     def gccr(self) -> GCCR:
         return GCCR(self._width, self.config.refinement.num_heads, self.config.dtype, self.config.attention)
+
+    @property
+    def max_frames(self) -> int | None:
+        """Frames whose registers are kept at most; None for all."""
+        bound = self.config.refinement.max_registers
+        return None if bound is None else bound // self.config.aggregator.num_registers
 
     @property
     def _width(self) -> int:

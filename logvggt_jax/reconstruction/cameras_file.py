@@ -13,6 +13,7 @@ import numpy as np
 from logvggt_jax.errors import InputError, MissingInput
 from logvggt_jax.files import open_regular, write_text
 from logvggt_jax.geometry import is_rotation
+from logvggt_jax.reconstruction.sources.record import SourceRecord
 
 CAMERAS_FILE = "cameras.json"
 CAMERAS_FORMAT = "logvggt-cameras-1"
@@ -33,6 +34,10 @@ def write_cameras(
     complete: bool = True,
     skipped: Sequence[tuple[str, str]] = (),
     noted_focal_length: float | None = None,
+    source: SourceRecord | None = None,
+    metric: bool = False,
+    depth_scale: np.ndarray | None = None,
+    loops: np.ndarray | None = None,
 ) -> None:
     """Writes all cameras as one JSON file.
 
@@ -48,6 +53,10 @@ def write_cameras(
       complete: whether the sequence was read to its end.
       skipped: frames that could not be read, with the reason.
       noted_focal_length: pixels of the original images, as the camera noted it; None where it is not known.
+      source: where the frames came from; None where they cannot be read again.
+      metric: whether lengths are metres.
+      depth_scale: [N], by which the depth files' depth has to be multiplied to fit the cameras; None where it fits.
+      loops: int [L, 2], the frames at which the sequence came back to a place; None where nobody looked for them.
     """
     frames: list[dict[str, Any]] = [
         {
@@ -56,19 +65,24 @@ def write_cameras(
             "extrinsics": extrinsics[i].tolist(),
             "intrinsics": intrinsics[i].tolist(),
             "depth_intrinsics": model_intrinsics[i].tolist(),
+            **({} if depth_scale is None else {"depth_scale": float(depth_scale[i])}),
         }
         for i, (name, timestamp) in enumerate(zip(names, timestamps, strict=True))
     ]
     document = {
         "format": CAMERAS_FORMAT,
         "conventions": "extrinsics [3, 4] are world-to-camera, OpenCV axes (x right, y down, z forward); the world "
-        "is the first camera's frame as the model estimates it, lengths are up to one common scale; intrinsics are "
-        "in pixels of the original images, depth_intrinsics in pixels of the depth maps; pixel centres lie at "
-        "integers",
+        "is the first camera's frame as the model estimates it, or that of the poses that were fused in; lengths are "
+        "metres where metric is true, else up to one common scale; intrinsics are in pixels of the original images, "
+        "depth_intrinsics in pixels of the depth maps; pixel centres lie at integers"
+        + ("" if depth_scale is None else "; depth is the depth files' times depth_scale"),
         "image_size": list(image_size),
         "depth_size": list(model_size),
+        "metric": metric,
         "complete": complete,
         "noted_focal_length": noted_focal_length,
+        "source": None if source is None else source._asdict(),
+        **({} if loops is None else {"loops": loops.tolist()}),
         "skipped": [{"name": name, "reason": reason} for name, reason in skipped],
         "frames": frames,
     }
@@ -84,7 +98,7 @@ def is_complete(path: Path) -> bool:
 
 
 def read_cameras(path: str | Path) -> dict[str, Any]:
-    """Inverse of `write_cameras`: the document, with the frames' matrices as float64 arrays.
+    """Inverse of `write_cameras`: the document, with the frames' matrices as float64 arrays and the source's record.
 
     What is returned can be relied on: sizes are positive; names differ, are names of files and lead out of no folder;
     numbers are finite, also in float32; rotations are rotations; focal lengths are not zero.
@@ -123,9 +137,11 @@ def _checked(document: Any) -> dict[str, Any]:
         _require(valid, f"{key} must be height and width in pixels, got {shown(size)}")
     # Earlier versions wrote none of these.
     complete, skipped = document.setdefault("complete", True), document.setdefault("skipped", [])
-    noted = document.setdefault("noted_focal_length", None)
+    noted, metric = document.setdefault("noted_focal_length", None), document.setdefault("metric", False)
+    document["source"] = _source(document.get("source"))
     _require(noted is None or bool(_numbers(noted, (), "noted_focal_length") > 0), "noted_focal_length must be above 0")
-    _require(type(complete) is bool, f"complete must be true or false, got {shown(complete)}")
+    for key, value in (("complete", complete), ("metric", metric)):
+        _require(type(value) is bool, f"{key} must be true or false, got {shown(value)}")
     _require(
         isinstance(skipped, list)
         and all(isinstance(each, dict) and isinstance(each.get("name"), str) for each in skipped),
@@ -141,6 +157,8 @@ def _checked(document: Any) -> dict[str, Any]:
         _require(name not in names, f"two frames have the name {name!r:.80}")
         names.add(name)
         where = f"of frame {index}, {name!r:.80},"
+        frame["depth_scale"] = float(_numbers(frame.get("depth_scale", 1.0), (), f"the depth_scale {where}"))
+        _require(frame["depth_scale"] > 0, f"the depth_scale {where} must be above 0")
         frame["timestamp"] = float(_numbers(frame.get("timestamp"), (), f"the timestamp {where}"))
         for key, shape in (("extrinsics", (3, 4)), ("intrinsics", (3, 3)), ("depth_intrinsics", (3, 3))):
             frame[key] = _numbers(frame.get(key), shape, f"the {key} {where}")
@@ -149,7 +167,19 @@ def _checked(document: Any) -> dict[str, Any]:
             matrix = frame[key]
             pinhole = (matrix[2] == [0, 0, 1]).all() and matrix[1, 0] == 0 and (matrix.diagonal() != 0).all()
             _require(pinhole, f"the {key} {where} are not those of a pinhole camera")
+    loops = document.setdefault("loops", None)
+    _require(
+        loops is None or (isinstance(loops, list) and all(_is_pair(pair, len(frames)) for pair in loops)),
+        f"loops must be pairs of positions among the frames, got {shown(loops)}",
+    )
     return document
+
+
+def _source(value: Any) -> SourceRecord | None:
+    kinds = {"path": str, "options": dict, "taken": int, "fingerprint": str}
+    valid = isinstance(value, dict) and all(type(value.get(key)) is kind for key, kind in kinds.items())
+    _require(value is None or valid, f"source must be null or say where frames came from, got {shown(value)}")
+    return None if value is None else SourceRecord(**{key: value[key] for key in kinds})
 
 
 def _require(condition: bool, complaint: str) -> None:
@@ -159,6 +189,10 @@ def _require(condition: bool, complaint: str) -> None:
 
 def _is_file_name(name: object) -> bool:
     return isinstance(name, str) and name not in ("", ".", "..") and "/" not in name and "\0" not in name
+
+
+def _is_pair(value: object, below: int) -> bool:
+    return isinstance(value, list) and len(value) == 2 and all(type(n) is int and 0 <= n < below for n in value)
 
 
 def _numbers(value: object, shape: tuple[int, ...], what: str) -> np.ndarray:

@@ -1,7 +1,8 @@
-"""Depth maps and images on disk, one file a frame, and pictures of depth."""
+"""Depth maps and images on disk, one file a frame."""
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +16,8 @@ from logvggt_jax.errors import InputError, MissingInput, one_line
 from logvggt_jax.files import atomic_file, open_regular
 from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE
 
+# Numpy parses an array's header with `ast`, which in Python 3.11 fails now and then where several threads do so.
+_ONE_AT_A_TIME = threading.Lock()
 _JPEG = (
     *(cv2.IMWRITE_JPEG_QUALITY, 95),
     *(cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444),
@@ -51,7 +54,7 @@ def read_depth(path: str | Path, size: tuple[int, int] | None = None) -> tuple[n
     """
     with _result_file(path) as stream:
         try:
-            with np.load(stream, allow_pickle=False) as arrays:
+            with _ONE_AT_A_TIME, np.load(stream, allow_pickle=False) as arrays:
                 # What has no array's header comes as bytes.
                 maps = np.asarray(arrays["depth"]), np.asarray(arrays["confidence"])
         except OSError:
@@ -66,26 +69,21 @@ def read_depth(path: str | Path, size: tuple[int, int] | None = None) -> tuple[n
     return maps[0].astype(np.float32), maps[1].astype(np.float32)
 
 
-def depth_picture(depth: np.ndarray, *, near: float, far: float) -> np.ndarray:
-    """Depth [H, W] as colours [H, W, 3] uint8 RGB: inverse depth, bright near, dark far, black where invalid."""
-    valid = np.isfinite(depth) & (depth > 0)
-    inverse = 1.0 / np.where(valid, depth, 1.0)
-    scaled = (inverse - 1.0 / far) / max(1.0 / near - 1.0 / far, 1e-12)
-    levels = (255 * np.clip(scaled, 0.0, 1.0)).astype(np.uint8)
-    colours = cv2.cvtColor(cv2.applyColorMap(levels, cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB)
-    return np.where(valid[..., None], colours, 0).astype(np.uint8)
-
-
 def write_picture(path: str | Path, image: np.ndarray) -> None:
     """Writes an RGB image [H, W, 3] uint8, or numbers [H, W] uint16, as PNG or JPEG, whichever the suffix says.
 
     JPEG has a quality that keeps nearly every pixel to a few grey levels.
     """
-    pixels = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-    suffix = Path(path).suffix
-    _, encoded = cv2.imencode(suffix, pixels, _JPEG if suffix == ".jpg" else ())
+    content = encode_picture(Path(path).suffix, image)
     with atomic_file(path) as temporary:
-        temporary.write_bytes(encoded.tobytes())
+        temporary.write_bytes(content)
+
+
+def encode_picture(suffix: str, image: np.ndarray) -> bytes:
+    """The content of a file with this suffix, see `write_picture`."""
+    pixels = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    _, encoded = cv2.imencode(suffix, pixels, _JPEG if suffix == ".jpg" else ())
+    return encoded.tobytes()
 
 
 def read_picture(path: str | Path, size: tuple[int, int] | None = None) -> np.ndarray:

@@ -26,18 +26,26 @@ from rich.progress import (
 )
 from rich.text import Text
 
+from logvggt_jax.colours import depth_picture
 from logvggt_jax.data.feeding.transforms import LONGER_EDGE
 from logvggt_jax.errors import InputError
 from logvggt_jax.interruption import StopRequest
 from logvggt_jax.model.logvggt import LogVGGT, Variables
+from logvggt_jax.reconstruction.calibration import Calibration
 from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE
-from logvggt_jax.reconstruction.depth_files import depth_picture, write_picture
+from logvggt_jax.reconstruction.depth_files import write_picture
 from logvggt_jax.reconstruction.exporters.ply import write_cloud
 from logvggt_jax.reconstruction.exporters.tum import export_tum
 from logvggt_jax.reconstruction.frame_pool import FramePool
 from logvggt_jax.reconstruction.point_cloud import PointFilter, PointSelection
 from logvggt_jax.reconstruction.request import check_request
-from logvggt_jax.reconstruction.result import POINTS_FILE, PREVIEW_FOLDER, TRAJECTORY_FILE, Reconstruction
+from logvggt_jax.reconstruction.result import (
+    EXPORT_FOLDER,
+    POINTS_FILE,
+    PREVIEW_FOLDER,
+    TRAJECTORY_FILE,
+    Reconstruction,
+)
 from logvggt_jax.reconstruction.run import Run
 from logvggt_jax.reconstruction.sources import Source, open_source
 from logvggt_jax.reconstruction.work_folder import WorkFolder
@@ -55,6 +63,7 @@ def reconstruct(
     settings: Any = None,
     longer_edge: int = LONGER_EDGE,
     point_filter: PointFilter | None = None,
+    calibration: Calibration | None = None,
     num_previews: int = 8,
     overwrite: bool = False,
     progress: bool = True,
@@ -82,6 +91,7 @@ def reconstruct(
       longer_edge: size in pixels, a multiple of 14, to which the longer edge of the frames is resized; take
         what the model was trained with (518 for VGGT).
       point_filter: which pixels become points.
+      calibration: intrinsics that are known; None takes those that the model predicts, frame by frame.
       num_previews: pictures of frames beside their depth, evenly over the sequence.
       overwrite: begin anew, whatever an earlier run has left, and replace an earlier reconstruction.
       progress: show a progress bar where standard error is a terminal, and say there if a run is taken up.
@@ -96,8 +106,8 @@ def reconstruct(
     if num_previews < 0:
         raise InputError(f"num_previews must not be negative, got {num_previews}")
     source = source if isinstance(source, Source) else open_source(source)
-    target = check_request(source, output, longer_edge=longer_edge, overwrite=overwrite)
-    point_filter = point_filter or PointFilter()
+    calibration, point_filter = calibration or Calibration(), point_filter or PointFilter()
+    target = check_request(source, output, longer_edge=longer_edge, overwrite=overwrite, calibration=calibration)
     request = {
         "version": importlib.metadata.version("logvggt-jax"),
         "jax": jax.__version__,
@@ -108,6 +118,7 @@ def reconstruct(
         "settings": str(settings),
         "longer_edge": str(longer_edge),
         "point_filter": str(point_filter),
+        "calibration": str(calibration),
     }
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Rate(), TimeRemainingColumn())
     console = Console(stderr=True)
@@ -131,11 +142,16 @@ def reconstruct(
         if run.num_taken and progress:
             console.print(f"going on after {run.num_taken} frames that an earlier run has done", highlight=False)
         started = time.monotonic()
-        complete = run.stream(stop, advance=lambda: bars.advance(task))
+        complete = run.stream(
+            stop,
+            advance=lambda: bars.advance(task),
+            refined=lambda done, count: bars.update(task, description="Refinement", completed=done, total=count),
+        )
         seconds = time.monotonic() - started
-        run.write_cameras(complete=complete)
+        run.write_cameras(calibration, complete=complete)
         result = Reconstruction.with_cameras_of(work.path)
-        shutil.rmtree(work.path / PREVIEW_FOLDER, ignore_errors=True)  # of an incomplete result
+        for name in (PREVIEW_FOLDER, EXPORT_FOLDER):  # of an incomplete result
+            shutil.rmtree(work.path / name, ignore_errors=True)
         (work.path / PREVIEW_FOLDER).mkdir()
         for index in set(np.linspace(0, result.num_frames - 1, num_previews).round().astype(int).tolist()):
             pool.submit(_write_preview, result, index)

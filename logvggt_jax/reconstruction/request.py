@@ -14,6 +14,7 @@ from logvggt_jax.errors import InputError
 from logvggt_jax.files import check_output, check_space, check_writable
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.operations import matmul_flops_per_second
+from logvggt_jax.reconstruction.calibration import Calibration
 from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE
 from logvggt_jax.reconstruction.point_cloud import VERTEX, PointFilter
 from logvggt_jax.reconstruction.sources import Source
@@ -29,12 +30,21 @@ _DEPTH_BYTES_PER_PIXEL = 4.0
 _REACHED = 1 / 3
 
 
-def check_request(source: Source, output: str | Path, *, longer_edge: int | None, overwrite: bool) -> Path:
+def check_request(
+    source: Source,
+    output: str | Path,
+    *,
+    longer_edge: int | None,
+    overwrite: bool,
+    calibration: Calibration | None = None,
+) -> Path:
     """The absolute path of the output, if `reconstruct` can begin; for callers that want to know before they load a
     large model. Arguments and errors as in `reconstruct`.
     """
     if longer_edge is not None:
         check_longer_edge(longer_edge)
+    if calibration is not None and source.image_size is not None:
+        calibration.check(source.image_size)
     target = Path(output).expanduser().resolve()
     if target in (source.path.resolve(), *source.path.resolve().parents):
         raise InputError(f"output {output} contains the source {source.path}: choose another output")

@@ -11,12 +11,14 @@ from logvggt_jax.errors import InputError, disk_errors, printable
 from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE, read_cameras
 from logvggt_jax.reconstruction.depth_files import read_depth, read_picture
 from logvggt_jax.reconstruction.point_cloud import count_points, read_points
+from logvggt_jax.reconstruction.sources.record import SourceRecord
 
 TRAJECTORY_FILE = "trajectory.txt"
 POINTS_FILE = "points.ply"
 DEPTH_FOLDER = "depth"
 IMAGE_FOLDER = "images"
 PREVIEW_FOLDER = "previews"
+EXPORT_FOLDER = "exports"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -27,15 +29,20 @@ class Reconstruction:
       folder: where it lies.
       names: N frame names, in order.
       timestamps: [N] float64, seconds of a video, positions in a folder.
-      extrinsics: [N, 3, 4] float64, world-to-camera (OpenCV); the world is the first camera's frame, lengths are up to
-        one common scale.
+      extrinsics: [N, 3, 4] float64, world-to-camera (OpenCV); the world is the first camera's frame, or that of poses
+        that were fused in.
       intrinsics: [N, 3, 3] float64, pixels of the original images.
       depth_intrinsics: [N, 3, 3] float64, pixels of depth, confidence and image; centres at integers.
       image_size: (H, W) of the original images.
       depth_size: (h, w) of depth, confidence and image.
+      metric: whether lengths are metres; else they are up to one common scale.
       complete: False if the run was ended before the end of its source.
       skipped: names of frames that could not be read and are left out.
       noted_focal_length: pixels of the original images, as the camera noted it in EXIF; None where it did not.
+      source: where the frames came from; None where they cannot be read again.
+      depth_scale: [N] float64, by which the depth files' depth is multiplied where it is read, so that it fits the
+        extrinsics.
+      loops: pairs of frames at which the sequence came back to a place; None where nobody looked for them.
       seconds: from the first frame to the last depth map, compilation included; None for a folder opened later.
     """
 
@@ -47,9 +54,13 @@ class Reconstruction:
     depth_intrinsics: np.ndarray
     image_size: tuple[int, int]
     depth_size: tuple[int, int]
+    depth_scale: np.ndarray
+    metric: bool = False
+    loops: tuple[tuple[int, int], ...] | None = None
     complete: bool = True
     skipped: tuple[str, ...] = ()
     noted_focal_length: float | None = None
+    source: SourceRecord | None = None
     seconds: float | None = None
 
     @classmethod
@@ -91,9 +102,13 @@ class Reconstruction:
             depth_intrinsics=stacked("depth_intrinsics"),
             image_size=tuple(document["image_size"]),
             depth_size=tuple(document["depth_size"]),
+            metric=document["metric"],
+            depth_scale=np.array([frame["depth_scale"] for frame in frames], np.float64),
+            loops=None if document["loops"] is None else tuple((a, b) for a, b in document["loops"]),
             complete=document["complete"],
             noted_focal_length=document["noted_focal_length"],
             skipped=tuple(frame["name"] for frame in document["skipped"]),
+            source=document["source"],
         )
 
     @property
@@ -116,6 +131,11 @@ class Reconstruction:
 
     def depth_and_confidence(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         """Both of one frame, in one reading."""
+        depth, confidence = self.stored_depth(index)
+        return depth * np.float32(self.depth_scale[index]), confidence
+
+    def stored_depth(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        """Depth and confidence of a frame as its file has them, before `depth_scale`."""
         return read_depth(depth_file(self.folder, self.names[index]), self.depth_size)
 
     def image(self, index: int) -> np.ndarray:
@@ -129,10 +149,11 @@ class Reconstruction:
     def summary(self) -> str:
         """One line a result, with its place; for people, so that a name's control characters are shown as escapes."""
         height, width = self.depth_size
+        scaled = f"; times depth_scale of {CAMERAS_FILE}" if (self.depth_scale != 1).any() else ""
         lines = [
             (CAMERAS_FILE, f"intrinsics and world-to-camera extrinsics of {self.num_frames} frames"),
             (TRAJECTORY_FILE, "camera-to-world trajectory, TUM format"),
-            (f"{DEPTH_FOLDER}/*.npz", f"depth and confidence, {height} x {width}, float16"),
+            (f"{DEPTH_FOLDER}/*.npz", f"depth and confidence, {height} x {width}, float16{scaled}"),
             (f"{IMAGE_FOLDER}/*.jpg", "the frames at that size"),
             (f"{PREVIEW_FOLDER}/*.png", "some images beside their depth"),
             (POINTS_FILE, f"{self.num_points:,} coloured points"),
@@ -143,6 +164,9 @@ class Reconstruction:
         notes = [] if self.complete else ["ended early: the same command goes on from here"]
         if self.skipped:
             notes.append(f"{len(self.skipped)} frames left out: {', '.join(map(printable, self.skipped[:5]))}")
+        if self.loops is not None:
+            pairs = ", ".join(f"{self.names[a]} with {self.names[b]}" for a, b in self.loops[:5])
+            notes.append(f"loops closed: {len(self.loops)}" + (f" ({printable(pairs)})" if pairs else ""))
         if self.noted_focal_length:
             focal = float(np.median(self.intrinsics[:, 0, 0]))
             notes.append(

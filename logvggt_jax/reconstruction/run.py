@@ -14,14 +14,17 @@ from logvggt_jax.data.feeding.transforms import ResizeTransform, resize
 from logvggt_jax.errors import InputError
 from logvggt_jax.geometry import decode_poses
 from logvggt_jax.interruption import Interrupted, StopRequest
+from logvggt_jax.reconstruction.calibration import Calibration
 from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE, write_cameras
 from logvggt_jax.reconstruction.depth_files import write_depth, write_picture
 from logvggt_jax.reconstruction.frame_pool import FramePool
 from logvggt_jax.reconstruction.point_cloud import PointSelection
 from logvggt_jax.reconstruction.result import DEPTH_FOLDER, IMAGE_FOLDER, depth_file, image_file
 from logvggt_jax.reconstruction.sources import SkippedFrame, Source, SourceFrame
-from logvggt_jax.reconstruction.work_folder import Progress, WorkFolder
-from logvggt_jax.streaming import FrameResult, Predictor
+from logvggt_jax.reconstruction.sources.record import record_source
+from logvggt_jax.reconstruction.work_folder import WorkFolder
+from logvggt_jax.streaming import FrameResult, Predictor, Progress
+from logvggt_jax.streaming.state_file import State
 
 _NARROWEST_FIELD_OF_VIEW = 0.01  # radians
 # Saving takes at most this share of the time.
@@ -83,8 +86,13 @@ class Run:
         if (saved := work.saved()) is not None:
             self._restore(saved)
 
-    def stream(self, stop: StopRequest, *, advance: Callable[[], object]) -> bool:
+    def stream(self, stop: StopRequest, *, advance: Callable[[], object], refined: Progress) -> bool:
         """The rest of the sequence through the predictor; images and depth go to disk, and the selection sees all.
+
+        Args:
+          stop: asks for an early end.
+          advance: called with every frame taken.
+          refined: told how far a long refinement at the end has come.
 
         Returns:
           Whether the source was read to its end; False if SIGINT ended the sequence.
@@ -112,14 +120,14 @@ class Run:
         if stop.reason not in (None, "SIGINT"):
             kept = f"{self._predictor.num_frames} frames are kept in {self._work.path}"
             raise Interrupted(stop.reason, f"{kept}; the same command goes on from there")
-        self._hand_on(self._predictor.close())
+        self._hand_on(self._predictor.close(refined))
         self._pool.finish()
         if not self._names:
             raise InputError(f"{self._source.path} gave no frame")
         return stop.reason is None
 
-    def write_cameras(self, *, complete: bool) -> None:
-        """Writes the cameras of all frames; their intrinsics are all finite."""
+    def write_cameras(self, calibration: Calibration, *, complete: bool) -> None:
+        """Writes the cameras of all frames, as far as they are known by the calibration; all numbers are finite."""
         cameras, transform = self._predictor.cameras(), self._transform
         assert transform is not None  # there are frames
         encodings = cameras.pose_encoding.copy()
@@ -132,7 +140,7 @@ class Run:
                 stacklevel=2,
             )
             encodings[:, 7:] = np.maximum(encodings[:, 7:], _NARROWEST_FIELD_OF_VIEW)
-        _, intrinsics = decode_poses(encodings, transform.size)
+        intrinsics = calibration.apply(decode_poses(encodings, transform.size)[1], transform)
         write_cameras(
             self._work.path / CAMERAS_FILE,
             names=self._names,
@@ -145,6 +153,9 @@ class Run:
             complete=complete,
             skipped=self._source.skipped,
             noted_focal_length=self._focal_length,
+            source=record_source(self._source, self.num_taken),
+            depth_scale=cameras.depth_scale,
+            loops=cameras.loops,
         )
 
     def _pictures(self) -> Iterator[_Picture | None]:
@@ -198,12 +209,12 @@ class Run:
             "size": None if self._transform is None else self._transform.original_size,
             "model_size": None if self._transform is None else self._transform.size,
         }
-        self._work.save(Progress(arrays, facts), self._files)
+        self._work.save(State(arrays, facts), self._files)
         self._files = []
         self._last_save = time.monotonic()
         self._saving = self._last_save - started
 
-    def _restore(self, saved: Progress) -> None:
+    def _restore(self, saved: State) -> None:
         facts = saved.facts
         self.num_taken = facts["num_taken"]
         if self._source.fingerprint(self.num_taken) != facts["source"]:

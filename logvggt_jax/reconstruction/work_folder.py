@@ -2,32 +2,20 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import shutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple
-
-import numpy as np
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
 
 from logvggt_jax.errors import InputError, OutputExists, disk_errors, one_line
-from logvggt_jax.files import FolderLock, atomic_file, check_output, move_folder, to_disk, write_text
+from logvggt_jax.files import FolderLock, check_output, move_folder, to_disk, write_text
 from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE, is_complete
+from logvggt_jax.streaming.state_file import State, read_state, write_state
 
 _PROGRESS = ".progress"
 _REQUEST, _STATE = "request.json", "state.safetensors"
 _MEND = "pass --overwrite to start anew"
-
-
-class Progress(NamedTuple):
-    """Where a run was: arrays by name, and what else there is to know, as JSON takes it."""
-
-    arrays: dict[str, np.ndarray]
-    facts: dict[str, Any]
 
 
 class WorkFolder:
@@ -88,32 +76,21 @@ class WorkFolder:
             (self._progress / _STATE).unlink(missing_ok=True)
         write_text(stored, json.dumps(self._request, indent=1))
 
-    def saved(self) -> Progress | None:
-        """What the last `save` stored; None for a new run. InputError where the file is damaged."""
+    def saved(self) -> State | None:
+        """Where the last `save` was; None for a new run. InputError where the file is damaged."""
         file = self._progress / _STATE
         if not file.is_file():
             return None
         try:
-            with disk_errors(file), safe_open(file, "numpy") as stored:
-                described = stored.metadata()
-                arrays = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118
-            if described["digest"] != _digest(described["facts"], arrays):
-                raise ValueError("its digest differs")
-        except (SafetensorError, ValueError, KeyError, TypeError) as error:
-            if isinstance(error, InputError):
-                raise
-            raise InputError(f"{file}: damaged ({one_line(error)}); {_MEND}") from error
-        return Progress(arrays, json.loads(described["facts"]))
+            return read_state(file)
+        except InputError as error:
+            raise InputError(f"{error}; {_MEND}") from error
 
-    def save(self, progress: Progress, files: Iterable[Path]) -> None:
+    def save(self, state: State, files: Iterable[Path]) -> None:
         """Stores where the run is, once what it rests on, `files`, is on the disk."""
         with disk_errors(self.path):
             to_disk(files)
-        arrays = {name: np.ascontiguousarray(array) for name, array in progress.arrays.items()}
-        facts = json.dumps(progress.facts)
-        with atomic_file(self._progress / _STATE) as temporary:
-            save_file(arrays, temporary, metadata={"facts": facts, "digest": _digest(facts, arrays)})
-            to_disk([temporary])
+        write_state(self._progress / _STATE, state)
 
     def commit(self, *, complete: bool) -> None:
         """Puts the folder in the result's place; an incomplete one can still be taken up."""
@@ -146,11 +123,3 @@ def _check_request(folder: Path, request: Mapping[str, str]) -> None:
             f"{folder} holds an unfinished reconstruction that differs in {', '.join(others)}; give its options to go "
             f"on with it, choose another output, or {_MEND}"
         )
-
-
-def _digest(facts: str, arrays: Mapping[str, np.ndarray]) -> str:
-    digest = hashlib.blake2b(facts.encode(), digest_size=16)
-    for name in sorted(arrays):
-        digest.update(f"{name} {arrays[name].dtype.name} {arrays[name].shape}".encode())
-        digest.update(np.ascontiguousarray(arrays[name]).reshape(-1).view(np.uint8).data)  # no copy of its bytes
-    return digest.hexdigest()

@@ -2,8 +2,8 @@
 
 Public VGGT weights never learned to pass the reference on from window to window. Long sequences are then cut into
 chunks as long as memory allows, each predicted in the frame of its own first camera and in its own unit, and carried
-into the first chunk's by the similarity that fits the frames which neighbours share (VGGT-Long, without its loop
-closure).
+into the first chunk's by the similarity that fits the frames which neighbours share (VGGT-Long). Loops are closed at
+the end where that is asked for, see `loops.py`.
 """
 
 from __future__ import annotations
@@ -18,29 +18,27 @@ import numpy as np
 
 from logvggt_jax.config import require_counts
 from logvggt_jax.errors import InputError
-from logvggt_jax.geometry import Similarity, robust_similarity, unproject_pixels
 from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.model.parameters import in_compute_type
+from logvggt_jax.streaming.alignment import align, move
+from logvggt_jax.streaming.loops import LoopCloser, LoopSettings, frame_describer, loop_settings
 from logvggt_jax.streaming.offline import FinalFrames, PlainPrediction, plain_program, predict_plain
 from logvggt_jax.streaming.program import Program
-from logvggt_jax.streaming.results import Cameras, FrameResult, PredictionError, checked_frames, device_memory
+from logvggt_jax.streaming.results import Cameras, FrameResult, PredictionError, Progress, checked_frames, device_memory
 
 PredictChunk = Callable[[np.ndarray], PlainPrediction]
-
-# Shared pixels that fit a similarity: seven numbers need no more, and every chunk solves for them six times.
-_MOST_POINTS = 200_000
-# Pixels less confident than this share of the median are left out.
-_LEAST_CONFIDENCE = 0.1
-# Residuals count linearly beyond this share of the median depth.
-_HUBER_THRESHOLD = 0.1
 
 
 @dataclasses.dataclass(frozen=True)
 class ChunkPlan:
-    """Chunks of `size` frames, neighbours sharing `overlap` of them (VGGT-Long's numbers)."""
+    """Chunks of `size` frames, neighbours sharing `overlap` of them (VGGT-Long's numbers).
+
+    `loops` closes loops when the sequence ends: True, or how they are looked for; chunks are then what moves as one.
+    """
 
     size: int = 60
     overlap: int = 30
+    loops: LoopSettings | bool = False
 
     def __post_init__(self) -> None:
         require_counts(self, "size", "overlap")
@@ -100,6 +98,11 @@ class ChunkChain:
         self._images, self._shared = [], None
         return last
 
+    @property
+    def held_bytes(self) -> int:
+        """Bytes of the images held and of what the next chunk is aligned with."""
+        return sum(array.nbytes for array in (*self._images, *jax.tree.leaves(self._shared)))
+
     def arrays(self) -> dict[str, np.ndarray]:
         """The images held and the last chunk's prediction of those it shares, for `restore`."""
         arrays = {"images": np.stack(self._images), "first": np.array([self._first])} if self._images else {}
@@ -140,7 +143,7 @@ class ChunkSession:
     """Takes frames like a `StreamSession` and hands them out chunk by chunk, depth and pose final.
 
     The world is the first chunk's first camera, the unit the first chunk's. Memory is that of one chunk, and the
-    cameras.
+    cameras; with loops also the places, see `LoopSettings`, and no pose is final before the end.
 
     Args:
       model: whose parts are used; its windows are not.
@@ -155,12 +158,24 @@ class ChunkSession:
         self._chain = ChunkChain(predict, plan)
         self._newest: np.ndarray | None = None
         self._final = FinalFrames()
+        self._loops: LoopCloser | None = None
+        if (settings := loop_settings(plan.loops)) is not None:
+            settings = dataclasses.replace(
+                settings, stretch=plan.size - plan.overlap, frames=min(settings.frames, max(1, plan.size // 2))
+            )
+            self._loops = LoopCloser(frame_describer(model, predict.args[1]), predict, settings)
+        self._cameras: Cameras | None = None
         self._closed = False
 
     @property
     def num_frames(self) -> int:
-        """Frames handed out so far; their depth and pose are final."""
+        """Frames handed out so far; their depth is final."""
         return len(self._final)
+
+    @property
+    def state_bytes(self) -> int:
+        """See `Predictor.state_bytes`: at most a chunk of images, and the prediction of an overlap."""
+        return self._chain.held_bytes
 
     def push(self, frames: np.ndarray | jax.Array | Sequence[np.ndarray]) -> list[FrameResult]:
         """Takes frames and returns those that became final; see `Predictor.push`."""
@@ -169,74 +184,51 @@ class ChunkSession:
         results: list[FrameResult] = []
         for frame in checked_frames(frames, patch_size=self._patch_size, before=self._newest):
             self._newest = frame
+            if self._loops is not None:
+                self._loops.see(frame)
             with self._memory():
-                results += self._final.add(self._chain.push(frame))
+                results += self._handed_out(self._chain.push(frame))
         return results
 
-    def close(self) -> list[FrameResult]:
+    def close(self, progress: Progress | None = None) -> list[FrameResult]:
         """Ends the stream: the frames still held; PredictionError where the last chunk does not fit the others."""
+        if self._closed:
+            return []
         self._closed, self._newest = True, None
         with self._memory():
-            return self._final.add(self._chain.close())
+            results = self._handed_out(self._chain.close())
+            if self._loops is not None and len(self._final):
+                self._cameras = self._loops.close(self._final.cameras())
+        return results
 
     def snapshot(self) -> tuple[list[FrameResult], dict[str, np.ndarray]]:
         """See `Predictor.snapshot`: the images of the chunk to come, and what the next is aligned with."""
         final = {f"final/{name}": array for name, array in self._final.arrays().items()}
-        return [], {**final, **self._chain.arrays()}
+        loops = {} if self._loops is None else self._loops.arrays()
+        return [], {**final, **self._chain.arrays(), **{f"loops/{name}": array for name, array in loops.items()}}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """See `Predictor.restore`."""
         self._final.restore({name.removeprefix("final/"): x for name, x in arrays.items() if name.startswith("final/")})
         self._chain.restore(arrays)
+        if self._loops is not None:
+            self._loops.restore({name.removeprefix("loops/"): x for name, x in arrays.items() if name[:6] == "loops/"})
         if "images" in arrays:
             self._newest = arrays["images"][-1]
 
     def cameras(self) -> Cameras:
-        """Cameras of the frames handed out so far; all are final."""
-        return self._final.cameras()
+        """Cameras of the frames handed out so far; all are final, but with loops, which change them at the end."""
+        if self._cameras is not None:
+            return self._cameras
+        cameras = self._final.cameras()
+        return cameras if self._loops is None else cameras._replace(is_final=np.zeros(len(self._final), bool))
+
+    def _handed_out(self, prediction: PlainPrediction | None) -> list[FrameResult]:
+        results = self._final.add(prediction)
+        if self._loops is None:
+            return results
+        self._loops.take(results)
+        return [dataclasses.replace(result, pose_is_final=False) for result in results]
 
     def _memory(self) -> AbstractContextManager[None]:
         return device_memory(f"a chunk of {self._plan.size} frames", "take a smaller chunk size")
-
-
-def align(source: PlainPrediction, target: PlainPrediction) -> Similarity:
-    """The similarity that carries one prediction of some frames onto another of the same frames.
-
-    It fits the points of the same pixels where both are confident, weighted by the geometric mean of both
-    confidences, with Huber weights against what the predictions disagree about.
-
-    Raises:
-      ValueError: fewer than three pixels are valid in both, or their points lie on a line.
-    """
-    valid = _confident(source, target)
-    chosen = np.flatnonzero(valid)
-    if len(chosen) > _MOST_POINTS:
-        chosen = chosen[np.linspace(0, len(chosen) - 1, _MOST_POINTS).round().astype(int)]
-    if len(chosen) < 3:
-        raise ValueError(f"{len(chosen)} of {valid.size} pixels have a valid depth and confidence in both")
-    weights = np.sqrt(source.depth_confidence.reshape(-1)[chosen].astype(np.float64))
-    weights *= np.sqrt(target.depth_confidence.reshape(-1)[chosen].astype(np.float64))
-    threshold = _HUBER_THRESHOLD * float(np.median(target.depth.reshape(-1)[chosen]))
-    clouds = [unproject_pixels(each.depth, each.intrinsics, each.extrinsics, chosen) for each in (source, target)]
-    return robust_similarity(clouds[0], clouds[1], weights, threshold=threshold)
-
-
-def move(prediction: PlainPrediction, similarity: Similarity) -> PlainPrediction:
-    """The same prediction in the world and unit that `similarity` maps to; float32."""
-    points = prediction.points
-    return prediction._replace(
-        depth=(similarity.scale * prediction.depth).astype(np.float32),
-        extrinsics=similarity.apply_to_extrinsics(prediction.extrinsics).astype(np.float32),
-        points=None if points is None else similarity.apply(points).astype(np.float32),
-    )
-
-
-def _confident(source: PlainPrediction, target: PlainPrediction) -> np.ndarray:
-    """Pixels [n, H, W] that both predictions know something of."""
-    valid = np.ones(source.depth.shape, bool)
-    for prediction in (source, target):
-        valid &= np.isfinite(prediction.depth) & (prediction.depth > 0) & np.isfinite(prediction.depth_confidence)
-    if valid.any():
-        least = _LEAST_CONFIDENCE * min(float(np.median(p.depth_confidence[valid])) for p in (source, target))
-        valid &= (source.depth_confidence > least) & (target.depth_confidence > least)
-    return valid

@@ -19,7 +19,7 @@ from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.model.memory import Memory, RoundMemory
 from logvggt_jax.model.parameters import in_compute_type
 from logvggt_jax.streaming.program import Program, abstract_variables, flops_of
-from logvggt_jax.streaming.results import Cameras, FrameResult, checked_frames, decoded_cameras, device_memory
+from logvggt_jax.streaming.results import Cameras, FrameResult, Progress, checked_frames, decoded_cameras, device_memory
 from logvggt_jax.types import WindowOutput
 
 Memories = TypeVar("Memories")
@@ -108,7 +108,7 @@ class FrameSession:
 
     @property
     def state_bytes(self) -> int:
-        """Bytes that count of what the stream keeps for the frames to come; waits for the device."""
+        """See `Predictor.state_bytes`: the filled part of all caches."""
         return sum(_bytes(cache) * _filled(cache) // cache.capacity for cache in _caches(self._memory))
 
     @property
@@ -130,7 +130,7 @@ class FrameSession:
                 results += self._landed(self._ahead)
         return results
 
-    def close(self) -> list[FrameResult]:
+    def close(self, progress: Progress | None = None) -> list[FrameResult]:
         """Ends the stream: the frames still on their way, oldest first."""
         self._closed = True
         with self._device_memory():

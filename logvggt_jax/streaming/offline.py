@@ -15,7 +15,7 @@ from logvggt_jax.geometry import encode_poses
 from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.model.parameters import in_compute_type
 from logvggt_jax.streaming.program import Program, abstract_variables, flops_of
-from logvggt_jax.streaming.results import Cameras, FrameResult, PredictionError, checked_frames, device_memory
+from logvggt_jax.streaming.results import Cameras, FrameResult, PredictionError, Progress, checked_frames, device_memory
 
 
 class PlainPrediction(NamedTuple):
@@ -166,6 +166,11 @@ class OfflineSession:
         """Frames handed out so far."""
         return len(self._final)
 
+    @property
+    def state_bytes(self) -> int:
+        """See `Predictor.state_bytes`: the images, all of them until the end."""
+        return sum(image.nbytes for image in self._images)
+
     def push(self, frames: np.ndarray | jax.Array | Sequence[np.ndarray]) -> list[FrameResult]:
         """Takes frames; see `Predictor.push`. Raises PredictionError for more than `max_frames`."""
         if self._closed:
@@ -180,7 +185,7 @@ class OfflineSession:
             )
         return []
 
-    def close(self) -> list[FrameResult]:
+    def close(self, progress: Progress | None = None) -> list[FrameResult]:
         """Predicts all frames at once."""
         images, self._images, self._closed = self._images, [], True
         if not images:

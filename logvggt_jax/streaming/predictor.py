@@ -25,7 +25,7 @@ from logvggt_jax.streaming.merged import MergedSession, MergedSettings, merged_p
 from logvggt_jax.streaming.offline import OfflineSession, OfflineSettings, offline_program
 from logvggt_jax.streaming.program import Program
 from logvggt_jax.streaming.pruned import PrunedSettings, open_pruned, pruned_program
-from logvggt_jax.streaming.results import Cameras, FrameResult
+from logvggt_jax.streaming.results import Cameras, FrameResult, Progress
 from logvggt_jax.streaming.rolling import RollingSettings, open_rolling, rolling_program
 from logvggt_jax.streaming.windows import StreamSession, WindowSettings, window_program
 
@@ -36,6 +36,14 @@ class Predictor(Protocol):
     @property
     def num_frames(self) -> int:
         """Frames handed out so far."""
+        ...
+
+    @property
+    def state_bytes(self) -> int:
+        """Bytes of what is kept for the frames to come, on the device and the host; waits for the device.
+
+        Empty places of buffers do not count, nor do parameters, what was handed out, and what a running program needs.
+        """
         ...
 
     def push(self, frames: np.ndarray | jax.Array | Sequence[np.ndarray]) -> list[FrameResult]:
@@ -51,8 +59,12 @@ class Predictor(Protocol):
         """
         ...
 
-    def close(self) -> list[FrameResult]:
-        """Ends the sequence: the frames still held, oldest first. Afterwards every pose is final."""
+    def close(self, progress: Progress | None = None) -> list[FrameResult]:
+        """Ends the sequence: the frames still held, oldest first. Afterwards every pose is final.
+
+        Args:
+          progress: told how many frames have been refined, of how many, where that takes a while.
+        """
         ...
 
     def snapshot(self) -> tuple[list[FrameResult], dict[str, np.ndarray]]:

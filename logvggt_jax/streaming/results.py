@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import jax
@@ -26,12 +26,16 @@ class FrameResult:
 
     Attributes:
       index: position in the stream, from 0.
-      depth: [H, W] float32, z-depth in the unit of the poses' translations.
+      depth: [H, W] float32, z-depth in the unit of the poses' translations. Where loops are closed when the sequence
+        ends, `Cameras.depth_scale` then says by which factor it changes.
       confidence: [H, W] float32, at least 1.
       pose_encoding: [9] float32, see `logvggt_jax.geometry.decode_poses`; None while the frame has no pose.
       pose_is_final: whether `pose_encoding` stays as it is.
       points: [H, W, 3] float32 in the first camera's frame; None without point head.
       points_confidence: [H, W] float32; None without point head.
+      latency: seconds from the frame's `push` to this result; None where it is not measured.
+      overlap_change: difference between the frame's camera tokens in its last two windows, as a fraction of their
+        norm: it rises where windows do not agree. None where the frame was in one window, and for other methods.
     """
 
     index: int
@@ -41,6 +45,24 @@ class FrameResult:
     pose_is_final: bool
     points: np.ndarray | None
     points_confidence: np.ndarray | None
+    latency: float | None = None
+    overlap_change: float | None = None
+
+
+# Told how much of something is done, and of how much.
+Progress = Callable[[int, int], object]
+
+
+class Signals(NamedTuple):
+    """What a stream tells of its own quality, for the first N frames, numpy arrays; NaN where it is not known.
+
+    Attributes:
+      overlap_change: [N] float32, see `FrameResult`.
+      correction: [N] float32, how far GCCR moved the camera token, as a fraction of its norm.
+    """
+
+    overlap_change: np.ndarray
+    correction: np.ndarray
 
 
 class Cameras(NamedTuple):
@@ -51,12 +73,17 @@ class Cameras(NamedTuple):
       extrinsics: [N, 3, 4] float32, world-to-camera (OpenCV); the world is the first camera's frame.
       intrinsics: [N, 3, 3] float32, pixels of the model's input.
       is_final: bool [N], False where later frames may still move the pose.
+      depth_scale: [N] float32, the factors that the depth of the frames, as it was handed out, needs to fit these
+        cameras; None where it fits as it is.
+      loops: int64 [L, 2], the frames at which the sequence came back to a place; None where nobody looked for them.
     """
 
     pose_encoding: np.ndarray
     extrinsics: np.ndarray
     intrinsics: np.ndarray
     is_final: np.ndarray
+    depth_scale: np.ndarray | None = None
+    loops: np.ndarray | None = None
 
 
 def decoded_cameras(encodings: np.ndarray, image_size: tuple[int, int], *, final: int) -> Cameras:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import functools
+import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -14,14 +16,23 @@ import jax.numpy as jnp
 import numpy as np
 
 from logvggt_jax.config import RefinementConfig, require_counts
-from logvggt_jax.model.gccr import RegisterKeys
 from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.model.parameters import in_compute_type
-from logvggt_jax.model.refinement import Span
 from logvggt_jax.model.windows import WindowState
+from logvggt_jax.streaming.loops import LoopCloser, LoopSettings, frame_describer, loop_settings
+from logvggt_jax.streaming.offline import predict_plain
+from logvggt_jax.streaming.pose_stream import Poses, PoseStream, relative_change
 from logvggt_jax.streaming.program import Program, abstract_variables, flops_of
-from logvggt_jax.streaming.results import Cameras, FrameResult, checked_frames, decoded_cameras, device_memory
-from logvggt_jax.streaming.token_store import TokenStore
+from logvggt_jax.streaming.results import (
+    Cameras,
+    FrameResult,
+    Progress,
+    Signals,
+    checked_frames,
+    decoded_cameras,
+    device_memory,
+)
+from logvggt_jax.streaming.rows import Rows
 from logvggt_jax.types import WindowOutput
 
 # The model is hashable and static, so that all sessions of a model share their compiled programs.
@@ -35,41 +46,21 @@ def _start(model: LogVGGT, variables: Variables, frames: jax.Array, mask: jax.Ar
 @functools.partial(jax.jit, static_argnums=0, donate_argnums=2)
 def _step(
     model: LogVGGT, variables: Variables, state: WindowState, frames: jax.Array, mask: jax.Array | None
-) -> tuple[WindowState, WindowOutput]:
-    return model.step(variables, state, frames, mask)
+) -> tuple[WindowState, WindowOutput, jax.Array]:
+    """The step, and how far apart the two copies are of each frame [B, s] that becomes final, as a fraction of its
+    camera token's norm; NaN for a frame that was in one window alone."""
+    before = state.special_tokens[:, :, 0]
+    state_after, output = model.step(variables, state, frames, mask)
+    twice = min(before.shape[1], output.camera_tokens.shape[1])
+    change = relative_change(before[:, :twice], output.camera_tokens[:, :twice])
+    change = jnp.where((state.step == 0)[:, None], jnp.nan, change)
+    rest = output.camera_tokens.shape[1] - twice
+    return state_after, output, jnp.pad(change, ((0, 0), (0, rest)), constant_values=jnp.nan)
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def _finish(model: LogVGGT, variables: Variables, state: WindowState) -> WindowOutput:
     return model.finish(variables, state)
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _project(model: LogVGGT, variables: Variables, register_tokens: jax.Array) -> RegisterKeys:
-    return model.refinement.project_registers(variables, register_tokens)
-
-
-@functools.partial(jax.jit, static_argnums=0, static_argnames="size")
-def _fire(
-    model: LogVGGT,
-    variables: Variables,
-    camera_tokens: jax.Array,
-    registers: RegisterKeys | None,
-    refined: jax.Array,
-    span: Span,
-    *,
-    size: int,
-) -> tuple[jax.Array, jax.Array]:
-    """One trigger: refined tokens with the span's frames added, and pose encodings [size, 9] from its start."""
-    refined, encodings = model.refinement.fire(variables, camera_tokens, registers, refined, span, size=size)
-    return refined, encodings[0, :, -1]
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _fire_all(
-    model: LogVGGT, variables: Variables, camera_tokens: jax.Array, registers: RegisterKeys | None, count: jax.Array
-) -> jax.Array:
-    return model.refinement.fire_all(variables, camera_tokens, registers, count[None])[0, :, -1]
 
 
 def window_program(
@@ -91,7 +82,7 @@ def window_program(
 def _without_refinement(model: LogVGGT) -> LogVGGT:
     """The model with one mode of refinement for all, so that sessions which differ in it share their programs: windows
     know nothing of it."""
-    plain = dataclasses.replace(model.config.refinement, enabled=True, period=None, context=None)
+    plain = dataclasses.replace(model.config.refinement, enabled=True, period=None, context=None, max_registers=None)
     return LogVGGT(dataclasses.replace(model.config, refinement=plain))
 
 
@@ -101,12 +92,14 @@ class _Flight(NamedTuple):
     Attributes:
       output: of the step; the first `valid` entries are frames.
       valid: frames that became final.
-      encodings: poses that became final with them, [n, 9] each, the first so many of which count.
+      overlap_change: [1, n] of these frames; None for the last ones, which nothing came after.
+      poses: that became final with them.
     """
 
     output: WindowOutput
     valid: int
-    encodings: list[tuple[jax.Array, int]]
+    overlap_change: jax.Array | None
+    poses: list[Poses]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,11 +112,14 @@ class WindowSettings:
       ahead: windows that may be on the device when `push` returns. With 1 the device works while the caller does,
         and a window's results come with the next window; with 0 they come at once.
       first_capacity: frames that the token buffers hold at first; they double.
+      loops: close loops when the sequence ends: True, or how they are looked for. No pose is final before; both places
+        of a loop are predicted together in one window.
     """
 
     provisional: bool = False
     ahead: int = 1
     first_capacity: int = 256
+    loops: LoopSettings | bool = False
 
     def __post_init__(self) -> None:
         require_counts(self, "first_capacity")
@@ -141,9 +137,13 @@ class StreamSession:
             ...
         cameras = session.cameras()
 
-    The numbers are those of `model.apply` on the whole sequence, in every refinement mode. Device memory is
+    The numbers are those of `model.apply` on the whole sequence, in every refinement mode (beyond `LONG_SEQUENCE`
+    frames that are refined at the end, those of `context=LONG_CONTEXT` where no context is set). Device memory is
     constant but for what refinement reads of every frame (two camera tokens and GCCR's keys and values, 49 kB in
-    VGGT-1B's size with bfloat16, 82 kB with float32); the depth of a frame leaves the device as soon as it is final.
+    VGGT-1B's size with bfloat16, 82 kB with float32). With `refinement.period`, `context` and `max_registers` set it
+    is constant, as is the time a frame; the host keeps 44 bytes a frame. The depth of a frame leaves the device as soon
+    as it is final. Sessions of one model share its programs, and its parameters where these are in the compute type,
+    as `load_model` gives them.
 
     Args:
       model: the model; `model.config.refinement` sets when poses become final.
@@ -159,23 +159,43 @@ class StreamSession:
         # Once, not at every call: cast, and brought to the device where they are numpy arrays.
         self._variables = jax.device_put(in_compute_type(variables, model.config))
         self._windows = _without_refinement(model)
-        self._store = TokenStore(first_capacity=self._settings.first_capacity)
+        self._poses = PoseStream(
+            model,
+            self._variables,
+            first_capacity=self._settings.first_capacity,
+            late=(self._settings.ahead + 1) * model.config.windows.size,
+        )
         self._pending: list[np.ndarray] = []
         self._state: WindowState | None = None
         self._flights: deque[_Flight] = deque()
         self._newest: np.ndarray | None = None
         self._image_size = (1, 1)  # (H, W), known with the first frame
         self._received = 0
-        # Frames whose pose some trigger has taken, whether it is here or still on its way.
-        self._refined = 0
-        self._encodings = np.zeros((0, 9), np.float32)
+        # When the frames came that are not handed out yet; None for those of a snapshot.
+        self._arrivals: deque[float | None] = deque()
+        # Pose and correction [N, 10], and the two copies' difference [N], of the frames where they are known.
+        self._final = Rows(np.zeros((0, 10), np.float32))
+        self._overlap = Rows(np.zeros(0, np.float32))
         self._handed_out = 0
+        self._loops: LoopCloser | None = None
+        if (loops := loop_settings(self._settings.loops)) is not None:
+            # No more than the model has ever seen at once.
+            loops = dataclasses.replace(loops, frames=min(loops.frames, max(1, model.config.windows.size // 2)))
+            predict = functools.partial(predict_plain, model, self._variables)
+            self._loops = LoopCloser(frame_describer(model, self._variables), predict, loops)
+        self._closed_loops: Cameras | None = None
         self._closed = False
 
     @property
     def num_frames(self) -> int:
         """Frames handed out so far; their depth is final."""
         return self._handed_out
+
+    @property
+    def state_bytes(self) -> int:
+        """See `Predictor.state_bytes`: cache and held tokens, compact tokens, and frames not yet in a window."""
+        arrays = (*jax.tree.leaves(self._state), *self._pending)
+        return self._poses.filled_bytes + sum(array.nbytes for array in arrays)
 
     def push(self, frames: np.ndarray | jax.Array | Sequence[np.ndarray]) -> list[FrameResult]:
         """Takes frames and returns those that became final, oldest first.
@@ -198,12 +218,18 @@ class StreamSession:
                 self._pending.append(frame)
                 self._newest = frame
                 self._received += 1
+                self._arrivals.append(time.monotonic())
+                if self._loops is not None:
+                    self._loops.see(frame)
                 if self._advance():
                     results += self._landed(self._settings.ahead)
         return results
 
-    def close(self) -> list[FrameResult]:
-        """Ends the stream: the frames still held, oldest first. Afterwards every pose is final."""
+    def close(self, progress: Progress | None = None) -> list[FrameResult]:
+        """Ends the stream: the frames still held, oldest first. Afterwards every pose is final.
+
+        `progress` is told how many frames are refined, of how many, where a long sequence is refined at the end.
+        """
         if self._closed:
             return []
         self._closed = True
@@ -212,12 +238,36 @@ class StreamSession:
         with self._memory():
             if self._state is None:
                 self._begin()
-            if self._pending or self._store.count == 0:
+            if self._pending or self._poses.num_frames == 0:
                 self._one_step()
             assert self._state is not None  # set by _begin
-            self._take_off(_finish(self._windows, self._variables, self._state))
+            self._take_off(_finish(self._windows, self._variables, self._state), None, progress)
             self._state = self._newest = None
-            return self._landed(0)
+            results = self._landed(0)
+            if self._loops is not None:
+                encodings = self._final.array[:, :9]
+                cameras = decoded_cameras(encodings, self._image_size, final=len(encodings))
+                self._closed_loops = self._loops.close(cameras)
+            return results
+
+    def provisional(self) -> list[FrameResult]:
+        """What is known of the newest frames, which later ones may still change: those that no `push` has handed out.
+
+        Depth and pose are those of a stream that ends here. Costs about a window, and copies of the stream's state;
+        the stream goes on as if nothing had been asked.
+        """
+        other = copy.copy(self)
+        other._pending, other._flights, other._arrivals = self._pending[:], self._flights.copy(), self._arrivals.copy()
+        other._final, other._overlap = Rows(self._final.array), Rows(self._overlap.array)
+        other._state, other._poses = jax.tree.map(jnp.copy, self._state), self._poses.copy()
+        known = self._poses.num_frames
+        return [dataclasses.replace(r, pose_is_final=r.index < known and r.pose_is_final) for r in other.close()]
+
+    def signals(self) -> Signals:
+        """How well the windows agree, frame by frame of those handed out."""
+        overlap, corrections = self._overlap.array, np.full(self._handed_out, np.nan, np.float32)
+        corrections[: len(self._final)] = self._final.array[: self._handed_out, 9]
+        return Signals(overlap.copy(), corrections)
 
     def snapshot(self) -> tuple[list[FrameResult], dict[str, np.ndarray]]:
         """See `Predictor.snapshot`: cache, held and compact tokens, poses, and frames not yet in a window."""
@@ -225,18 +275,20 @@ class StreamSession:
             results = self._landed(0)
         if self._newest is None:
             return results, {}
-        arrays = {f"tokens/{name}": array for name, array in self._store.arrays().items()} if self._store.count else {}
+        arrays = {f"tokens/{name}": array for name, array in self._poses.arrays().items()}
         if self._state is not None:
             fields = dataclasses.fields(self._state)
             arrays |= {f"state/{field.name}": np.asarray(getattr(self._state, field.name)) for field in fields}
         if self._pending:
             arrays["pending"] = np.stack(self._pending)
-        counts = (self._received, self._refined, self._handed_out)
+        if self._loops is not None:
+            arrays |= {f"loops/{name}": array for name, array in self._loops.arrays().items()}
         return results, {
             **arrays,
             "newest": self._newest,
-            "counts": np.array(counts, np.int64),
-            "encodings": self._encodings,
+            "counts": np.array((self._received, self._handed_out), np.int64),
+            "final": self._final.array.copy(),
+            "overlap": self._overlap.array.copy(),
         }
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
@@ -246,10 +298,14 @@ class StreamSession:
         self._newest = arrays["newest"]
         self._image_size = (self._newest.shape[0], self._newest.shape[1])
         self._pending = list(arrays.get("pending", ()))
-        self._received, self._refined, self._handed_out = (int(count) for count in arrays["counts"])
-        self._encodings = arrays["encodings"]
-        if tokens := {name.removeprefix("tokens/"): x for name, x in arrays.items() if name.startswith("tokens/")}:
-            self._store.restore(tokens)
+        self._received, self._handed_out = (int(count) for count in arrays["counts"])
+        self._arrivals = deque([None] * (self._received - self._handed_out))
+        self._final, self._overlap = Rows(arrays["final"]), Rows(arrays["overlap"])
+        self._poses.restore(
+            {name.removeprefix("tokens/"): x for name, x in arrays.items() if name.startswith("tokens/")}
+        )
+        if self._loops is not None:
+            self._loops.restore({name.removeprefix("loops/"): x for name, x in arrays.items() if name[:6] == "loops/"})
         if fields := {name.removeprefix("state/"): x for name, x in arrays.items() if name.startswith("state/")}:
             del fields["image_size"]
             self._state = WindowState(
@@ -257,27 +313,31 @@ class StreamSession:
             )
 
     def cameras(self, *, provisional: bool = False) -> Cameras:
-        """Cameras of the frames whose pose is final; with `provisional` of all frames handed out."""
+        """Cameras of the frames whose pose is final, but for loops; with `provisional` of all frames handed out."""
+        if self._closed_loops is not None:
+            return self._closed_loops
         encodings = self._all_encodings(provisional=provisional)
-        return decoded_cameras(encodings, self._image_size, final=len(self._encodings))
+        return decoded_cameras(encodings, self._image_size, final=self._num_final)
 
     def cameras_with(self, refinement: RefinementConfig) -> Cameras:
         """Cameras of all frames of a closed stream, as another mode of refinement gives them.
 
-        Windows know nothing of refinement, so that modes are compared on one run of them.
+        Windows know nothing of refinement, so that modes are compared on one run of them. A stream that closes loops
+        closes them for these cameras.
 
         Raises:
-          ValueError: the stream is not closed; it ran without refinement, so that it has kept no registers.
+          ValueError: the stream is not closed; it had no frames, or has not kept what that mode reads.
         """
-        store = self._store
-        if not self._closed or store.camera is None:
-            raise ValueError("cameras_with is for a stream that has had frames and is closed")
-        if refinement.enabled and store.registers is None:
-            raise ValueError("this stream ran with refinement off and kept no registers; open it with refinement on")
-        model = LogVGGT(dataclasses.replace(self._model.config, refinement=refinement))
-        registers = store.registers if refinement.enabled else None
-        encodings = _fire_all(model, self._variables, store.camera, registers, jnp.int32(store.count))
-        return decoded_cameras(np.asarray(encodings)[: store.count], self._image_size, final=store.count)
+        if not self._closed:
+            raise ValueError("cameras_with is for a stream that is closed")
+        encodings = self._poses.all_with(refinement)
+        cameras = decoded_cameras(encodings, self._image_size, final=len(encodings))
+        return cameras if self._loops is None else self._loops.close(cameras)
+
+    @property
+    def _num_final(self) -> int:
+        """Poses that nothing will change."""
+        return len(self._final) if self._loops is None else 0
 
     def _memory(self) -> AbstractContextManager[None]:
         height, width = self._image_size
@@ -286,11 +346,10 @@ class StreamSession:
 
     def _all_encodings(self, *, provisional: bool) -> np.ndarray:
         """Final pose encodings [N, 9]; with `provisional` those of all frames handed out."""
-        done = len(self._encodings)
+        done, final = len(self._final), self._final.array[:, :9]
         if not provisional or done >= self._handed_out:
-            return self._encodings
-        _, encodings = self._trigger(done, self._handed_out)
-        return np.concatenate([self._encodings, np.asarray(encodings)[: self._handed_out - done]])
+            return final
+        return np.concatenate([final, self._poses.provisional(done, self._handed_out)])
 
     # Dispatch: nothing here waits for the device.
 
@@ -323,54 +382,26 @@ class StreamSession:
     def _one_step(self) -> None:
         frames, mask = self._take(self._model.config.windows.stride)
         assert self._state is not None
-        self._state, out = _step(self._windows, self._variables, self._state, frames, mask)
-        self._take_off(out)
+        self._state, out, change = _step(self._windows, self._variables, self._state, frames, mask)
+        self._take_off(out, change)
 
-    def _take_off(self, output: WindowOutput) -> None:
-        """Stores a window's tokens, fires the triggers that are due, and sends for its results."""
-        valid = min(output.depth.shape[1], self._received - self._store.count)
-        registers = None
-        if self._model.config.refinement.enabled:
-            registers = _project(self._windows, self._variables, output.register_tokens)
-        self._store.append(output.camera_tokens, registers, valid)
+    def _take_off(
+        self,
+        output: WindowOutput,
+        overlap_change: jax.Array | None,
+        progress: Progress | None = None,
+    ) -> None:
+        """Hands on a window's tokens, with the triggers that are due, and sends for its results."""
+        valid = min(output.depth.shape[1], self._received - self._poses.num_frames)
+        poses = self._poses.append(output.camera_tokens, output.register_tokens, valid)
+        if self._closed and self._poses.num_frames == self._received:
+            poses += self._poses.finish(progress)
         # The tokens stay on the device: what is fetched is what is handed out.
         output = output.replace(camera_tokens=None, register_tokens=None, frame_mask=None)  # type: ignore[attr-defined]
-        flight = _Flight(output, valid, self._due_poses(last=self._store.count == self._received and self._closed))
-        for array in jax.tree.leaves((flight.output, [encodings for encodings, _ in flight.encodings])):
+        flight = _Flight(output, valid, overlap_change, poses)
+        for array in jax.tree.leaves((output, overlap_change, [(each.encodings, each.corrections) for each in poses])):
             array.copy_to_host_async()
         self._flights.append(flight)
-
-    def _due_poses(self, *, last: bool) -> list[tuple[jax.Array, int]]:
-        """Fires the triggers that are due; pose encodings and how many of them count."""
-        period, poses = self._model.config.refinement.period, []
-        while self._refined < (count := self._store.count):
-            due = period is not None and count >= self._refined + period
-            if not due and not last:
-                break
-            stop = self._refined + period if due and period is not None else count
-            if period is None:
-                # What reads all frames runs once: at their number, not at the buffers' size.
-                self._store.trim()
-            self._store.refined, encodings = self._trigger(self._refined, stop)
-            poses.append((encodings, stop - self._refined))
-            self._refined = stop
-        return poses
-
-    def _trigger(self, start: int, stop: int) -> tuple[jax.Array, jax.Array]:
-        """Refined tokens and pose encodings of a trigger that takes the frames [start, stop)."""
-        store, period = self._store, self._model.config.refinement.period
-        if period is not None:
-            store.reserve(start + period)
-        assert store.camera is not None and store.refined is not None
-        return _fire(
-            self._model,
-            self._variables,
-            store.camera,
-            store.registers,
-            store.refined,
-            Span(jnp.int32(start), jnp.int32(stop), jnp.full(1, stop, jnp.int32)),
-            size=store.capacity if period is None else period,
-        )
 
     # Results: here the host waits for what it asked for.
 
@@ -387,19 +418,30 @@ class StreamSession:
         points, points_confidence = (
             None if x is None else np.asarray(x)[0] for x in (out.points, out.points_confidence)
         )
-        arrived = [np.asarray(encodings)[:count] for encodings, count in flight.encodings]
-        self._encodings = np.concatenate([self._encodings, *arrived])
+        for poses in flight.poses:
+            found = np.column_stack([np.asarray(poses.encodings), np.asarray(poses.corrections)])
+            self._final.append(found[: poses.valid])
+        change = np.full(flight.valid, np.nan, np.float32)
+        if flight.overlap_change is not None:
+            change = np.asarray(flight.overlap_change)[0, : flight.valid]
+        self._overlap.append(change)
         self._handed_out += flight.valid
+        now = time.monotonic()
         encodings = self._all_encodings(provisional=self._settings.provisional)
-        return [
+        results = [
             FrameResult(
                 index=index,
                 depth=depth[offset],
                 confidence=confidence[offset],
                 pose_encoding=encodings[index] if index < len(encodings) else None,
-                pose_is_final=index < len(self._encodings),
+                pose_is_final=index < self._num_final,
                 points=None if points is None else points[offset],
                 points_confidence=None if points_confidence is None else points_confidence[offset],
+                latency=None if (arrival := self._arrivals.popleft()) is None else now - arrival,
+                overlap_change=None if np.isnan(change[offset]) else float(change[offset]),
             )
             for offset, index in enumerate(range(first, self._handed_out))
         ]
+        if self._loops is not None:
+            self._loops.take(results)
+        return results

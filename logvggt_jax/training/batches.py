@@ -12,21 +12,30 @@ from logvggt_jax.data.dataset import Dataset, Reader
 from logvggt_jax.data.errors import EmptySplit
 from logvggt_jax.data.feeding.batches import BatchIterator, training_batches
 from logvggt_jax.data.feeding.holdouts import check_disjoint, check_held_out
+from logvggt_jax.data.frame_range import FrameRange
 from logvggt_jax.data.registry import DATASETS, open_dataset
 from logvggt_jax.errors import InputError
 from logvggt_jax.training.config import DataConfig, SourceConfig, StageConfig
 
 
-def open_source(source: SourceConfig) -> Reader:
-    """The data set of one source, made with its options."""
+def open_source(source: SourceConfig) -> Dataset:
+    """The data set of one source, made with its options, and of its frames those that it names."""
+    return _frames_of(source, _reader(source))
+
+
+def _reader(source: SourceConfig) -> Reader:
     return open_dataset(source.name, source.root, source.split, **dict(source.options))
 
 
-def open_sources(config: DataConfig, validation: SourceConfig | None = None) -> dict[str, Dataset]:
+def _frames_of(source: SourceConfig, dataset: Dataset) -> Dataset:
+    return dataset if source.frames is None else FrameRange(dataset, source.frames, source.name)
+
+
+def open_sources(config: DataConfig, validation: Sequence[SourceConfig] = ()) -> dict[str, Dataset]:
     """The mixture's data sets by name, in the form in which training reads them; what has to be made is made here.
 
     Raises InputError: folders of data sets do not exist and `config.allow_missing` is off, or none exists; a data set
-    would train on sequences that `config.hold_out` or the `validation` source keeps.
+    would train on sequences that `config.hold_out` or a source of `validation` keeps.
     """
     rules = dict(config.hold_out)
     if unknown := sorted(rules.keys() - set(DATASETS)):
@@ -35,16 +44,18 @@ def open_sources(config: DataConfig, validation: SourceConfig | None = None) -> 
         )
     datasets: dict[str, Dataset] = {}
     for source in _present(config):
-        dataset = open_source(source)
+        reader = _reader(source)
         if source.name in rules:
             check_held_out(
-                source.name, dataset.sequences, rules[source.name], functools.partial(_split_sequences, source)
+                source.name, reader.sequences, rules[source.name], functools.partial(_split_sequences, source)
             )
         # Names of sequences do not depend on where a copy of the set lies.
-        if validation is not None and validation.name == source.name:
-            check_disjoint(source.name, dataset.sequences, open_source(validation).sequences)
+        for kept in validation:
+            if kept.name == source.name:
+                check_disjoint(source.name, _frames_of(source, reader), open_source(kept))
         progress = jax.process_index() == 0
-        datasets[source.name] = dataset.for_training(cache_dir=config.cache_dir, progress=progress)
+        made = reader.for_training(cache_dir=config.cache_dir, progress=progress)
+        datasets[source.name] = _frames_of(source, made)
     return datasets
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
 from collections.abc import Mapping
@@ -14,7 +15,7 @@ import numpy as np
 from absl import logging
 
 from logvggt_jax.errors import DiskError, InputError, OutputExists, disk_errors, one_line
-from logvggt_jax.files import FolderLock, write_text
+from logvggt_jax.files import FolderLock, check_space, write_text
 from logvggt_jax.model.parameters import unstack_layers
 from logvggt_jax.training.checkpoint_files import DamagedCheckpoint, Position, StoredCheckpoint, write_checkpoint
 from logvggt_jax.training.config import TrainConfig
@@ -31,7 +32,8 @@ FREE_DATA_SETTINGS = ("worker_count", "num_threads", "cache_dir", "max_broken")
 
 
 class RunCheckpoints:
-    """The checkpoints `<workdir>/checkpoints/<step>` and the model folder `<workdir>/model`; a context manager.
+    """The checkpoints `<workdir>/checkpoints/<step>` and the model folders `<workdir>/model` and `<workdir>/best`; a
+    context manager.
 
     While entered, the folder is this run's alone. Saves are written in the background, by process 0. A checkpoint
     appears under its name only when complete, see `checkpoint_files`. What `restore` passes over stays, under the name
@@ -41,13 +43,14 @@ class RunCheckpoints:
     def __init__(self, workdir: Path, config: TrainConfig) -> None:
         self.config = config
         self.folder = workdir.expanduser().absolute() / "checkpoints"
-        self.model_folder = self.folder.parent / "model"
+        self.model_folder, self.best_folder = self.folder.parent / "model", self.folder.parent / "best"
         self._honoured = self.folder / "resumed.json"
         self._lock: FolderLock | None = None
         self._writer = ThreadPoolExecutor(1, "checkpoints")
         self._pending: Future[None] | None = None
         # Now rather than after the steps before the first save.
-        check_destination(self.model_folder)
+        for folder in (self.model_folder, self.best_folder):
+            check_destination(folder)
         self._check_own()
 
     def __enter__(self) -> RunCheckpoints:
@@ -77,16 +80,16 @@ class RunCheckpoints:
         the save before from being written, see `wait`. The checkpoint `in_place_of` goes when this one is complete.
         """
         self.wait()
-        first = jax.process_index() == 0
-
-        def copied(leaf: Any) -> np.ndarray | None:
-            whole = whole_array(leaf)
-            # Always a copy: on a CPU it could be the very memory that the next step writes to.
-            return np.array(whole) if first else None
-
-        copies = jax.tree.map(copied, state)
-        if first:
+        copies = self._copied(state)
+        if jax.process_index() == 0:
             self._pending = self._writer.submit(self._write, copies, position, in_place_of)
+
+    def save_best(self, state: TrainState) -> None:
+        """Begins to replace the model folder `best` by this state's parameters, and returns; as `save`."""
+        self.wait()
+        params, step = self._copied(state.averaged), int(state.step)
+        if jax.process_index() == 0:
+            self._pending = self._writer.submit(self._write_model, self.best_folder, params, step)
 
     def check(self) -> None:
         """Raises on process 0 what kept a save from being written, as soon as that is known; waits for nothing."""
@@ -146,6 +149,17 @@ class RunCheckpoints:
                     write_text(self._honoured, json.dumps({"resume_step": step}))
         return state, position
 
+    @staticmethod
+    def _copied(tree: Any) -> Any:
+        """Arrays on the host of process 0, nothing on the others; all have to call this at the same point."""
+
+        def copied(leaf: Any) -> np.ndarray | None:
+            whole = whole_array(leaf)
+            # Always a copy: on a CPU it could be the very memory that the next step writes to.
+            return np.array(whole) if jax.process_index() == 0 else None
+
+        return jax.tree.map(copied, tree)
+
     def _restore(self, step: int, like: TrainState) -> tuple[TrainState, Position]:
         """Raises DamagedCheckpoint on every process where one of them finds damage."""
         problem: DamagedCheckpoint | None = None
@@ -168,10 +182,12 @@ class RunCheckpoints:
         return state, stored.position
 
     def _write(self, state: TrainState, position: Position, in_place_of: int | None) -> None:
-        # First, so that a run that is killed in between goes on from an older checkpoint and writes both again.
-        layers = unstack_layers(state.averaged, self.config.model)
         step = int(state.step)
-        save_model(self.model_folder, self.config.model, layers, self._provenance(step))
+        # Else the library that writes says the same in hundreds of lines.
+        needed = sum(leaf.nbytes for leaf in jax.tree.leaves((state, state.averaged)))
+        check_space(self.folder / str(step), needed, "make room, and the same command goes on from the last checkpoint")
+        # First, so that a run that is killed in between goes on from an older checkpoint and writes both again.
+        self._write_model(self.model_folder, state.averaged, step)
         write_checkpoint(self.folder / str(step), state, position, self.config)
         newest = [kept for kept in self.steps if kept != in_place_of][-self.config.keep_checkpoints :]
         for old in {*self.steps} - {step, *newest}:
@@ -179,6 +195,9 @@ class RunCheckpoints:
             leaving = self.folder / f".{old}.old"
             (self.folder / str(old)).rename(leaving)
             shutil.rmtree(leaving, ignore_errors=True)
+
+    def _write_model(self, folder: Path, params: Any, step: int) -> None:
+        save_model(folder, self.config.model, unstack_layers(params, self.config.model), self._provenance(step))
 
     def _set_aside(self, step: int) -> Path:
         """Gives a checkpoint a name that no other has, under which it is none."""
@@ -199,14 +218,15 @@ class RunCheckpoints:
 
     def _check_own(self) -> None:
         """A model without checkpoints is this run's if it was killed before its first one was complete."""
-        if any(entry.name.isdecimal() for entry in self.folder.glob("*")) or not is_model_folder(self.model_folder):
+        if any(entry.name.isdecimal() for entry in self.folder.glob("*")):
             return
-        source = read_provenance(self.model_folder).source or "source not recorded"
-        if not source.endswith(self._here()):
-            raise OutputExists(
-                f"{self.model_folder}: a model that this run did not write ({source}) would be replaced; start in "
-                "another --workdir or move it away"
-            )
+        for folder in filter(is_model_folder, (self.model_folder, self.best_folder)):
+            source = read_provenance(folder).source or "source not recorded"
+            if not source.endswith(self._here()):
+                raise OutputExists(
+                    f"{folder}: a model that this run did not write ({source}) would be replaced; start in another "
+                    "--workdir or move it away"
+                )
 
     def _here(self) -> str:
         return f" in {self.folder.parent}"
@@ -223,9 +243,11 @@ class RunCheckpoints:
         return Provenance("windows", longer_edge, source=f"trained from {start}{self._here()}", training=record)
 
     def _check_configuration(self, stored: StoredCheckpoint) -> None:
-        ours = self.config.to_dict()
+        ours, written = self.config.to_dict(), stored.config
+        with contextlib.suppress(InputError):  # with what an earlier version had no field for
+            written = TrainConfig.from_dict(written).to_dict()
         for part in ("model", "stages", "data", "loss", "optimizer", "seed", "average"):
-            theirs = stored.config.get(part)
+            theirs = written.get(part)
             if part == "data" and theirs is not None:
                 theirs, ours[part] = _what_decides_clips(theirs), _what_decides_clips(ours[part])
             difference = _first_difference(theirs, ours[part], part)

@@ -24,17 +24,25 @@ from logvggt_jax.data.feeding.augmentation import ColourAugmentation
 from logvggt_jax.data.feeding.holdouts import HoldOut
 from logvggt_jax.errors import InputError
 
-LOSSES = ("log_vggt", "vggt")
+LOSSES = ("log_vggt", "vggt", "distillation")
 SCHEDULES = ("cosine", "linear_tail")
+# What validation measures of a model, and whether more of it is better.
+VALIDATION_METRICS = {
+    "abs_rel": False,
+    "delta_1.25": True,
+    "rotation": False,
+    "translation_direction": False,
+    "auc_30": True,
+}
 
 
 @dataclasses.dataclass(frozen=True)
 class LossConfig:
-    """The objective: `name` is `log_vggt` (the paper's) or `vggt` (VGGT's released trainer).
+    """The objective: `name` is `log_vggt` (the paper's), `vggt` (VGGT's released trainer) or `distillation`.
 
     `translation_weight`, `rotation_weight` and `field_of_view_weight` weigh the parts of the camera loss, `gamma`
-    decays earlier rounds of the camera head, `alpha` rewards confidence. `quantile` (vggt only) drops the largest
-    depth errors, None keeps all.
+    decays earlier rounds of the camera head, `alpha` rewards confidence; in a distillation it weighs the distance to
+    the teacher's. `quantile` (vggt only) drops the largest depth errors, None keeps all.
     """
 
     name: str
@@ -61,7 +69,8 @@ class OptimizerConfig:
     The rate climbs linearly over `warmup_fraction` of the schedule and then follows a `cosine`, or stays and
     falls linearly over the last quarter (`linear_tail`), to `final_learning_rate`. With `restart_each_stage` every
     stage of the curriculum runs the schedule anew. `decay_all` applies weight decay to vectors (biases, norms,
-    gains) too.
+    gains) too. Parameters whose names match one of the patterns `frozen` (see `freezing`) are not trained; the encoder
+    is one of them where `model.encoder.frozen` says so.
     """
 
     learning_rate: float
@@ -74,8 +83,10 @@ class OptimizerConfig:
     weight_decay: float
     decay_all: bool
     clip_norm: float
+    frozen: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        freeze_lists(self)
         require_one_of(self, SCHEDULES, "schedule")
         require_within(self, "(0, inf)", "learning_rate", "clip_norm")
         require_within(self, "[0, inf)", "final_learning_rate", "weight_decay")
@@ -115,7 +126,9 @@ class SourceConfig:
     """One data set of a mixture.
 
     `weight` is its share of the clips relative to the others'. `stride`, smallest and largest, takes the place of
-    the stage's. `options` (sorted pairs) are further arguments of the set's reader.
+    the stage's. Of every sequence the `frames`, first and the one after the last, are taken, as a slice of Python does:
+    (None, 700) the first 700, (-200, None) the last 200. `options` (sorted pairs) are further arguments of the set's
+    reader.
     """
 
     name: str
@@ -123,6 +136,7 @@ class SourceConfig:
     split: str
     weight: float = 1.0
     stride: tuple[int, int] | None = None
+    frames: tuple[int | None, int | None] | None = None
     options: tuple[tuple[str, Any], ...] = ()
 
     def __post_init__(self) -> None:
@@ -168,21 +182,51 @@ class DataConfig:
 
 @dataclasses.dataclass(frozen=True)
 class ValidationConfig:
-    """Every `every` steps, `num_clips` fixed clips of `clip_length` frames, `stride` apart, of a held-out set."""
+    """Every `every` steps, `num_clips` fixed clips of `clip_length` frames, `stride` apart, of each of some held-out
+    sets. The model of the best value of the metric `best` is kept, None keeps none.
 
-    source: SourceConfig
+    They come from as many sequences as a set has; where those are fewer, from several places of each.
+    """
+
+    sources: tuple[SourceConfig, ...]
     every: int
     num_clips: int
     clip_length: int
     stride: int
     size: tuple[int, int]
+    best: str | None = None
 
     def __post_init__(self) -> None:
         freeze_lists(self)
+        if not self.sources:
+            raise InputError("ValidationConfig.sources is empty: name at least one data set, or set validation to None")
+        if self.best is not None:
+            require_one_of(self, tuple(VALIDATION_METRICS), "best")
         require_counts(self, "every", "num_clips", "clip_length", "stride")
         if self.clip_length < 2:
             raise InputError("ValidationConfig.clip_length must be at least 2: pose errors are of pairs of frames")
         check_size(self.size, "ValidationConfig.size")
+
+
+@dataclasses.dataclass(frozen=True)
+class TeacherConfig:
+    """Plain VGGT, whose predictions take the place of the truth in all sources of a run.
+
+    `weights` is what `from_pretrained` reads. Videos are cut into clips of `clip_length` frames, `stride` apart, each
+    of which the teacher sees as a whole: the longer, the more a student learns of what lies far apart, up to what a
+    device's memory holds. Its labels are kept in `data.cache_dir`. With `validation` the validation source is labelled
+    as well and the student compared with its teacher, else with that source's truth.
+    """
+
+    weights: str
+    clip_length: int
+    stride: int = 1
+    validation: bool = True
+
+    def __post_init__(self) -> None:
+        require_counts(self, "clip_length", "stride")
+        if self.clip_length < 2:
+            raise InputError("TeacherConfig.clip_length must be at least 2: one frame alone has no pose to be learned")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -198,7 +242,7 @@ class TrainConfig:
     `accumulate` times as many devices. With `shard_parameters` a device holds its part of parameters, gradients and
     moments, and puts the parameters together layer by layer. `average`, such as 0.999, is the decay in a step of a
     moving average of the parameters, which validation and the model folder then have; None keeps none. The first two
-    may change when a run goes on.
+    may change when a run goes on. A `teacher` labels the data, for the objective `distillation`.
     """
 
     model: ModelConfig
@@ -217,10 +261,21 @@ class TrainConfig:
     accumulate: int = 1
     shard_parameters: bool = False
     average: float | None = None
+    teacher: TeacherConfig | None = None
 
     def __post_init__(self) -> None:
         if not self.stages:
             raise InputError("TrainConfig.stages is empty: a run needs at least one")
+        if (self.loss.name == "distillation") != (self.teacher is not None):
+            raise InputError("loss.name='distillation' and a teacher belong together: give both, or neither")
+        if self.teacher is not None:
+            if self.data.cache_dir is None:
+                raise InputError("a teacher's labels are kept on disk: give data.cache_dir a folder")
+            if longest := [s.name for s in self.stages if s.clip_length > self.teacher.clip_length]:
+                raise InputError(
+                    f"stages {', '.join(longest)}: clips are longer than the teacher's, "
+                    f"teacher.clip_length={self.teacher.clip_length}: raise it or shorten them"
+                )
         require_counts(self, "log_every", "save_every", "keep_checkpoints", "max_skipped_in_a_row", "accumulate")
         require_within(self, "[0, 1)", "average")
         require_within(self, "(0, inf)", "max_minutes")

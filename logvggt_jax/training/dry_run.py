@@ -119,7 +119,7 @@ def step_costs(
     program = make_program(LogVGGT(config.model), config, params, mesh)
     batch = jax.tree.map(
         lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=split(mesh)),
-        abstract_clips(clips * mesh.size, clip_length, size),
+        abstract_clips(clips * mesh.size, clip_length, size, taught=config.teacher is not None),
     )
     started = time.perf_counter()
     try:
@@ -137,9 +137,13 @@ def step_costs(
     )
 
 
-def abstract_clips(batch: int, frames: int, size: tuple[int, int]) -> dict[str, jax.ShapeDtypeStruct]:
-    """A batch as the training step takes it, without values."""
+def abstract_clips(
+    batch: int, frames: int, size: tuple[int, int], *, taught: bool = False
+) -> dict[str, jax.ShapeDtypeStruct]:
+    """A batch as the training step takes it, without values; with a teacher's confidence where it is `taught`."""
+    confidence = {"confidence": jax.ShapeDtypeStruct((batch, frames, *size), jnp.float32)} if taught else {}
     return {
+        **confidence,
         "images": jax.ShapeDtypeStruct((batch, frames, *size, 3), jnp.uint8),
         "depth": jax.ShapeDtypeStruct((batch, frames, *size), jnp.float32),
         "intrinsics": jax.ShapeDtypeStruct((batch, frames, 3, 3), jnp.float32),

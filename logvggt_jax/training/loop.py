@@ -1,9 +1,10 @@
 """The training loop: stages, logging, validation, checkpoints, and a clean end whatever ends it."""
 
 import contextlib
+import math
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,23 +21,26 @@ from logvggt_jax.errors import InputError, one_line
 from logvggt_jax.interruption import StopRequest
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.operations import matmul_flops_per_second
-from logvggt_jax.training.batches import open_sources, stage_batches
+from logvggt_jax.training.batches import stage_batches
 from logvggt_jax.training.checkpoint_files import Position
 from logvggt_jax.training.checkpoints import RunCheckpoints
-from logvggt_jax.training.config import StageConfig, TrainConfig
+from logvggt_jax.training.compilation import compiled_steps
+from logvggt_jax.training.config import VALIDATION_METRICS, StageConfig, TrainConfig
 from logvggt_jax.training.device_batches import DeviceBatches
+from logvggt_jax.training.distillation import open_data
 from logvggt_jax.training.dry_run import step_flops
 from logvggt_jax.training.initialization import initial_parameters
 from logvggt_jax.training.metrics_log import MetricsLog, read_metrics
 from logvggt_jax.training.processes import Vote, any_process, check_agreement, check_shared
 from logvggt_jax.training.profile import ProfiledSteps, Profiler
 from logvggt_jax.training.program import abstract_parameters, make_program
-from logvggt_jax.training.progress import IntervalMeans, RunTimes, duration, progress_line
+from logvggt_jax.training.progress import IntervalMeans, RunTimes, duration, goodput, progress_line
 from logvggt_jax.training.sharding import check_batch_size
 from logvggt_jax.training.skipped import clips_to_blame, described
 from logvggt_jax.training.state import TrainState
-from logvggt_jax.training.step import Batch, Metrics
+from logvggt_jax.training.step import Metrics
 from logvggt_jax.training.validation import Validation
+from logvggt_jax.training.wandb_run import WandbRun, load_wandb
 from logvggt_jax.training.watchdog import Watchdog
 
 # Steps handed to the device before the oldest has to be finished: enough to hide the host's work.
@@ -56,34 +60,41 @@ def train(
     resume_step: int | None = None,
     watchdog: float = 0.0,
     profile: ProfiledSteps | None = None,
+    wandb: str | None = None,
 ) -> TrainState:
     """Runs the stages of `config` on `mesh`, or what is left of them if `workdir` holds a checkpoint; the state at the
     end.
 
-    Leaves `checkpoints/`, `model/` (for `load_model`), `metrics.jsonl`, `times.jsonl`, `tensorboard/` and a `profile/`
-    that was asked for in `workdir`. SIGTERM, Ctrl-C
-    and `config.max_minutes` end the run after the current step with a checkpoint; `resume_step` is the one to go on
-    from, once, None takes the latest. A run begins with a save and a validation, so that either fails at once.
-    When no step has ended for `watchdog` times the median step the process ends, see `Watchdog`.
+    Leaves `checkpoints/`, `model/` (for `load_model`), the `best/` model by a metric of validation, `metrics.jsonl`,
+    `times.jsonl`, `tensorboard/` and a `profile/` that was asked for in `workdir`; `wandb` names a project of Weights &
+    Biases that shows the same. SIGTERM, Ctrl-C and `config.max_minutes` end the run after the current step with a
+    checkpoint; `resume_step` is the one to go on from, once, None takes the latest. A run begins with a save and a
+    validation, so that either fails at once. When no step has ended for `watchdog` times the median step the process
+    ends, see `Watchdog`.
 
     Raises InputError for settings, data or a checkpoint that do not fit, in one line, and NonFiniteTraining where
     `config.max_skipped_in_a_row` updates in a row were not finite; a run that is started again goes on past them.
     """
     for stage in config.stages:
         check_batch_size(stage, mesh, accumulate=config.accumulate)
+    if wandb is not None:
+        load_wandb()
     check_shared(workdir)
     with contextlib.ExitStack() as stack:
         watched = stack.enter_context(Watchdog(watchdog))
         # Before gigabytes of weights are read.
-        datasets = open_sources(config.data, None if config.validation is None else config.validation.source)
-        run = _Run(config, workdir, mesh, watched)
+        datasets, validated = open_data(config)
+        run = _Run(config, workdir, mesh, watched, validated)
         run.profiler = stack.enter_context(Profiler(profile, workdir / "profile"))
         stack.enter_context(run.checkpoints)
         stop = stack.enter_context(StopRequest("SIGTERM", "SIGINT"))
         first, position = run.start(resume_step)
         check_agreement("the checkpoints", first)
         silent = jax.process_index() != 0
-        with MetricsLog(workdir, first_step=first, console=Console(), silent=silent) as log:
+        tracked = None
+        if wandb is not None and not silent:
+            tracked = stack.enter_context(WandbRun(wandb, workdir, config.to_dict()))
+        with MetricsLog(workdir, first_step=first, console=Console(), silent=silent, wandb=tracked) as log:
             log.say(f"{mesh.size} devices, {first}/{config.total_steps} steps done, results in {workdir}")
             run.train(datasets, position, log, stop)
     return run.state
@@ -96,7 +107,9 @@ class _Run:
     times: RunTimes
     profiler: Profiler
 
-    def __init__(self, config: TrainConfig, workdir: Path, mesh: Mesh, watchdog: Watchdog) -> None:
+    def __init__(
+        self, config: TrainConfig, workdir: Path, mesh: Mesh, watchdog: Watchdog, validated: Sequence[Dataset]
+    ) -> None:
         self.config, self.mesh, self.watchdog = config, mesh, watchdog
         self.deadline = None if config.max_minutes is None else time.monotonic() + 60 * config.max_minutes
         model = LogVGGT(config.model)
@@ -106,7 +119,7 @@ class _Run:
         self.programs: dict[tuple[int, ...], jax.stages.Compiled] = {}
         self.operations: dict[tuple[int, ...], float] = {}
         layout = self.program.layout
-        self.validation = None if config.validation is None else Validation(model, config.validation, layout)
+        self.validation = None if config.validation is None else Validation(model, config.validation, layout, validated)
         self.checkpoints = RunCheckpoints(workdir, config)
         self.peak = None
         if mesh.devices.flat[0].platform != "cpu":  # whose cores share one peak
@@ -161,15 +174,14 @@ class _Run:
             self._validate(step, log)
         for index, stage, end, source in left:
             with source, DeviceBatches(source, self.mesh) as batches, self._device_memory(stage):
+                self._compile(stage, source.sizes, log)
                 step, ended = self._train_stage(index, stage, batches, step, end, log, stop)
             if ended:
                 break
         self.checkpoints.wait()
-        wall = max(time.time() - log.started, 1e-9)
         log.say(
-            f"{step}/{self.config.total_steps} steps done; model in {self.checkpoints.model_folder}; goodput "
-            f"{min(self.times.productive / wall, 1.0):.0%}: {duration(self.times.productive)} of training in "
-            f"{duration(wall)} since the first start"
+            f"{step}/{self.config.total_steps} steps done; model in {self.checkpoints.model_folder}; "
+            f"{goodput(self.times.productive, time.time() - log.started)}"
         )
 
     def _train_stage(
@@ -199,7 +211,7 @@ class _Run:
                         self._log(step, end, stage, batches.broken_clips, log)
                     self._save(Position(index, batches.get_state()))
                 raise
-            program = self._program(stage, batch, log)
+            program = self.programs[batch["images"].shape]
             self.profiler.before(step + 1)
             self.state, metrics, finite = program(self.state, batch)
             step += 1
@@ -272,17 +284,21 @@ class _Run:
         with self.times.other("save"), self.watchdog.other("the save"):
             self.checkpoints.save(self.state, position, in_place_of=in_place_of)
 
-    def _program(self, stage: StageConfig, batch: Batch, log: MetricsLog) -> jax.stages.Compiled:
-        """The step compiled ahead of time for clips of this shape: a call cannot cost another compilation unseen."""
-        shape = batch["images"].shape
-        if shape not in self.programs:
-            started = time.perf_counter()
-            with self.times.other("compilation"), self.watchdog.other("the compilation"):
-                self.programs[shape] = self.program.step.lower(self.state, batch).compile()
+    def _compile(self, stage: StageConfig, sizes: Sequence[tuple[int, int]], log: MetricsLog) -> None:
+        """Makes the stage's steps ready for all sizes of its clips, so that none costs a compilation on the way."""
+        new = [size for size in sizes if (stage.batch_size, stage.clip_length, *size, 3) not in self.programs]
+        if not new:  # an earlier stage had the same
+            return
+        with self.times.other("compilation"), self.watchdog.other("the compilation"):
+            for number, step in enumerate(compiled_steps(self.program, self.state, stage, new), 1):
+                self.programs[step.clips] = step.run
                 if self.peak is not None:
-                    self.operations[shape] = step_flops(self.config.model, shape[:4])
-            log.say(f"{stage.name}: step compiled in {time.perf_counter() - started:.0f} s")
-        return self.programs[shape]
+                    self.operations[step.clips] = step_flops(self.config.model, step.clips[:4])
+                height, width = step.clips[2:4]
+                log.say(
+                    f"{stage.name}: step for images of {height} x {width} compiled after {step.seconds:.0f} s, "
+                    f"{number} of {len(new)}"
+                )
 
     @contextlib.contextmanager
     def _device_memory(self, stage: StageConfig) -> Iterator[None]:
@@ -314,11 +330,9 @@ class _Run:
         speed = self.times.read(stage)
         log.write(step, {**values, "frames_per_second": speed.frames_per_second})
         memory = most_device_bytes(self.mesh.local_devices)
-        shapes = {(s.name, size) for s in self.config.stages for size in s.sizes}
-        missing = max(len(shapes) - len(self.programs), 0)
-        here = min(missing, max(len(stage.sizes) - len(self.programs), 0))
-        stage_seconds = self.times.remaining_seconds(step, end, compilations=here)
-        run_seconds = self.times.remaining_seconds(step, compilations=missing)
+        stages = self.config.stages
+        stage_seconds = self.times.remaining_seconds(step, end)
+        run_seconds = self.times.remaining_seconds(step, compilations=len(stages) - 1 - stages.index(stage))
         log.write_times(
             step,
             {
@@ -352,15 +366,31 @@ class _Run:
             return
         started = time.perf_counter()
         with self.times.other("validation"), self.watchdog.other("the validation"):
-            values = self.validation(self.state.averaged)
+            values, pictures = self.validation(self.state.averaged)
+            # Before the line of this validation: a run that is killed between the two validates again.
+            best = self._keep_if_best(step, values, log)
+        log.show(step, pictures)
         log.write(step, values)
         log.say(
             f"validation after step {step} ({duration(time.perf_counter() - started)}): "
             f"abs_rel {values['validation/abs_rel']:.3f} (constant depth {values['validation/constant_abs_rel']:.3f}), "
             f"delta<1.25 {values['validation/delta_1.25']:.3f}, "
             f"rotation {values['validation/rotation']:.2f}° (identity {values['validation/identity_rotation']:.2f}°), "
-            f"direction {values['validation/translation_direction']:.1f}°"
+            f"direction {values['validation/translation_direction']:.1f}°{best}"
         )
+
+    def _keep_if_best(self, step: int, values: Mapping[str, float], log: MetricsLog) -> str:
+        """Keeps the model if none before was better by the metric that the configuration names; says so in words."""
+        name = None if self.config.validation is None else self.config.validation.best
+        if name is None:
+            return ""
+        # Process 0 has the earlier values and decides.
+        better = not log.silent and _is_best(read_metrics(log.path), step, f"validation/{name}", values)
+        if not any_process(better):
+            return ""
+        self.checkpoints.save_best(self.state)
+        self.checkpoints.wait()
+        return f", the best {name} so far"
 
     def _reason_to_end(self, stop: StopRequest) -> str | None:
         reason = None
@@ -370,6 +400,13 @@ class _Run:
             reason = f"max_minutes={self.config.max_minutes} are over"
         # A process that left alone would let the others wait for its share of the next step for ever.
         return (reason or "another process is to stop") if self.vote(reason is not None) else None
+
+
+def _is_best(before: Sequence[Mapping[str, Any]], step: int, name: str, values: Mapping[str, float]) -> bool:
+    """Whether the value of this step is better than that of every validation before; one that is no number is not."""
+    sign = 1.0 if VALIDATION_METRICS[name.removeprefix("validation/")] else -1.0
+    known = [sign * line[name] for line in before if line["step"] < step and line.get(name) is not None]
+    return math.isfinite(values[name]) and sign * values[name] > max(known, default=-math.inf)
 
 
 def _is_validated(metrics: Path, step: int) -> bool:

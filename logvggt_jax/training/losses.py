@@ -55,16 +55,52 @@ def depth_losses(
     (finite everywhere), all [B, T, H, W]. Source: LoG-VGGT, "Training Objective", fourth equation, as means, with
     absolute values for the norm over one channel.
     """
-    count = valid.sum().astype(jnp.float32)
-    error = jnp.where(valid, depth - target, 0.0)
     weight = jnp.where(valid, confidence, 1.0)
+    count = valid.sum().astype(jnp.float32)
+    error, gradient = _weighted_errors(depth, target, valid, weight)
+    return {
+        "depth_error": Mean(error, count),
+        "depth_gradient": Mean(gradient, count),
+        "depth_confidence": Mean(-alpha * jnp.log(weight).sum(), count),
+    }
+
+
+def distilled_depth_losses(
+    depth: jax.Array,
+    confidence: jax.Array,
+    target: jax.Array,
+    valid: jax.Array,
+    target_confidence: jax.Array,
+    *,
+    alpha: float,
+) -> dict[str, Mean]:
+    """Distances to a teacher's depth and confidence, each a mean over the pixels where `valid` bool [B, T, H, W].
+
+    `depth_error` and `depth_gradient` are those of `depth_losses` with another weight: the teacher's confidence over
+    its mean in the clip, so that what it is unsure of counts less, and clips weigh alike. `depth_confidence` is
+    alpha |log S - log S_teacher| of the student's confidence S. All arrays are [B, T, H, W], float32.
+    """
+    count = valid.sum().astype(jnp.float32)
+    known = jnp.where(valid, target_confidence, 0.0)
+    mean = known.sum((1, 2, 3)) / jnp.maximum(valid.sum((1, 2, 3)), 1)
+    weight = known / jnp.maximum(mean, 1.0)[:, None, None, None]
+    error, gradient = _weighted_errors(depth, target, valid, weight)
+    distance = jnp.log(jnp.where(valid, confidence, 1.0)) - jnp.log(jnp.where(valid, target_confidence, 1.0))
+    return {
+        "depth_error": Mean(error, count),
+        "depth_gradient": Mean(gradient, count),
+        "depth_confidence": Mean(alpha * jnp.abs(distance).sum(), count),
+    }
+
+
+def _weighted_errors(
+    depth: jax.Array, target: jax.Array, valid: jax.Array, weight: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Sums over valid pixels of weighted absolute errors, and of their differences between neighbours."""
+    error = jnp.where(valid, depth - target, 0.0)
     both_x = valid[..., :, 1:] & valid[..., :, :-1]
     both_y = valid[..., 1:, :] & valid[..., :-1, :]
     along_x = weight[..., :, :-1] * jnp.abs(error[..., :, 1:] - error[..., :, :-1])
     along_y = weight[..., :-1, :] * jnp.abs(error[..., 1:, :] - error[..., :-1, :])
     gradient = jnp.where(both_x, along_x, 0.0).sum() + jnp.where(both_y, along_y, 0.0).sum()
-    return {
-        "depth_error": Mean((weight * jnp.abs(error)).sum(), count),
-        "depth_gradient": Mean(gradient, count),
-        "depth_confidence": Mean(-alpha * jnp.log(weight).sum(), count),
-    }
+    return (weight * jnp.abs(error)).sum(), gradient

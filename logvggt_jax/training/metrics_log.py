@@ -1,17 +1,20 @@
-"""Scalars of a run: JSON lines, TensorBoard and the terminal, written by process 0."""
+"""Scalars and pictures of a run: JSON lines, TensorBoard and the terminal, written by process 0."""
 
 from __future__ import annotations
 
 import json
 import math
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TextIO
 
+import numpy as np
 from rich.console import Console
 from tensorboardX import SummaryWriter
 
 from logvggt_jax.files import write_text
+from logvggt_jax.training.wandb_run import WandbRun
 
 FILE_NAME = "metrics.jsonl"
 # Beside the metrics, which are the same however often a run was interrupted.
@@ -29,11 +32,21 @@ class MetricsLog:
     that the file reads like one uninterrupted run.
     """
 
-    def __init__(self, workdir: Path, *, first_step: int, console: Console, silent: bool = False) -> None:
-        """Args: `silent` writes and says nothing, as is right for all processes of a run but the first."""
+    def __init__(
+        self,
+        workdir: Path,
+        *,
+        first_step: int,
+        console: Console,
+        silent: bool = False,
+        wandb: WandbRun | None = None,
+    ) -> None:
+        """Args: `silent` writes and says nothing, as is right for all processes of a run but the first; `wandb` gets
+        what TensorBoard gets."""
         self.path = workdir / FILE_NAME
         self.console = console
         self.silent = silent
+        self._wandb = wandb
         self.started, self.productive_seconds = time.time(), 0.0
         if silent:
             return
@@ -71,15 +84,26 @@ class MetricsLog:
             self._append(self._times, step, values)
             self._draw(step, {f"times/{name}": value for name, value in values.items()})
 
+    def show(self, step: int, pictures: Mapping[str, np.ndarray]) -> None:
+        """Pictures by name, [h, w, 3] uint8 RGB."""
+        if self.silent:
+            return
+        for name, picture in pictures.items():
+            self._tensorboard.add_image(name, picture, step, dataformats="HWC")
+        if self._wandb is not None:
+            self._wandb.show(step, pictures)
+
     def _append(self, file: TextIO, step: int, values: dict[str, float]) -> None:
         finite = {name: value if math.isfinite(value) else None for name, value in values.items()}
         file.write(json.dumps({"step": step, "time": round(time.time(), 3), **finite}) + "\n")
         file.flush()
 
     def _draw(self, step: int, values: dict[str, float]) -> None:
-        for name, value in values.items():
-            if math.isfinite(value):
-                self._tensorboard.add_scalar(name, value, step)
+        finite = {name: value for name, value in values.items() if math.isfinite(value)}
+        for name, value in finite.items():
+            self._tensorboard.add_scalar(name, value, step)
+        if self._wandb is not None:
+            self._wandb.write(step, finite)
 
     def say(self, message: str) -> None:
         """One line on the terminal."""

@@ -10,10 +10,15 @@ from logvggt_jax.training.normalization import Targets
 from logvggt_jax.types import Predictions
 
 
-def loss_terms(predictions: Predictions, targets: Targets, config: LossConfig) -> dict[str, Mean]:
-    """Every term of the objective over the clips at hand; names begin with `camera` or `depth`."""
+def loss_terms(
+    predictions: Predictions, targets: Targets, config: LossConfig, confidence: jax.Array | None = None
+) -> dict[str, Mean]:
+    """Every term of the objective over the clips at hand; names begin with `camera` or `depth`.
+
+    A distillation needs the `confidence` [B, T, H, W] of the teacher whose targets these are.
+    """
     dense = (predictions.depth, predictions.depth_confidence, targets.depth, targets.depth_valid)
-    if config.name == "log_vggt":
+    if config.name in ("log_vggt", "distillation"):
         camera = losses.camera_loss(
             predictions.pose_encodings,
             targets.pose_encoding,
@@ -23,7 +28,10 @@ def loss_terms(predictions: Predictions, targets: Targets, config: LossConfig) -
             field_of_view_weight=config.field_of_view_weight,
             gamma=config.gamma,
         )
-        return {"camera": camera, **losses.depth_losses(*dense, alpha=config.alpha)}
+        if config.name == "log_vggt":
+            return {"camera": camera, **losses.depth_losses(*dense, alpha=config.alpha)}
+        assert confidence is not None
+        return {"camera": camera, **losses.distilled_depth_losses(*dense, confidence, alpha=config.alpha)}
     return {
         **vggt_losses.camera_losses(
             predictions.pose_encodings,

@@ -8,8 +8,11 @@ import jax.numpy as jnp
 import optax
 
 from logvggt_jax.training.config import OptimizerConfig, StageConfig
+from logvggt_jax.training.freezing import frozen_leaves
 
 Norm = Callable[[Any], jax.Array]
+# Group of the parameters that are frozen in a module of which others are trained.
+_FROZEN = "frozen"
 
 
 def learning_rate_schedule(config: OptimizerConfig, stages: tuple[StageConfig, ...]) -> optax.Schedule:
@@ -27,17 +30,26 @@ def make_optimizer(
     """AdamW without the learning rate: the training step multiplies what it returns with the rate of that step.
 
     `params` is a dict of modules (encoder, aggregator, heads). The gradient of each module is clipped to
-    `config.clip_norm` by itself, so that one head with an exploding gradient does not slow down the others. Modules
-    named in `frozen` do not move, and no moments are kept for them. `norm` is that of a tree of gradients, of which a
-    device may hold a part.
+    `config.clip_norm` by itself, so that one head with an exploding gradient does not slow down the others. Parameters
+    matched by the patterns `frozen` (see `freezing`) do not move, and no moments are kept for them. `norm` is that of a
+    tree of gradients, of which a device may hold a part.
 
     Weight decay applies to the kernels of linear layers and convolutions: not to biases, norms, gains of residual
     branches, special tokens and the position embedding, unless `config.decay_all`.
 
     Source: clipping by module as in VGGT's released trainer.
     """
-    labels = {module: jax.tree.map(lambda _, m=module: m, tree) for module, tree in params.items()}
-    groups = {module: optax.set_to_zero() if module in frozen else _module_optimizer(config, norm) for module in params}
+    still = frozen_leaves(params, frozen)
+    groups: dict[str, optax.GradientTransformation] = {}
+    labels: dict[str, Any] = {}
+    for module, leaves in still.items():
+        whole = all(jax.tree.leaves(leaves))
+        groups[module] = optax.set_to_zero() if whole else _module_optimizer(config, norm)
+        apart = module if whole else _FROZEN
+        labels[module] = jax.tree.map(lambda frozen, own=module, apart=apart: apart if frozen else own, leaves)
+    # A group that no parameter is in would only change what checkpoints hold.
+    if _FROZEN in jax.tree.leaves(labels):
+        groups[_FROZEN] = optax.set_to_zero()
     return optax.partition(groups, labels)
 
 

@@ -20,10 +20,11 @@ from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.data.feeding.batches import training_batches
 from logvggt_jax.errors import InputError, one_line, printable
 from logvggt_jax.model.logvggt import LogVGGT
-from logvggt_jax.training.batches import open_sources, stage_batches
+from logvggt_jax.training.batches import stage_batches
 from logvggt_jax.training.checkpoint_files import Position
 from logvggt_jax.training.checkpoints import RunCheckpoints
 from logvggt_jax.training.config import SourceConfig, StageConfig, TrainConfig
+from logvggt_jax.training.distillation import open_data
 from logvggt_jax.training.dry_run import step_costs
 from logvggt_jax.training.processes import any_process, check_shared
 from logvggt_jax.training.program import abstract_parameters, make_program
@@ -63,8 +64,7 @@ def preflight(config: TrainConfig, workdir: Path, mesh: Mesh, say: Callable[[str
     datasets: dict[str, Dataset] = {}
 
     def find_data() -> str:
-        validation = None if config.validation is None else config.validation.source
-        datasets.update(open_sources(config.data, validation))
+        datasets.update(open_data(config)[0])
         for stage in config.stages:
             stage_batches(datasets, config.data, stage, seed=config.seed).close()
         return f"{', '.join(datasets)}, with clips for every stage"

@@ -11,6 +11,7 @@ from logvggt_jax.config import ModelConfig
 from logvggt_jax.model.logvggt import LogVGGT, variable_shapes
 from logvggt_jax.model.parameters import stack_layers
 from logvggt_jax.training.config import TrainConfig
+from logvggt_jax.training.freezing import ENCODER, frozen_leaves
 from logvggt_jax.training.optimizer import learning_rate_schedule, make_optimizer
 from logvggt_jax.training.sharding import Layout, parameter_layout
 from logvggt_jax.training.state import TrainState, initial_state
@@ -50,12 +51,12 @@ class Program(NamedTuple):
 
 def make_program(model: LogVGGT, config: TrainConfig, params: Any, mesh: Mesh) -> Program:
     """The program for parameters of such shapes."""
-    frozen = ("encoder",) if config.model.encoder.frozen else ()
+    frozen = (*((ENCODER,) if config.model.encoder.frozen else ()), *config.optimizer.frozen)
     layout = parameter_layout(params, mesh, shard=config.shard_parameters)
     optimizer = make_optimizer(config.optimizer, params, frozen=frozen, norm=layout.norm)
     schedule = learning_rate_schedule(config.optimizer, config.stages)
     step = make_train_step(
-        make_loss_terms(model, config.loss),
+        make_loss_terms(model, config.loss, frozen=frozen),
         config.loss,
         optimizer,
         schedule,
@@ -63,5 +64,6 @@ def make_program(model: LogVGGT, config: TrainConfig, params: Any, mesh: Mesh) -
         accumulate=config.accumulate,
         average=config.average,
     )
-    averaged = () if config.average is None else tuple(module for module in params if module not in frozen)
+    still = {module: all(jax.tree.leaves(tree)) for module, tree in frozen_leaves(params, frozen).items()}
+    averaged = () if config.average is None else tuple(module for module in params if not still[module])
     return Program(layout, optimizer, step, averaged)

@@ -91,7 +91,7 @@ class RunTimes:
     def remaining_seconds(self, step: int, end: int | None = None, *, compilations: int = 0) -> float:
         """Seconds until step `end` (None: the last of all), if frames, validations and saves take as long as so far.
 
-        `compilations` are still to be made.
+        The steps of `compilations` more stages are still to be compiled.
         """
         config = self._config
         end = config.total_steps if end is None else end
@@ -164,6 +164,15 @@ def progress_line(
         parts.append(f"memory {memory / 2**30:.1f} GiB")
     left = f"{duration(stage_seconds)} left of the stage, {duration(run_seconds)} of the run"
     return f"step {step}/{total} {stage}: {', '.join(parts)}, {left}"
+
+
+def goodput(productive: float, wall: float) -> str:
+    """Productive seconds as a part of those since the first start, in words; the latter are of a clock that people and
+    machines set."""
+    done = f"{duration(productive)} of training"
+    if wall < productive or wall <= 0:
+        return f"goodput not known, {done} in less time: the clock was set back since the first start"
+    return f"goodput {productive / wall:.0%}: {done} in {duration(wall)} since the first start"
 
 
 def duration(seconds: float) -> str:

@@ -11,6 +11,7 @@ from jax.sharding import PartitionSpec as P
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.training.clip_errors import clip_errors
 from logvggt_jax.training.config import LossConfig
+from logvggt_jax.training.freezing import without_gradient
 from logvggt_jax.training.losses import Mean
 from logvggt_jax.training.normalization import Targets, normalize_clips
 from logvggt_jax.training.objective import loss_terms, total_loss
@@ -24,20 +25,22 @@ Metrics = dict[str, jax.Array]
 LossTerms = Callable[[Any, Batch], tuple[dict[str, Mean], dict[str, Mean], jax.Array]]
 
 
-def make_loss_terms(model: LogVGGT, config: LossConfig) -> LossTerms:
+def make_loss_terms(model: LogVGGT, config: LossConfig, *, frozen: tuple[str, ...] = ()) -> LossTerms:
     """A function (parameters, one device's share of a batch) -> (terms of the objective, errors to be logged, bool [b]
     which clips are finite in predictions and targets).
 
     Both are sums and counts over that share alone, so the function holds no communication of its own and can be
-    differentiated on each device by itself.
+    differentiated on each device by itself. What the patterns `frozen` match has no gradient.
     """
 
     def terms(params: Any, batch: Batch) -> tuple[dict[str, Mean], dict[str, Mean], jax.Array]:
         frame_mask = batch.get("frame_mask")
-        predictions = model.apply({"params": params}, batch["images"], frame_mask, remat=True)
+        variables = {"params": without_gradient(params, frozen)}
+        predictions = model.apply(variables, batch["images"], frame_mask, remat=True)
         targets = normalize_clips(batch["depth"], batch["intrinsics"], batch["extrinsics"], frame_mask=frame_mask)
         seen: Any = jax.lax.stop_gradient(predictions)
-        return loss_terms(predictions, targets, config), clip_errors(seen, targets), _finite_clips(seen, targets)
+        means = loss_terms(predictions, targets, config, batch.get("confidence"))
+        return means, clip_errors(seen, targets), _finite_clips(seen, targets)
 
     return terms
 
@@ -111,7 +114,8 @@ def make_train_step(
     mesh.
 
     A batch holds `images` uint8 [B, T, H, W, 3], `depth` [B, T, H, W], `intrinsics` [B, T, 3, 3], `extrinsics`
-    [B, T, 4, 4] and optionally `frame_mask` bool [B, T]. Metrics are float32 scalars, equal on all devices. A
+    [B, T, 4, 4], optionally `frame_mask` bool [B, T], and for a distillation the teacher's `confidence` [B, T, H, W].
+    Metrics are float32 scalars, equal on all devices. A
     non-finite loss or gradient leaves parameters and moments as they were and is counted in the state; where it comes
     from predictions or targets, `finite clips`, bool [B] and split as the batch is, says of which clips.
 

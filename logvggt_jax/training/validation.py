@@ -1,11 +1,13 @@
 """Accuracy on a few fixed clips that training never sees."""
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from jax.sharding import PartitionSpec as P
 
+from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.data.feeding.transforms import fit
 from logvggt_jax.errors import InputError
 from logvggt_jax.metrics.depth import depth_metrics
@@ -13,63 +15,105 @@ from logvggt_jax.metrics.pose import pose_accuracy, relative_pose_errors
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.training.batches import open_source
 from logvggt_jax.training.config import ValidationConfig
+from logvggt_jax.training.pictures import clip_picture, trajectory_picture
 from logvggt_jax.training.sharding import DATA_AXIS, Layout, replicated, split
 from logvggt_jax.types import Frames
+
+
+class Judgement(NamedTuple):
+    """What validation finds.
+
+    Attributes:
+      values: means over the clips of all sources, `validation/abs_rel`, and where there are several over those of each,
+        `validation/SOURCE/abs_rel`. Depth is judged after median alignment, poses by errors over all pairs, in degrees.
+        `constant_abs_rel` and `identity_rotation` are what a constant depth and a motionless camera get.
+      pictures: of the first clip of each source, [h, w, 3] uint8 RGB.
+    """
+
+    values: dict[str, float]
+    pictures: dict[str, np.ndarray]
 
 
 class Validation:
     """Fixed clips, read once, and the jitted model that is tried on them.
 
-    Clip i shows frames 0, stride, 2 stride, … of the i-th sequence that is long enough.
+    Clip i of a source shows frames start, start + stride, … of a sequence that is long enough. As many sequences as
+    there are have clips; those of one sequence start evenly spaced, the first one at frame 0. `datasets` take the place
+    of the sources that the configuration names.
     """
 
-    def __init__(self, model: LogVGGT, config: ValidationConfig, layout: Layout) -> None:
+    def __init__(
+        self, model: LogVGGT, config: ValidationConfig, layout: Layout, datasets: Sequence[Dataset] = ()
+    ) -> None:
         mesh = layout.mesh
-        self._clips = _read_clips(config)
+        self._names = [source.name for source in config.sources]
+        opened = datasets or [open_source(source) for source in config.sources]
+        each = zip(self._names, opened, strict=True)
+        self._clips = [clip for name, dataset in each for clip in _read_clips(name, dataset, config)]
+        self._each = config.num_clips
+        firsts = np.arange(0, len(self._clips), self._each)
         self._without_learning = [_baselines(clip) for clip in self._clips]
         # The last clip again, as often as the devices need it for equal shares.
         shown = [*self._clips, *self._clips[-1:] * (-len(self._clips) % mesh.size)]
         images = np.stack([clip.images for clip in shown])
         self._images = jax.make_array_from_callback(images.shape, split(mesh), lambda index: images[index])
 
-        def predict(params: Any, images: jax.Array) -> tuple[jax.Array, jax.Array]:
+        def predict(params: Any, images: jax.Array) -> tuple[jax.Array, ...]:
             predictions = model.apply({"params": layout.in_parts(params)}, images)
-            return predictions.depth, predictions.extrinsics
+            return predictions.depth, predictions.extrinsics, predictions.depth_confidence
 
-        def on_all_devices(params: Any, images: jax.Array) -> tuple[jax.Array, jax.Array]:
+        def on_all_devices(params: Any, images: jax.Array) -> tuple[jax.Array, ...]:
             specs = (layout.specs(params), P(DATA_AXIS))
-            return jax.shard_map(predict, mesh=mesh, in_specs=specs, out_specs=P(DATA_AXIS), check_vma=False)(
-                params, images
-            )
+            depth, extrinsics, confidence = jax.shard_map(
+                predict, mesh=mesh, in_specs=specs, out_specs=P(DATA_AXIS), check_vma=False
+            )(params, images)
+            return depth, extrinsics, confidence[firsts]
 
         self._predict = jax.jit(on_all_devices, out_shardings=replicated(mesh))
 
-    def __call__(self, params: Any) -> dict[str, float]:
-        """Means over the clips: depth after median alignment, pose errors over all pairs in degrees.
-
-        `constant_abs_rel` and `identity_rotation` are what a constant depth and a motionless camera get.
-        """
+    def __call__(self, params: Any) -> Judgement:
+        """Judges these parameters."""
         count = len(self._clips)
-        depth, extrinsics = jax.device_get(self._predict(params, self._images))
+        depth, extrinsics, confidence = jax.device_get(self._predict(params, self._images))
         results = [
             {**_clip_metrics(*each), **known}
             for *each, known in zip(depth[:count], extrinsics[:count], self._clips, self._without_learning, strict=True)
         ]
-        means = {name: float(np.mean([result[name] for result in results])) for name in results[0]}
-        means["rotation_over_identity"] = means["rotation"] / max(means["identity_rotation"], 1e-6)
-        return {f"validation/{name}": value for name, value in means.items()}
+        values = _means(results, "validation")
+        pictures = {}
+        for number, name in enumerate(self._names):
+            first = number * self._each
+            if len(self._names) > 1:
+                values |= _means(results[first : first + self._each], f"validation/{name}")
+            clip = self._clips[first]
+            pictures[f"validation/{name}/clip"] = clip_picture(clip, depth[first], confidence[number])
+            pictures[f"validation/{name}/trajectory"] = trajectory_picture(extrinsics[first], clip.extrinsics)
+        return Judgement(values, pictures)
 
 
-def _read_clips(config: ValidationConfig) -> list[Frames]:
-    dataset = open_source(config.source)
-    indices = [i * config.stride for i in range(config.clip_length)]
-    names = [name for name in dataset.sequences if dataset.num_frames(name) > indices[-1]]
-    if len(names) < config.num_clips:
+def _means(results: list[dict[str, float]], prefix: str) -> dict[str, float]:
+    means = {name: float(np.mean([result[name] for result in results])) for name in results[0]}
+    means["rotation_over_identity"] = means["rotation"] / max(means["identity_rotation"], 1e-6)
+    return {f"{prefix}/{name}": value for name, value in means.items()}
+
+
+def _read_clips(name: str, dataset: Dataset, config: ValidationConfig) -> list[Frames]:
+    span = (config.clip_length - 1) * config.stride + 1
+    # Starts that a sequence has room for.
+    room = {sequence: dataset.num_frames(sequence) - span + 1 for sequence in dataset.sequences}
+    sequences = [sequence for sequence in dataset.sequences if room[sequence] > 0][: config.num_clips]
+    counts = {each: len(range(i, config.num_clips, len(sequences))) for i, each in enumerate(sequences)}
+    if not sequences or any(counts[each] > room[each] for each in sequences):
         raise InputError(
-            f"validation: data set {config.source.name!r} has {len(names)} sequences of at least {indices[-1] + 1} "
-            f"frames, num_clips={config.num_clips} needs more; lower num_clips, clip_length or stride"
+            f"validation: data set {name!r} has {len(sequences)} sequences of at least {span} frames, "
+            f"num_clips={config.num_clips} needs more or longer ones; lower num_clips, clip_length or stride"
         )
-    return [fit(dataset.read(name, indices), config.size) for name in names[: config.num_clips]]
+    clips = []
+    for sequence in sequences:
+        for start in np.linspace(0, room[sequence] - 1, counts[sequence]).round().astype(int):
+            frames = dataset.read(sequence, range(start, start + span, config.stride))
+            clips.append(fit(frames, config.size))
+    return clips
 
 
 def _clip_metrics(depth: np.ndarray, extrinsics: np.ndarray, clip: Frames) -> dict[str, float]:

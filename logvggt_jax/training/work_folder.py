@@ -13,11 +13,13 @@ def remove_scratch(workdir: Path) -> None:
 
     A model that was moved aside for a new one which never came takes its place again. The caller has the folder's lock.
     """
-    model, checkpoints = workdir / "model", workdir / "checkpoints"
-    aside = sorted(workdir.glob(".model.*.old"), key=lambda path: path.stat().st_mtime)
-    with disk_errors(model):
-        if aside and not model.exists():
-            aside.pop().rename(model)
-    half = [*workdir.glob("model.*.partial"), *checkpoints.glob("*.partial"), *checkpoints.glob(".*.old")]
-    for path in (*aside, *half):
+    checkpoints = workdir / "checkpoints"
+    half = [*checkpoints.glob("*.partial"), *checkpoints.glob(".*.old")]
+    for model in (workdir / "model", workdir / "best"):
+        aside = sorted(workdir.glob(f".{model.name}.*.old"), key=lambda path: path.stat().st_mtime)
+        with disk_errors(model):
+            if aside and not model.exists():
+                aside.pop().rename(model)
+        half += [*aside, *workdir.glob(f"{model.name}.*.partial")]
+    for path in half:
         shutil.rmtree(path, ignore_errors=True)

@@ -118,7 +118,8 @@ def check_destination(path: Path) -> None:
 
 
 def load_model(path: str | Path) -> tuple[LogVGGT, dict[str, Any]]:
-    """The model in a folder and its variables {"params": …}, float32, on the default device.
+    """The model in a folder and its variables {"params": …}, float32, on the default device until put elsewhere: they
+    are committed to none, so that a program over a mesh takes them as they are.
 
     `path` is a folder of `save_model`, `logvggt convert` or training (`<workdir>/model`, or `<workdir>` for short), or
     the name of a model that ships with the package: `rooms`, unless a model folder of that name is here.
@@ -142,7 +143,7 @@ def load_model(path: str | Path) -> tuple[LogVGGT, dict[str, Any]]:
     params = restore(path, parameter_shapes(config))
     verify_digests(params, description["digests"], str(path))
     check_finite(params, str(path))
-    return model, {"params": params}
+    return model, {"params": jax.device_put(params)}
 
 
 def read_provenance(path_or_repo: str | Path) -> Provenance:
@@ -282,7 +283,7 @@ def _checkpointer() -> ocp.StandardCheckpointer:
 
 
 def _restore(folder: Path, target: Any) -> Any:
-    """Parameters in the shapes and placement of `target`, after a check that these are the stored shapes."""
+    """Parameters in the shapes of `target` on the host, after a check that these are the stored shapes."""
     path = folder / "params"
     if not path.is_dir():
         raise MissingInput(f"{path}: the parameters are missing; {MEND}")
@@ -294,7 +295,9 @@ def _restore(folder: Path, target: Any) -> Any:
             raise FileNotFoundError("Orbax's description of the parameters is missing")
         if wrong := first_misfit(stored.tree, target, "the configuration in config.json"):
             raise InputError(f"{path}: {wrong}; the two belong to different models")
-        return read_arrays(path, target)
+        # Arrays of one entry, seen in their shape: Orbax reads to where its target is, and gives numpy for numpy.
+        on_host = jax.tree.map(lambda leaf: np.broadcast_to(np.zeros((), leaf.dtype), leaf.shape), target)
+        return read_arrays(path, on_host)
 
     return read_with_orbax(read, f"{path}:", MEND)
 
@@ -304,7 +307,7 @@ def _restore_rounded(folder: Path, target: Any) -> Any:
     stored = read_parameters(folder)
     if wrong := first_misfit(stored, target, "the configuration in config.json"):
         raise InputError(f"{folder / PARAMETERS_FILE}: {wrong}; the two belong to different models")
-    leaves = [jax.device_put(stored[name], leaf.sharding) for name, leaf in named_leaves(target)]
+    leaves = [stored[name] for name, _ in named_leaves(target)]
     return jax.tree.unflatten(jax.tree.structure(target), leaves)
 
 

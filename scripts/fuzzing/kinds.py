@@ -9,6 +9,8 @@ from __future__ import annotations
 import dataclasses
 import functools
 import importlib
+import json
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -56,6 +58,18 @@ def _read_dataset(name: str, root: Path, output: Path) -> None:
             raise Nonsense(f"read without complaint: {error}") from error
 
 
+def _write_packed(root: Path) -> None:
+    from logvggt_jax.data.packed.pack import pack
+
+    _write_dataset("seven_scenes", root / "originals")
+    pack("seven_scenes", root / "originals", root / "packed")
+    shutil.rmtree(root / "originals")
+
+
+def _read_packed(root: Path, output: Path) -> None:
+    _read_dataset("seven_scenes", root / "packed", output)
+
+
 def _pictures() -> np.ndarray:
     """[N, 48, 64, 3] uint8, smooth, no two alike."""
     v, u = np.mgrid[0:48, 0:64]
@@ -99,7 +113,7 @@ def _write_result(root: Path) -> None:
 
 def _read_result(root: Path, output: Path) -> None:
     from logvggt_jax.geometry import camera_centres, is_rotation, matrix_to_quaternion
-    from logvggt_jax.reconstruction.exporters import EXPORTERS
+    from logvggt_jax.reconstruction.exporters import export
     from logvggt_jax.reconstruction.exporters.tum import read_trajectory
     from logvggt_jax.reconstruction.point_cloud import read_points
     from logvggt_jax.reconstruction.result import Reconstruction
@@ -117,10 +131,9 @@ def _read_result(root: Path, output: Path) -> None:
         maps = result.depth_and_confidence(index)
         _expect(all(each.shape == result.depth_size for each in maps), "depth has another size than cameras")
     # What is written from it can be read.
-    for name, export in EXPORTERS.items():
-        export(result, output / name, progress=False)
-    read_points(output / "ply")
-    read_trajectory(output / "tum")
+    export(result, ["ply", "tum", "kitti", "euroc", "nerfstudio", "depth-png", "depth-npz"], output, progress=False)
+    read_points(output / "points.ply")
+    read_trajectory(output / "tum.txt")
 
 
 def _write_trajectory(root: Path) -> None:
@@ -138,6 +151,24 @@ def _read_trajectory(root: Path, output: Path) -> None:
     timestamps, extrinsics = read_trajectory(root / "trajectory.txt")
     _expect(np.isfinite(timestamps).all(), "time stamps are not finite")
     _expect_finite("poses", extrinsics)
+    _expect(is_rotation(extrinsics[:, :3, :3]).all(), "rotations are none")
+
+
+def _write_transforms(root: Path) -> None:
+    frame = {"w": 64, "h": 48, "fl_x": 50.0, "fl_y": 50.0, "cx": 32.0, "cy": 24.0}
+    poses = np.tile(np.eye(4), (6, 1, 1))
+    poses[:, :3, 3] = np.random.default_rng(0).normal(size=(6, 3))
+    frames = [{"file_path": f"images/{i}.jpg", "transform_matrix": pose.tolist()} for i, pose in enumerate(poses)]
+    (root / "transforms.json").write_text(json.dumps({**frame, "frames": frames}))
+
+
+def _read_transforms(root: Path, output: Path) -> None:
+    from logvggt_jax.geometry import is_rotation
+    from logvggt_jax.reconstruction.fusion.pose_files import read_poses
+
+    poses = read_poses(root / "transforms.json")
+    extrinsics = np.stack([pose.extrinsics for pose in poses])
+    _expect_finite("poses", extrinsics, *(pose.intrinsics for pose in poses if pose.intrinsics is not None))
     _expect(is_rotation(extrinsics[:, :3, :3]).all(), "rotations are none")
 
 
@@ -255,6 +286,7 @@ KINDS = (
         Kind(name, functools.partial(_write_dataset, name), functools.partial(_read_dataset, name))
         for name in _datasets()
     ),
+    Kind("packed", _write_packed, _read_packed),
     Kind("images", _write_images, functools.partial(_read_source, "")),
     Kind("video", _write_video, functools.partial(_read_source, "walk.mp4")),
     Kind("safetensors", _write_safetensors, functools.partial(_read_checkpoint, "model.safetensors")),
@@ -263,6 +295,7 @@ KINDS = (
     Kind("shipped", functools.partial(_write_model, True), functools.partial(_read_model, True)),
     Kind("result", _write_result, _read_result),
     Kind("trajectory", _write_trajectory, _read_trajectory),
+    Kind("transforms", _write_transforms, _read_transforms),
     Kind("evaluation", _write_evaluation, _read_evaluation),
 )
 """All kinds, in the order in which cases take turns."""

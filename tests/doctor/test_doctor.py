@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.metadata
 import json
 import subprocess
@@ -14,16 +15,51 @@ from types import SimpleNamespace
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from logvggt_jax.cli import main
-from logvggt_jax.doctor import environment, examination, parity
+from logvggt_jax import LogVGGT, ModelConfig, Predictions
+from logvggt_jax.cli import MODES, main
+from logvggt_jax.doctor import environment, examination, methods, parity, training
 from logvggt_jax.doctor.finding import Finding
+from logvggt_jax.doctor.subject import Subject, tiny_config
+from logvggt_jax.geometry import decode_poses
+from logvggt_jax.streaming import METHODS
+
+
+@dataclasses.dataclass(frozen=True)
+class QuickModel:
+    """Depth and poses from two parameters of the real model, so that a training step of all of them compiles soon."""
+
+    config: ModelConfig
+
+    def apply(self, variables: Any, images: jax.Array, frame_mask: Any = None, *, remat: bool = False) -> Predictions:
+        params, pixels = variables["params"], images.astype(jnp.float32) / 255.0
+        gain = jax.tree.leaves(params["depth_head"])[0].mean()
+        pose = (
+            jnp.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.8, 1.0]) + jax.tree.leaves(params["camera_head"])[0].mean()
+        )
+        poses = pose * (1.0 + pixels.mean((2, 3, 4)))[..., None]
+        depth = jnp.exp(gain * pixels.mean(-1))
+        extrinsics, intrinsics = decode_poses(poses, images.shape[2:4])
+        return Predictions(
+            pose_encoding=poses,
+            pose_encodings=poses[:, :, None],
+            extrinsics=extrinsics,
+            intrinsics=intrinsics,
+            depth=depth,
+            depth_confidence=1.0 + depth,
+            camera_tokens=poses,
+            register_tokens=poses[:, :, None],
+        )
 
 
 @pytest.mark.parametrize("part", [part for part in examination.SHARES if part != "environment"])
-def test_every_part_finds_a_cpu_sound(part: str) -> None:
+def test_every_part_finds_a_cpu_sound(part: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    # The real model's own step is compiled by the test of `train.py`; this one has its parameters, loss and optimiser.
+    real = training.make_loss_terms
+    monkeypatch.setattr(training, "make_loss_terms", lambda model, loss: real(QuickModel(model.config), loss))
     findings = list(examination.part_findings(part, tiny=True, quick=True))
     assert {finding.part for finding in findings} == {part}
     assert not [finding for finding in findings if finding.ok is False]
@@ -36,6 +72,41 @@ def test_every_part_finds_a_cpu_sound(part: str) -> None:
         "whole": {"rate, files to files", "processor time a frame"},
     }
     assert wanted[part] <= names
+
+
+@pytest.mark.parametrize(("method", "rates"), [("rolling", 2), ("chunks", 1)])
+def test_a_method_is_timed_and_on_a_cpu_compared_with_nothing(method: str, rates: int) -> None:
+    findings = list(examination.part_findings(method, tiny=True, quick=True))
+    assert {finding.part for finding in findings} == {method}
+    found = [finding for finding in findings if finding.unit == "frames/s"]
+    assert len(found) == rates and all(isinstance(each.value, float) and each.value > 0 for each in found)
+    assert all(finding.ok is None and not finding.note for finding in findings)
+
+
+def test_rates_are_judged_where_the_originals_were_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    large = Subject(LogVGGT(tiny_config()), (392, 518), tiny=False, quick=False)
+
+    def judged(rate: float, frames: int, kind: str) -> Finding:
+        monkeypatch.setattr(jax, "devices", lambda: [SimpleNamespace(device_kind=kind)])
+        return methods._rate("causal", "rate", rate, frames, large)
+
+    last, h100 = methods.STREAMED - 1, "NVIDIA H100 80GB HBM3"
+    assert [judged(rate, last, h100).ok for rate in (4.9, 5.1)] == [False, True]
+    assert "2.00 x the 10.9 of StreamVGGT's PyTorch code" in judged(21.8, 0, h100).note
+    other = judged(4.9, last, "NVIDIA A10")
+    assert other.ok is None and "0.98 x the 5.0" in other.note
+    assert methods._rate("pruned", "rate", 1.0, 0, large) == Finding("pruned", "rate", 1.0, "frames/s")
+
+
+def test_every_method_has_a_part_and_time_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: dict[str, float] = {}
+    monkeypatch.setattr(
+        examination, "_in_own_process", lambda part, limit, **_: asked.update({part: limit}) or iter(())
+    )
+    assert main(["doctor", "--methods"]) == 0
+    assert list(asked) == list(MODES) and set(METHODS) == set(MODES)
+    shares = [examination.METHOD_SHARE[1] * (i + 1) for i in range(len(MODES))]
+    assert list(asked.values()) == pytest.approx(shares, abs=1), "what the ones before left is theirs"
 
 
 def test_a_machine_that_computes_otherwise_is_found(monkeypatch: pytest.MonkeyPatch) -> None:

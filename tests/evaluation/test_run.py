@@ -12,8 +12,11 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from logvggt_jax import LogVGGT
 from logvggt_jax.config import ModelConfig
 from logvggt_jax.errors import InputError, OutputExists
+from logvggt_jax.evaluation import run as run_module
+from logvggt_jax.evaluation.methods.method import Checkpoint
 from logvggt_jax.evaluation.report.report import print_report
 from logvggt_jax.evaluation.run import run_evaluation
 from logvggt_jax.weights import Provenance, save_model
@@ -117,6 +120,20 @@ def test_the_model_and_all_baselines_make_a_table(
     rows = list(csv.reader((output / "tables" / "01-depth-clips-of-4-frames.csv").read_text().splitlines()))
     assert rows[0][:2] == ["method", "Abs Rel (scale) ↓"]
     assert rows[1][:2] == ["LoG-VGGT", shown]
+
+
+def test_weights_in_methods_that_are_not_theirs_are_warned_of_once(
+    small_config: ModelConfig, small_variables: dict[str, Any]
+) -> None:
+    """Plain VGGT is a reference row of every run, whose line in the report says it."""
+    checkpoint = Checkpoint(LogVGGT(small_config), small_variables, "digest")
+    with pytest.warns(UserWarning, match=r"trained for windows, not for causal, pruned: expect worse") as caught:
+        run_module._warn_of_unsuited("windows", ("windows", "causal", "offline", "pruned"))
+    assert len(caught) == 1
+    run_module._warn_of_unsuited("windows", ("windows", "offline", "chunks"))
+    run_module._warn_of_unsuited(None, ("causal",))
+    assert "as they have never seen it" in run_module._row("causal", checkpoint, None, "windows").knows
+    assert run_module._row("causal", checkpoint, None, "causal").knows.startswith("its training; each frame sees")
 
 
 def test_only_a_new_folder_or_an_evaluations_is_written_to(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import pytest
 from logvggt_jax.geometry import (
     Similarity,
     as_matrix,
+    pose_similarity,
     quaternion_to_matrix,
     robust_similarity,
     transform_points,
@@ -80,3 +81,24 @@ def test_cameras_move_with_their_world() -> None:
     seen, before = transform_points(moved, TRUTH.apply(points())), transform_points(pose, points())
     np.testing.assert_allclose(seen, TRUTH.scale * before, atol=1e-12)
     np.testing.assert_allclose(TRUTH.apply_to_extrinsics(as_matrix(pose)), as_matrix(moved), atol=1e-12)
+
+
+def cameras(centres: np.ndarray) -> np.ndarray:
+    rotations = quaternion_to_matrix(np.random.default_rng(1).normal(size=(len(centres), 4)))
+    return np.concatenate([rotations, -(rotations @ centres[:, :, None])], axis=2)
+
+
+@pytest.mark.parametrize("straight", [False, True])
+def test_cameras_give_the_transform_even_on_a_straight_path_and_with_wrong_ones_among_them(straight: bool) -> None:
+    source = cameras(np.arange(30.0)[:, None] * [1.0, 0.5, 0.2] if straight else points(30))
+    target = TRUTH.apply_to_extrinsics(source)
+    assert_same(pose_similarity(source, target), TRUTH, 1e-8)
+    target[::4] = cameras(5 * points(30)[::4])
+    assert_same(pose_similarity(source, target), TRUTH, 1e-4)
+
+
+def test_cameras_at_one_place_have_no_scale() -> None:
+    with pytest.raises(ValueError, match="all at one place"):
+        pose_similarity(cameras(np.ones((5, 3))), cameras(points(5)))
+    with pytest.raises(ValueError, match="at least 2"):
+        pose_similarity(cameras(points(1)), cameras(points(1)))

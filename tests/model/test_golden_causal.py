@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import dataclasses
 import functools
 from typing import Any
 
@@ -12,9 +14,11 @@ import numpy as np
 import pytest
 from golden_methods import POSES, TOKENS, Golden, assert_depth
 
-from logvggt_jax.model.frame_by_frame import FrameByFrame
+from logvggt_jax.model.aggregator import WindowTokens
+from logvggt_jax.model.frame_by_frame import CausalMask, FrameByFrame
 from logvggt_jax.model.key_value_cache import CameraMemory, GrowingCache
 from logvggt_jax.model.memory import Memory
+from logvggt_jax.model.rope import apply_rope, rope_table
 from logvggt_jax.model.windows import Windows
 from logvggt_jax.streaming.causal import CausalSettings, KeepAll
 from logvggt_jax.streaming.frame_session import camera_memory
@@ -27,7 +31,8 @@ def golden(golden_dir) -> Golden:
 
 @pytest.fixture(scope="module")
 def streamed(golden: Golden) -> dict[str, Any]:
-    """Tokens of all frames at the key layers, depth, poses of both camera caches, and the caches at the end."""
+    """Tokens of all frames at the stored layers, depth, poses of both camera caches, lengths, and the caches at the
+    end."""
     images = golden["images_u8"]
     frames, tokens = len(images), golden.settings["tokens_per_frame"]
     keeping = KeepAll(CausalSettings(first_capacity=frames), golden.config.camera_head.iterations)
@@ -37,22 +42,42 @@ def streamed(golden: Golden) -> dict[str, Any]:
     found = []
     for index, image in enumerate(images):
         blocks, per_round, single, numbers = step(blocks, per_round, single, image, jnp.array([index == 0]))
-        found.append(jax.device_get(numbers))
+        lengths = {
+            "cache_len": [layer.length for layer in blocks.layers],
+            "camera_cache_len": [cache.length for cache in single.trunk.shared.layers],
+        }
+        found.append(jax.device_get({**numbers, **{name: np.stack(each)[None] for name, each in lengths.items()}}))
     stacked = jax.tree.map(lambda *x: np.concatenate(x), *found)
     return {**stacked, "blocks": blocks, "per_round": per_round, "single": single}
+
+
+def _stored_layers(golden: Golden, form: str) -> list[int]:
+    """The layers whose tokens are stored, those of the depth head and some besides."""
+    return sorted(int(name.rsplit("_", 1)[1]) for name in golden.arrays if name.startswith(f"{form}_tokens_"))
+
+
+def _tokens(golden: Golden, form: str, *given: Any) -> tuple[WindowTokens, WindowTokens, Any]:
+    """Tokens at all stored layers, those of the depth head's layers, and the memory."""
+    layers, sizes = _stored_layers(golden, form), copy.copy(golden.config.aggregator)
+    # A configuration has the four that the depth head reads; the aggregator gives as many as it is asked for.
+    object.__setattr__(sizes, "key_layers", tuple(layers))
+    parts = FrameByFrame(dataclasses.replace(golden.config, aggregator=sizes))
+    tokens, memory = parts.tokens(golden.variables, *given)
+    chosen = np.array([layers.index(layer) for layer in golden.config.aggregator.key_layers])
+    return tokens, tokens._replace(key=tokens.key[:, chosen]), memory
 
 
 def _step(
     golden: Golden, blocks: Memory, per_round: CameraMemory, single: CameraMemory, image: jax.Array, first: jax.Array
 ) -> tuple[Memory, CameraMemory, CameraMemory, dict[str, jax.Array]]:
     parts, images = FrameByFrame(golden.config), image[None, None]
-    tokens, blocks = parts.tokens(golden.variables, blocks, images, first)
+    stored, tokens, blocks = _tokens(golden, "stream", blocks, images, first)
     mask = jnp.ones((1, 1), bool)
     out = Windows(golden.config).decode_dense(golden.variables, tokens, mask, images.shape[2:4])
     per_round, poses = parts.locate(golden.variables, per_round, out.camera_tokens, out.register_tokens)
     single, quirky = parts.locate(golden.variables, single, out.camera_tokens, out.register_tokens)
     numbers = {
-        "tokens": jnp.moveaxis(tokens.key[0], 1, 0),
+        "tokens": jnp.moveaxis(stored.key[0], 1, 0),
         "depth": out.depth[0],
         "depth_conf": out.depth_confidence[0],
     }
@@ -60,7 +85,7 @@ def _step(
 
 
 def test_tokens_of_a_stream(golden: Golden, streamed: dict[str, Any]) -> None:
-    for place, layer in enumerate(golden.config.aggregator.key_layers):
+    for place, layer in enumerate(_stored_layers(golden, "stream")):
         expected = golden[f"stream_tokens_{layer:02d}"]
         np.testing.assert_allclose(streamed["tokens"][:, place], expected, rtol=0, atol=TOKENS, err_msg=str(layer))
 
@@ -73,36 +98,57 @@ def test_depth_of_a_stream(golden: Golden, streamed: dict[str, Any]) -> None:
 def test_poses_with_a_cache_a_round_are_the_mask_forms(golden: Golden, streamed: dict[str, Any]) -> None:
     found = np.moveaxis(streamed["per_round_poses"], 1, 0)
     np.testing.assert_allclose(found, golden["mask_pose_enc"], rtol=0, atol=POSES)
+    np.testing.assert_allclose(found[0], golden["camera_one_round_pose_enc"], rtol=0, atol=POSES)
 
 
 def test_poses_with_one_cache_are_the_published_ones(golden: Golden, streamed: dict[str, Any]) -> None:
     found = np.moveaxis(streamed["single_poses"], 1, 0)
     np.testing.assert_allclose(found, golden["stream_pose_enc"], rtol=0, atol=POSES)
-    assert np.abs(found - golden["mask_pose_enc"]).max() > 1e-3, "the two caches would not be told apart"
+    quirk = np.abs(found - np.moveaxis(streamed["per_round_poses"], 1, 0)).max(-1)
+    np.testing.assert_allclose(quirk, golden["pose_stream_minus_mask"], rtol=0, atol=2 * POSES)
+    assert quirk.max() > 1e-3, "the two caches would not be told apart"
 
 
 def test_caches_hold_what_the_original_has(golden: Golden, streamed: dict[str, Any]) -> None:
-    for layer in streamed["blocks"].layers:
-        assert int(layer.length) == golden["stream_cache_len"][-1]
-    for cache in streamed["single"].trunk.shared.layers:
-        assert int(cache.length) == golden["stream_camera_cache_len"][-1]
+    for name in ("cache_len", "camera_cache_len"):
+        assert (streamed[name] == golden[f"stream_{name}"][:, None]).all()
+    # In round r a camera token sees what the frames before left, and its own entries up to that round's.
+    before = np.concatenate([[0], streamed["camera_cache_len"][:-1, 0]])
+    attended = before + 1 + np.arange(golden.config.camera_head.iterations)[:, None]
+    np.testing.assert_array_equal(attended, golden["camera_keys_attended"])
     for cache in streamed["per_round"].trunk.each.layers:
         assert set(cache.length.tolist()) == {len(golden["images_u8"])}
-    tokens = golden.settings["tokens_per_frame"]
+    tokens, images = golden.settings["tokens_per_frame"], golden["images_u8"]
+    grid = (images.shape[1] // 14, images.shape[2] // 14)
     for index, layer in enumerate(golden["cache_layers"]):
-        value = np.asarray(streamed["blocks"].layers[layer].value[0])
+        cache, raw = streamed["blocks"].layers[layer], golden["cache_key_raw"][index]
+        norm = golden.variables["params"]["aggregator"][f"global_block_{layer}"]["attention"]["key_norm"]
+        special = tokens - grid[0] * grid[1]
+        rope = rope_table(grid, special, raw.shape[-1], golden.config.aggregator.rope_base)
         for place, frame in enumerate(golden["cache_frames"]):
-            found = np.swapaxes(value[frame * tokens : (frame + 1) * tokens], 0, 1)
-            np.testing.assert_allclose(found, golden["cache_value"][index, :, place], rtol=0, atol=TOKENS)
+            span = slice(frame * tokens, (frame + 1) * tokens)
+            value = np.swapaxes(np.asarray(cache.value[0, span]), 0, 1)
+            np.testing.assert_allclose(value, golden["cache_value"][index, :, place], rtol=0, atol=TOKENS)
+            # The original keeps keys as they are before norm and rotation.
+            key = np.swapaxes(raw[:, place], 0, 1)
+            key = (key - key.mean(-1, keepdims=True)) / np.sqrt(key.var(-1, keepdims=True) + 1e-5)
+            rotated = apply_rope(jnp.asarray(key * norm["scale"] + norm["bias"])[None], rope)[0]
+            np.testing.assert_allclose(cache.key[0, span], rotated, rtol=0, atol=TOKENS)
 
 
 def test_the_mask_form(golden: Golden) -> None:
     """One call over the whole sequence: tokens, depth and poses of training under the causal mask."""
     images = golden["images_u8"][None]
-    out, poses = jax.device_get(jax.jit(FrameByFrame(golden.config).whole)(golden.variables, images))
-    special = golden["mask_tokens_23"][:, :5]
-    np.testing.assert_allclose(out.camera_tokens[0], special[:, 0], rtol=0, atol=TOKENS)
-    np.testing.assert_allclose(out.register_tokens[0], special[:, 1:], rtol=0, atol=TOKENS)
+
+    @jax.jit
+    def run(images: jax.Array) -> Any:
+        stored, _, _ = _tokens(golden, "mask", CausalMask(images.shape[1]), images, jnp.ones(1, bool))
+        return stored.key[0], FrameByFrame(golden.config).whole(golden.variables, images)
+
+    key, (out, poses) = jax.device_get(run(images))
+    for place, layer in enumerate(_stored_layers(golden, "mask")):
+        expected = golden[f"mask_tokens_{layer:02d}"]
+        np.testing.assert_allclose(key[place], expected, rtol=0, atol=TOKENS, err_msg=str(layer))
     assert_depth(out.depth[0], golden["mask_depth"])
     assert_depth(out.depth_confidence[0], golden["mask_depth_conf"])
     np.testing.assert_allclose(np.moveaxis(poses[0], 1, 0), golden["mask_pose_enc"], rtol=0, atol=POSES)

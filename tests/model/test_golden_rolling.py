@@ -56,14 +56,16 @@ class Stream:
                 "cache_len": jnp.stack([layer.length for layer in layers])[None],
                 "score_before": memory.blocks.scores[None],
                 "score_after": blocks.scores[None],
+                "camera_cache_len": jnp.stack([cache.length for cache in camera.trunk.shared.layers])[None],
             }
 
         self.step, self.recorded = step, recorded
 
-    def run(self, images: np.ndarray) -> dict[str, Any]:
+    def run(self, images: np.ndarray, total: str = "total_budget") -> dict[str, Any]:
         """Everything of a new sequence, and `kept`: for every frame the token numbers [heads, n] of each layer."""
         config, tokens = self.golden.config, self.golden.settings["tokens_per_frame"]
-        settings = RollingSettings(self.golden.settings["total_budget"], camera_cache="single")
+        budget, temperature = self.golden.settings[total], self.golden.settings["temperature"]
+        settings = RollingSettings(budget, temperature, camera_cache="single")
         keeping = KeepWithinBudget(settings, config.camera_head.iterations)
         memory, found, kept, scores = keeping.start(config, tokens), [], [], []
         held = [np.zeros((config.aggregator.num_heads, 0), int)] * config.aggregator.depth
@@ -105,10 +107,36 @@ def test_budgets_scores_and_lengths(golden: Golden, evicting: dict[str, Any]) ->
     np.testing.assert_array_equal(evicting["cache_len"], golden["evict_cache_len"])
     for name in ("score_before", "score_after"):
         np.testing.assert_allclose(evicting[name], golden[f"evict_{name}"], rtol=0, atol=SCORES)
+    assert (evicting["camera_cache_len"] == golden["evict_camera_cache_len"][:, None]).all()
+    anchors = [layer.anchor for layer in evicting["memory"].blocks.layers]
+    np.testing.assert_array_equal(anchors, golden["evict_anchor_len"])
+    # Of the original's own scores, whose products with the budget are stored before they are truncated.
+    total, temperature = golden.settings["total_budget"], golden.settings["temperature"]
+    for scores, budget, product in zip(
+        golden["evict_score_before"], golden["evict_budget"], golden["evict_budget_product"], strict=True
+    ):
+        np.testing.assert_array_equal(rolling_cache.budgets(scores, total, temperature), budget)
+        np.testing.assert_array_equal(np.floor(product), budget)
+
+
+def test_mean_and_margin_of_every_selection(golden: Golden, evicting: dict[str, Any]) -> None:
+    """In all layers and heads: the mean score, and how far the first that goes lies above the last that stays."""
+    tokens = golden.settings["tokens_per_frame"]
+    for index, by_layer in enumerate(evicting["scores"]):
+        assert set(by_layer) == set(np.flatnonzero(np.isfinite(golden["evict_score_mean"][index, :, 0])))
+        for layer, scores in by_layer.items():
+            held = evicting["cache_len"][index - 1, layer] + tokens
+            ranked = np.sort(scores[tokens:held], axis=0)
+            np.testing.assert_allclose(ranked.mean(0), golden["evict_score_mean"][index, layer], rtol=0, atol=SCORES)
+            stay = evicting["budget"][index, layer] - tokens
+            if not stay:  # the anchor alone
+                continue
+            gap = ranked[stay] - ranked[stay - 1]
+            np.testing.assert_allclose(gap, golden["evict_score_gap"][index, layer], rtol=0, atol=2 * SCORES)
 
 
 def test_what_is_kept_and_by_which_scores(golden: Golden, evicting: dict[str, Any]) -> None:
-    tokens, evicted = golden.settings["tokens_per_frame"], 0
+    tokens, evictions = golden.settings["tokens_per_frame"], 0
     for index in range(len(golden["images_u8"])):
         for place, layer in enumerate(golden.settings["detail_layers"]):
             kept, expected = evicting["kept"][index][layer], golden["evict_kept_tokens"][index, place]
@@ -120,8 +148,8 @@ def test_what_is_kept_and_by_which_scores(golden: Golden, evicting: dict[str, An
             if count:
                 found = evicting["scores"][index][layer][tokens : tokens + count].T
                 np.testing.assert_allclose(found, expected[:, :count], rtol=0, atol=SCORES)
-                evicted += 1
-    assert evicted > 5, "the sequence must be long enough to evict"
+                evictions += 1
+    assert evictions, "the sequence must be long enough to evict"
 
 
 def test_caches_at_the_end(golden: Golden, evicting: dict[str, Any]) -> None:
@@ -133,23 +161,35 @@ def test_caches_at_the_end(golden: Golden, evicting: dict[str, Any]) -> None:
 
 
 def test_tokens_depth_and_poses(golden: Golden, evicting: dict[str, Any]) -> None:
-    layers = golden.config.aggregator.key_layers
-    for place, layer in enumerate(layers):
-        found = evicting["tokens"][:, place]
-        if layer != layers[-1]:
-            found = found[:, golden["token_index"]]
-        np.testing.assert_allclose(found, golden[f"evict_tokens_{layer:02d}"], rtol=0, atol=TOKENS)
-    assert_depth(evicting["depth"], golden["evict_depth"])
-    assert_depth(evicting["depth_conf"], golden["evict_depth_conf"])
-    np.testing.assert_allclose(np.moveaxis(evicting["poses"], 1, 0), golden["evict_pose_enc"], rtol=0, atol=POSES)
+    _assert_numbers(golden, "evict", evicting)
+
+
+def _assert_numbers(golden: Golden, name: str, found: dict[str, Any]) -> None:
+    for place, layer in enumerate(golden.config.aggregator.key_layers):
+        tokens, expected = found["tokens"][:, place], golden[f"{name}_tokens_{layer:02d}"]
+        if expected.shape[1] != tokens.shape[1]:
+            tokens = tokens[:, golden["token_index"]]
+        np.testing.assert_allclose(tokens, expected, rtol=0, atol=TOKENS, err_msg=f"block {layer}")
+    assert_depth(found["depth"], golden[f"{name}_depth"])
+    assert_depth(found["depth_conf"], golden[f"{name}_depth_conf"])
+    np.testing.assert_allclose(np.moveaxis(found["poses"], 1, 0), golden[f"{name}_pose_enc"], rtol=0, atol=POSES)
+
+
+@pytest.mark.slow
+def test_a_budget_that_nothing_exceeds(golden: Golden, stream: Stream) -> None:
+    """Caches of another size, and so another program."""
+    _assert_numbers(golden, "never", stream.run(golden["images_u8"], "total_budget_never"))
 
 
 def test_a_second_sequence_starts_afresh(golden: Golden, stream: Stream, evicting: dict[str, Any]) -> None:
     """In the original it starts with the first one's scores and anchor."""
     second = stream.run(golden["images_second_u8"])
     np.testing.assert_array_equal(second["budget"], golden["second_fresh_budget"])
+    assert (second["budget"] != golden["second_leaked_budget"]).any()
+    assert not second["score_before"][0].any() and golden["second_leaked_score_before"][0].any()
     poses = np.moveaxis(second["poses"], 1, 0)
     np.testing.assert_allclose(poses, golden["second_fresh_pose_enc"], rtol=0, atol=POSES)
     tokens = second["tokens"][:, -1][:, golden["token_index"]]
-    np.testing.assert_allclose(tokens, golden["second_fresh_tokens_23"], rtol=0, atol=TOKENS)
+    last = golden.config.aggregator.key_layers[-1]
+    np.testing.assert_allclose(tokens, golden[f"second_fresh_tokens_{last:02d}"], rtol=0, atol=TOKENS)
     assert np.abs(poses - golden["second_leaked_pose_enc"]).max() > 1e-3

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 from logvggt_jax import LogVGGT, ModelConfig, RefinementConfig
+from logvggt_jax.errors import InputError
+from logvggt_jax.model.kept_registers import is_kept
 from logvggt_jax.model.refinement import num_triggers
 
 WIDTH = 64
@@ -149,7 +151,9 @@ def by_hand(config: ModelConfig, settings: RefinementConfig, variables, camera, 
     for trigger in range(num_triggers(num_frames, settings.period)):
         start, stop = refined_frames(trigger, num_frames, settings.period)
         past = register[:, :stop]
-        refined[:, start:stop] = refine_tokens(variables, camera[:, start:stop], past, full(stop))
+        if settings.max_registers is not None:
+            past = past[:, is_kept(np.arange(stop), np.array(stop), settings.max_registers // 4)]
+        refined[:, start:stop] = refine_tokens(variables, camera[:, start:stop], past, full(past.shape[1]))
         if settings.context is None:
             poses.append(decode_cameras(variables, refined[:, :stop], full(stop))[:, start:])
             continue
@@ -162,18 +166,31 @@ def by_hand(config: ModelConfig, settings: RefinementConfig, variables, camera, 
 
 
 @pytest.mark.parametrize(
-    ("period", "context"), [(None, None), (3, None), (2, None), (None, 4), (4, 3), (2, 2), (5, 20)]
+    ("period", "context", "max_registers"),
+    [
+        (None, None, None),
+        (3, None, None),
+        (2, None, None),
+        (None, 4, None),
+        (4, 3, None),
+        (2, 2, None),
+        (5, 20, None),
+        (None, None, 16),
+        (2, 2, 12),
+    ],
 )
-def test_modes_equal_their_definition(small_config, small_variables, period, context):
-    model = with_refinement(small_config, period=period, context=context)
+def test_modes_equal_their_definition(small_config, small_variables, period, context, max_registers):
+    model = with_refinement(small_config, period=period, context=context, max_registers=max_registers)
     camera, register = tokens()
     expected = by_hand(small_config, model.config.refinement, small_variables, camera, register)
     close(sequence(model)(small_variables, camera, register, full()), expected)
 
 
-@pytest.mark.parametrize(("period", "context"), [(None, 4), (3, None), (3, 4), (2, 2)])
-def test_unequal_lengths_equal_items_one_by_one(small_config, small_variables, period, context):
-    model = with_refinement(small_config, period=period, context=context)
+@pytest.mark.parametrize(
+    ("period", "context", "max_registers"), [(None, 4, None), (3, None, None), (3, 4, None), (2, 2, 16)]
+)
+def test_unequal_lengths_equal_items_one_by_one(small_config, small_variables, period, context, max_registers):
+    model = with_refinement(small_config, period=period, context=context, max_registers=max_registers)
     lengths = (FRAMES, 6, 1)
     camera, register = tokens(batch=len(lengths))
     mask = np.arange(FRAMES)[None] < np.array(lengths)[:, None]
@@ -218,3 +235,8 @@ def test_wrong_input_is_named(small_config, small_variables, changes, message):
 def test_context_smaller_than_the_stride_is_refused(small_config):
     with pytest.raises(ValueError, match="context=1 must be at least the window stride 2"):
         with_refinement(small_config, context=1)
+
+
+def test_registers_of_less_than_two_frames_are_refused(small_config):
+    with pytest.raises(InputError, match="max_registers=7 must be at least 8"):
+        with_refinement(small_config, max_registers=7)

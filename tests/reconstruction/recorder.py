@@ -12,7 +12,7 @@ import pytest
 
 from logvggt_jax import LogVGGT
 from logvggt_jax.reconstruction import Reconstruction, Source, reconstruct
-from logvggt_jax.streaming import METHODS, Cameras, FrameResult, Method, WindowSettings
+from logvggt_jax.streaming import METHODS, Cameras, FrameResult, Method, Progress, WindowSettings
 from logvggt_jax.streaming.results import decoded_cameras
 from logvggt_jax.streaming.windows import window_program
 
@@ -36,7 +36,7 @@ class Recorder:
         self.frames.append(frame)
         return self.close() if len(self.frames) == 2 else []
 
-    def close(self) -> list[FrameResult]:
+    def close(self, progress: Progress | None = None) -> list[FrameResult]:
         results = []
         for frame in self.frames:
             generator = np.random.default_rng(self.num_frames)

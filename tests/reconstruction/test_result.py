@@ -15,8 +15,8 @@ from result_folder import SIZE, write_result
 from logvggt_jax.errors import InputError
 from logvggt_jax.geometry import camera_centres
 from logvggt_jax.reconstruction.depth_files import write_picture
-from logvggt_jax.reconstruction.exporters import EXPORTERS
-from logvggt_jax.reconstruction.exporters.tum import read_trajectory
+from logvggt_jax.reconstruction.exporters.ply import export_ply
+from logvggt_jax.reconstruction.exporters.tum import export_tum, read_trajectory
 from logvggt_jax.reconstruction.point_cloud import PointFilter, read_points
 from logvggt_jax.reconstruction.result import Reconstruction
 
@@ -83,6 +83,8 @@ EYE = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
         (lambda d: d.update(image_size=[0, 64]), "image_size must be height and width"),
         (lambda d: d.update(depth_size=[24, 1e400]), "depth_size must be height and width"),
         (lambda d: d.update(depth_size=[48, 32]), r"depth/0\.npz: depth must be floats \[48, 32\].*got \[24, 32\]"),
+        (lambda d: d.update(source={"path": 1}), "source must be null or say where"),
+        (lambda d: d.update(metric="yes"), "metric must be true or false"),
         (frame_with(name="../../secret"), "cannot be that of a file"),
         (frame_with(name=".."), "cannot be that of a file"),
         (frame_with(name="a\0b"), "cannot be that of a file"),
@@ -97,6 +99,10 @@ EYE = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
         (frame_with(extrinsics=[[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]), "hold no rotation"),
         (frame_with(extrinsics=[[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]), "hold no rotation"),
         (frame_with(intrinsics=[[0, 0, 0], [0, 1, 0], [0, 0, 1]]), "not those of a pinhole camera"),
+        (frame_with(depth_scale=0), "the depth_scale of frame 1, '1', must be above 0"),
+        (frame_with(depth_scale="twice"), "the depth_scale of frame 1, '1', must be a number"),
+        (lambda d: d.update(loops=[[0, 3]]), "loops must be pairs of positions among the frames"),
+        (lambda d: d.update(loops={"0": 1}), "loops must be pairs of positions among the frames"),
         (frame_with(depth_intrinsics=[[10**400, 0, 0], [0, 1, 0], [0, 0, 1]]), "must be numbers"),
     ],
 )
@@ -133,22 +139,11 @@ def test_results_of_before_images_were_kept_still_open(tmp_path: Path) -> None:
         result.image(0)
 
 
-def test_every_exporter_writes_its_file_and_leaves_nothing_beside_it(tmp_path: Path) -> None:
-    (tmp_path / "result").mkdir()
-    (tmp_path / "exported").mkdir()
-    write_result(tmp_path / "result")
-    result = Reconstruction.open(tmp_path / "result")
-    assert set(EXPORTERS) >= {"ply", "tum"}
-    for name, export in EXPORTERS.items():
-        export(result, tmp_path / "exported" / name, progress=False)
-    assert {path.name for path in (tmp_path / "exported").iterdir()} == set(EXPORTERS)
-
-
 def test_the_cloud_is_every_frame_unprojected_in_its_own_colour(tmp_path: Path) -> None:
     write_result(tmp_path)
     result = Reconstruction.open(tmp_path)
     every = PointFilter(confidence_percentile=0, edge_threshold=None, max_points=None)
-    EXPORTERS["ply"](result, tmp_path / "all.ply", point_filter=every, progress=False)
+    export_ply(result, tmp_path / "all.ply", point_filter=every, progress=False)
     points, colours = read_points(tmp_path / "all.ply")
     pixels = SIZE[0] * SIZE[1]
     assert len(points) == 3 * pixels
@@ -163,7 +158,7 @@ def test_the_cloud_is_every_frame_unprojected_in_its_own_colour(tmp_path: Path) 
 def test_the_trajectory_is_the_cameras(tmp_path: Path) -> None:
     write_result(tmp_path)
     result = Reconstruction.open(tmp_path)
-    EXPORTERS["tum"](result, tmp_path / "path.txt")
+    export_tum(result, tmp_path / "path.txt")
     timestamps, extrinsics = read_trajectory(tmp_path / "path.txt")
     np.testing.assert_array_equal(timestamps, result.timestamps)
     np.testing.assert_allclose(extrinsics[:, :3], result.extrinsics, atol=1e-8)

@@ -10,17 +10,12 @@ import cv2
 import numpy as np
 import pytest
 
+from logvggt_jax.colours import depth_picture
 from logvggt_jax.data import open_dataset
 from logvggt_jax.errors import InputError, MissingInput
 from logvggt_jax.geometry import camera_centres, invert, quaternion_to_matrix, rotation_angle
 from logvggt_jax.reconstruction.cameras_file import read_cameras, write_cameras
-from logvggt_jax.reconstruction.depth_files import (
-    depth_picture,
-    read_depth,
-    read_picture,
-    write_depth,
-    write_picture,
-)
+from logvggt_jax.reconstruction.depth_files import read_depth, read_picture, write_depth, write_picture
 from logvggt_jax.reconstruction.exporters.tum import read_trajectory, write_trajectory
 from logvggt_jax.reconstruction.point_cloud import read_points
 from logvggt_jax.reconstruction.room_sequence import read_room_sequence, write_room_sequence

@@ -19,9 +19,10 @@ from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.errors import InputError, OutputExists
 from logvggt_jax.interruption import Interrupted
 from logvggt_jax.reconstruction import PointFilter, Reconstruction, open_source, reconstruct
-from logvggt_jax.reconstruction.work_folder import Progress, WorkFolder
+from logvggt_jax.reconstruction.work_folder import WorkFolder
 from logvggt_jax.streaming import ChunkPlan
 from logvggt_jax.streaming.chunks import ChunkSession
+from logvggt_jax.streaming.state_file import State
 from logvggt_jax.streaming.windows import StreamSession
 
 COUNT, THINNED = 12, PointFilter(max_points=3000)
@@ -243,7 +244,7 @@ def test_a_source_that_breaks_off_keeps_its_frames(walk: Path, tmp_path: Path) -
 def test_one_run_at_a_time(tmp_path: Path) -> None:
     output = tmp_path / "out"
     with WorkFolder(output, {"method": "windows"}, overwrite=False) as work:
-        work.save(Progress({}, {}), [])
+        work.save(State({}, {}), [])
         for overwrite in (False, True):
             with (
                 pytest.raises(InputError, match=rf"another run is using this folder \(process {os.getpid()} on "),
@@ -257,7 +258,7 @@ def test_every_damage_of_a_saved_state_is_noticed(tmp_path: Path) -> None:
     output, request = tmp_path / "out", {"method": "windows"}
     arrays = {"tokens": np.arange(6, dtype=np.float32).reshape(2, 3), "pending": np.zeros((0, 3), np.uint8)}
     with WorkFolder(output, request, overwrite=False) as work:
-        work.save(Progress(arrays, {"names": ["a"]}), [])
+        work.save(State(arrays, {"names": ["a"]}), [])
     file = work.path / ".progress" / "state.safetensors"
     sound = file.read_bytes()
     with WorkFolder(output, request, overwrite=False) as work:

@@ -153,6 +153,18 @@ def test_no_more_than_a_chunk_is_held(truth: PlainPrediction) -> None:
     )
 
 
+def test_bytes_of_a_chain_are_those_of_a_chunk_and_an_overlap(truth: PlainPrediction) -> None:
+    """Pictures until their chunk is full; then the overlap's, and what was predicted of them."""
+    chain, found = ChunkChain(Oracle(truth), ChunkPlan(8, 4)), []
+    for image in images()[:16]:
+        chain.push(image)
+        found.append(chain.held_bytes)
+    picture = HEIGHT * WIDTH * 3
+    assert found[:7] == [n * picture for n in range(1, 8)]
+    shared = 4 * (picture + 4 * (2 * HEIGHT * WIDTH + 3 * 4 + 3 * 3))
+    assert found[7::4] == [shared] * 3
+
+
 def test_chunks_that_do_not_fit_are_named(truth: PlainPrediction) -> None:
     predict = Oracle(truth)
 

@@ -233,6 +233,30 @@ def test_one_program_serves_all_frames(small_config: ModelConfig, small_variable
         assert frame_session._locate._cache_size() - before[1] <= 1, method
 
 
+@pytest.mark.parametrize(
+    ("method", "settings"),
+    [
+        ("causal", CausalSettings(first_capacity=2)),
+        ("anchored-window", AnchoredWindowSettings(window=2)),
+        ("rolling", SMALL_BUDGET),
+        ("pruned", PrunedSettings(SMALL_CAP, camera_cache="single")),
+    ],
+)
+def test_caches_are_given_to_the_step(
+    method: str, settings: Any, small_config: ModelConfig, small_variables: dict
+) -> None:
+    """The buffers of before a frame are those of after it: no second cache is ever there."""
+    stream = opened(method, small_config, small_variables, settings)
+    stream.push(IMAGES[0])
+    before = jax.tree.leaves(stream._memory)
+    places = {leaf.unsafe_buffer_pointer() for leaf in before if leaf.ndim > 1}
+    stream.push(IMAGES[1])
+    assert all(leaf.is_deleted() for leaf in before)
+    after = {leaf.unsafe_buffer_pointer() for leaf in jax.tree.leaves(stream._memory) if leaf.ndim > 1}
+    assert after == places
+    stream.close()
+
+
 def test_a_layer_whose_budget_exceeds_its_share_gets_room(small_config: ModelConfig) -> None:
     """Capacities in frames as a layer fills up: doubled, twice the equal share and one, the largest budget and one."""
     keeping = KeepWithinBudget(dataclasses.replace(SMALL_BUDGET, first_capacity=2), rounds=4)
@@ -287,6 +311,38 @@ def test_a_cap_below_a_frame(small_config: ModelConfig, small_variables: dict) -
     assert stream._memory is not None
     assert {int(cache.length) for cache in stream._memory.blocks.layers} == {2 * TOKENS}
     assert len(stream.close()) == 1
+
+
+@pytest.mark.parametrize(
+    ("method", "settings"),
+    [
+        ("rolling", RollingSettings(budget=2 * LAYERS * (5 + 1 * 2))),
+        ("pruned", PrunedSettings(cap=16)),
+    ],
+)
+def test_sequences_of_a_batch_do_not_meet(
+    method: str, settings: Any, small_config: ModelConfig, small_variables: dict
+) -> None:
+    """Three at once, of pictures of another size, are what each is alone; `rolling` below its budget, since the budgets
+    of its layers follow from the scores of the whole batch."""
+    images = np.random.default_rng(3).integers(0, 256, (3, 2 if method == "rolling" else 4, 14, 28, 3), np.uint8)
+    parts, tokens = FrameByFrame(small_config), 5 + 1 * 2
+    step = jax.jit(parts.tokens)
+
+    def run_batch(batch: np.ndarray) -> np.ndarray:
+        keeping = opened(method, small_config, small_variables, settings)._keeping
+        blocks = keeping.start(small_config, tokens, batch.shape[1]).blocks
+        blocks = jax.tree.map(lambda x: jnp.repeat(x, len(batch), axis=0) if x.ndim > 1 else x, blocks)
+        found = []
+        for index in range(batch.shape[1]):
+            first = jnp.full(len(batch), index == 0)
+            out, blocks = step(small_variables, blocks, batch[:, index : index + 1], first)
+            found.append(np.asarray(out.key))
+        return np.stack(found, axis=1)
+
+    together = run_batch(images)
+    for index in range(len(images)):
+        np.testing.assert_allclose(together[index], run_batch(images[index : index + 1])[0], rtol=1e-4, atol=2e-5)
 
 
 def test_a_closed_stream_takes_no_frame(small_config: ModelConfig, small_variables: dict) -> None:

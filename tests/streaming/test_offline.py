@@ -11,7 +11,7 @@ import pytest
 from logvggt_jax import LogVGGT, ModelConfig, WindowConfig
 from logvggt_jax.model import windows as module
 from logvggt_jax.streaming.chunks import ChunkChain, ChunkPlan
-from logvggt_jax.streaming.offline import PlainPrediction, plain_vggt, predict_plain
+from logvggt_jax.streaming.offline import OfflineSession, OfflineSettings, PlainPrediction, plain_vggt, predict_plain
 
 FRAMES = 6
 IMAGES = np.random.default_rng(0).integers(0, 256, (FRAMES, 28, 42, 3), np.uint8)
@@ -42,6 +42,12 @@ def test_limited_trunk_and_periods_are_the_streams_not_vggts(small_config: Model
     settings = dataclasses.replace(small_config.refinement, period=2, context=4)
     model = LogVGGT(dataclasses.replace(small_config, refinement=settings))
     assert plain_vggt(model, 7) == plain_vggt(LogVGGT(small_config), 7)
+
+
+def test_pictures_are_all_that_is_kept_until_the_end(small_config: ModelConfig, small_variables: dict) -> None:
+    session = OfflineSession(LogVGGT(small_config), small_variables, OfflineSettings())
+    session.push(IMAGES[:4])
+    assert session.state_bytes == IMAGES[:4].nbytes
 
 
 def test_one_frame_alone(small_config: ModelConfig, small_variables: dict) -> None:

@@ -18,18 +18,24 @@ from logvggt_jax.streaming import (
     CausalSettings,
     ChunkPlan,
     FrameResult,
+    LoopSettings,
     Predictor,
     PrunedSettings,
     RollingSettings,
+    WindowSettings,
     open_predictor,
 )
 
 COUNT = 11
+LOOPS = LoopSettings(spacing=2, gap=4, similarity=-1.0, frames=1)
 CASES = {
     "windows": ("windows", None, RefinementConfig()),
     "online windows": ("windows", None, RefinementConfig(period=2, context=4)),
+    "bounded windows": ("windows", None, RefinementConfig(period=2, context=4, max_registers=8)),
     "windows without refinement": ("windows", None, RefinementConfig(enabled=False)),
+    "windows with loops": ("windows", WindowSettings(loops=LOOPS), RefinementConfig()),
     "chunks": ("chunks", ChunkPlan(4, 2), RefinementConfig()),
+    "chunks with loops": ("chunks", ChunkPlan(4, 2, LOOPS), RefinementConfig()),
     "offline": ("offline", None, RefinementConfig()),
     "merged": ("merged", None, RefinementConfig()),
     "causal": ("causal", CausalSettings(first_capacity=2), RefinementConfig()),

@@ -10,7 +10,10 @@ import pytest
 
 from logvggt_jax import LogVGGT, ModelConfig, Predictions, RefinementConfig, WindowConfig
 from logvggt_jax.errors import InputError
+from logvggt_jax.streaming import LoopSettings, pose_stream
 from logvggt_jax.streaming import windows as session_module
+from logvggt_jax.streaming.loops import LoopCloser
+from logvggt_jax.streaming.results import Cameras
 from logvggt_jax.streaming.windows import FrameResult, StreamSession, WindowSettings
 
 HEIGHT, WIDTH = 28, 42
@@ -90,6 +93,9 @@ def test_stream_equals_apply_for_every_length(
         {"period": 2, "context": 3},
         {"period": 5, "context": 4},
         {"period": 3, "enabled": False, "context": 2},
+        {"max_registers": 12},
+        {"period": 3, "max_registers": 16},
+        {"period": 2, "context": 3, "max_registers": 8},
     ],
     ids=str,
 )
@@ -171,6 +177,34 @@ def test_other_modes_on_the_same_windows_are_streams_of_their_own(
     assert len(session.cameras().extrinsics) == len(frames)
 
 
+def test_loops_are_closed_beside_refinement(
+    small_config: ModelConfig, small_variables: dict, frames: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What the closer makes of the stream's cameras is what comes out, whichever the refinement."""
+    closers: list[LoopCloser] = []
+
+    def close(self: LoopCloser, cameras: Cameras) -> Cameras:
+        closers.append(self)
+        assert all(place.depth is not None for place in self._places.values())
+        return cameras._replace(depth_scale=cameras.extrinsics[:, 0, 3])
+
+    monkeypatch.setattr(LoopCloser, "close", close)
+    model = with_modes(small_config)
+    plain = StreamSession(model, small_variables, first_capacity=16)
+    session = StreamSession(model, small_variables, first_capacity=16, loops=LoopSettings(spacing=3))
+    expected, results = stream(plain, frames), stream(session, frames)
+    np.testing.assert_array_equal([r.depth for r in results], [r.depth for r in expected])
+    assert not any(result.pose_is_final for result in results)
+    for refinement in (model.config.refinement, with_modes(small_config, context=4).config.refinement):
+        found, without = session.cameras_with(refinement), plain.cameras_with(refinement)
+        np.testing.assert_array_equal(found.extrinsics, without.extrinsics)
+        np.testing.assert_array_equal(found.depth_scale, without.extrinsics[:, 0, 3])
+    np.testing.assert_array_equal(session.cameras().depth_scale, plain.cameras().extrinsics[:, 0, 3])
+    assert session.cameras().is_final.all()
+    # Both places in one window of four.
+    assert list(closers[0]._places) == [0, 3, 6, 9, 12] and closers[0]._settings.frames == 2
+
+
 def test_online_poses_are_final_with_the_depth_and_never_move(
     small_config: ModelConfig, small_variables: dict, frames: np.ndarray
 ) -> None:
@@ -217,31 +251,48 @@ def test_nothing_compiles_per_frame_and_the_state_does_not_grow(
     session.push(np.stack([frame] * 8))
 
     def compiled() -> list[int]:
-        programs = (session_module._step, session_module._fire)
+        programs = (session_module._step, pose_stream._fire)
         return [program._cache_size() for program in programs]
 
     def state_bytes() -> int:
         return sum(leaf.nbytes for leaf in jax.tree.leaves(session._state))
 
-    before, size, capacity = compiled(), state_bytes(), session._store.capacity
+    before, size, capacity = compiled(), state_bytes(), session._poses.capacity
     for _ in range(40):
         session.push(frame)
     assert compiled() == before
     assert state_bytes() == size
-    assert session._store.capacity == capacity == 64
+    assert session._poses.capacity == capacity == 64
     assert len(session._pending) < 2
 
 
-def test_programs_grow_with_the_logarithm_of_an_online_stream(small_config: ModelConfig, small_variables: dict) -> None:
+def test_programs_grow_with_the_logarithm_of_a_stream_that_reads_everything(
+    small_config: ModelConfig, small_variables: dict
+) -> None:
     """Buffers double: from 4 frames to 128 there are six sizes, and no more programs than that."""
-    session = StreamSession(with_modes(small_config, period=2, context=2), small_variables, first_capacity=4)
-    frame, before = np.zeros((HEIGHT, WIDTH, 3), np.uint8), session_module._fire._cache_size()
+    session = StreamSession(with_modes(small_config, period=2), small_variables, first_capacity=4)
+    frame, before = np.zeros((HEIGHT, WIDTH, 3), np.uint8), pose_stream._fire._cache_size()
     for _ in range(120):
         session.push(frame)
     session.close()
     assert len(session.cameras().is_final) == 120
-    assert session._store.capacity == 128
-    assert session_module._fire._cache_size() - before <= 6
+    assert session._poses.capacity == 128
+    assert pose_stream._fire._cache_size() - before <= 6
+
+
+def test_a_state_grows_by_compact_tokens_alone(
+    small_config: ModelConfig, small_variables: dict, frames: np.ndarray
+) -> None:
+    """A frame's camera token, the same refined, and keys and values of its four registers, of 2C numbers each."""
+    session, found = StreamSession(with_modes(small_config), small_variables), []
+    assert session.state_bytes == 0
+    for frame in frames[:12]:
+        session.push(frame)
+        found.append(session.state_bytes)
+    assert found[0] == HEIGHT * WIDTH * 3, "a picture that waits for its window"
+    compact = 4 * 2 * small_config.encoder.embed_dim * (1 + 1 + 2 * 4)
+    assert np.diff(found[3::2]).tolist() == [2 * compact] * 4
+    session.close()
 
 
 def test_an_empty_stream_has_no_frames(small_config: ModelConfig, small_variables: dict) -> None:

@@ -76,6 +76,26 @@ def pixel_params() -> dict[str, Any]:
 
 
 @pytest.fixture(scope="session")
+def layered(small_config: ModelConfig, pixel_model: PixelModel) -> Any:
+    """A `parallel_runs.LayeredModel`; that file, which processes of their own run too, takes its model from here."""
+    from parallel_runs import LayeredModel
+
+    return LayeredModel(small_config, pixel_model)
+
+
+@pytest.fixture(scope="session")
+def layered_params(pixel_params: Any) -> dict[str, Any]:
+    """Parameters of `LayeredModel`: four layers, sixteen wide."""
+    generator = np.random.default_rng(3)
+
+    def normal(*shape: int) -> np.ndarray:
+        return (0.2 * generator.standard_normal(shape)).astype(np.float32)
+
+    blocks = {"kernel": normal(4, 16, 16), "bias": normal(4, 16)}
+    return {**pixel_params, "aggregator": {"embed": {"kernel": normal(3, 16)}, "frame_blocks": blocks}}
+
+
+@pytest.fixture(scope="session")
 def clips() -> dict[str, np.ndarray]:
     """Eight clips of five frames whose shares of valid pixels and lengths differ widely."""
     generator = np.random.default_rng(0)

@@ -47,9 +47,18 @@ def test_a_copy_without_the_sequences_of_a_held_out_split_can_be_trained_on(monk
 
 
 def test_validation_sequences_are_not_trained_on() -> None:
-    open_sources(data(), rooms("val"))
+    open_sources(data(), (rooms("val"),))
     with pytest.raises(ValueError, match="rooms: 8 sequences are trained on and validated on"):
-        open_sources(data(), rooms("train"))
+        open_sources(data(), (rooms("train"),))
+
+
+def test_other_frames_of_a_sequence_may_be_validated_on() -> None:
+    first, last = (dataclasses.replace(rooms("train"), frames=frames) for frames in ((None, 5), (-3, None)))
+    dataset = open_sources(data(sources=(first,)), last)["rooms"]
+    assert {dataset.num_frames(name) for name in dataset.sequences} == {5}
+    more = dataclasses.replace(first, frames=(None, 6))
+    with pytest.raises(InputError, match="rooms: 8 sequences are trained on and validated on"):
+        open_sources(data(sources=(more,)), last)
 
 
 def test_a_rule_for_a_data_set_that_does_not_exist_is_refused() -> None:

@@ -1,12 +1,16 @@
 """The training log, validation and evaluation agree on what an error is."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from logvggt_jax.geometry import quaternion_to_matrix
 from logvggt_jax.metrics import depth_metrics, relative_pose_errors
-from logvggt_jax.training.clip_errors import depth_errors, pose_errors
+from logvggt_jax.training import clip_errors
+
+# As programs, which training runs: one by one each operation would compile by itself.
+depth_errors, pose_errors = jax.jit(clip_errors.depth_errors), jax.jit(clip_errors.pose_errors)
 
 
 def _cameras(seed: int) -> np.ndarray:

@@ -6,11 +6,13 @@ import dataclasses
 import importlib
 import importlib.util
 from pathlib import Path
+from typing import Any
 
 import jax
 import pytest
 
 from logvggt_jax.errors import InputError, MissingPackage
+from logvggt_jax.operations import count_flops
 from logvggt_jax.training import dry_run as module
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.dry_run import StepCosts, abstract_clips, collectives, dry_run, step_costs, step_flops
@@ -30,7 +32,19 @@ def config(monkeypatch: pytest.MonkeyPatch) -> TrainConfig:
     return dataclasses.replace(tiny, stages=(stage,), model=dataclasses.replace(tiny.model, encoder=encoder))
 
 
-def test_a_step_is_described_and_nothing_is_allocated(config: TrainConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch, layered: Any, layered_params: Any) -> list[tuple[int, ...]]:
+    """Runs have a model that compiles at once; the clips whose operations, which are none of its, were asked for."""
+    asked: list[tuple[int, ...]] = []
+    monkeypatch.setattr(module, "LogVGGT", lambda _: layered)
+    monkeypatch.setattr(module, "abstract_parameters", lambda _: jax.eval_shape(lambda: layered_params))
+    monkeypatch.setattr(module, "step_flops", lambda _, clips: asked.append(clips) or 3e12)
+    return asked
+
+
+def test_a_step_is_described_and_nothing_is_allocated(
+    config: TrainConfig, quick: list[tuple[int, ...]], monkeypatch: pytest.MonkeyPatch
+) -> None:
     found: list[StepCosts | None] = []
     monkeypatch.setattr(module, "step_costs", lambda *given: found.append(step_costs(*given)) or found[-1])
     lines: list[str] = []
@@ -39,7 +53,8 @@ def test_a_step_is_described_and_nothing_is_allocated(config: TrainConfig, monke
     assert len(jax.live_arrays()) <= before
     assert "2 x cpu, memory not known" in lines[0]
     assert "28x42, 2 x 2 frames a device" in lines[1]
-    for word in ("TFLOP", "arguments", "temporaries", "all-reduce", "compiled in"):
+    assert quick == [(4, 2, *SIZE)]
+    for word in (": 3 TFLOP in all", "arguments", "temporaries", "all-reduce", "compiled in"):
         assert word in lines[1]
     assert "is not known" in lines[2], "a CPU does not say how much memory a program may use"
 
@@ -49,18 +64,26 @@ def test_a_step_is_described_and_nothing_is_allocated(config: TrainConfig, monke
     size = {name: sum(4 * leaf.size for leaf in jax.tree.leaves(tree)) for name, tree in params.items()}
     trained = sum(size.values()) - size["encoder"]
     exchanged = sum(total for _, total in costs.collectives.values())
-    # A compiler may leave out sums of what is zero everywhere: of the frozen encoder, of a bias before a softmax.
-    assert 0.99 * trained <= exchanged < 1.05 * sum(size.values()) + 10_000
+    # A compiler may leave out sums of what is zero everywhere, of the frozen encoder; there are numbers for the log.
+    assert trained <= exchanged < sum(size.values()) + 1_000
     assert costs.arguments > sum(size.values()) + 2 * trained, "parameters, two moments, a batch"
 
 
-def test_operations_grow_with_the_clips_and_what_is_trained(config: TrainConfig) -> None:
+def test_operations_grow_with_the_clips_and_what_is_trained(
+    config: TrainConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    counted: list[float] = []
+    monkeypatch.setattr(module, "count_flops", lambda *given: counted.append(count_flops(*given)) or counted[-1])
     one, four = (step_flops(config.model, (clips, 2, *SIZE)) for clips in (1, 4))
     assert four == pytest.approx(4 * one, rel=1e-3)
-    encoder = dataclasses.replace(config.model.encoder, frozen=False)
-    assert step_flops(dataclasses.replace(config.model, encoder=encoder), (1, 2, *SIZE)) > one
+    forward, encoder = counted[:2]
+    assert 0 < encoder < forward and one == 3 * forward - 2 * encoder
+    monkeypatch.setattr(module, "count_flops", lambda *_: counted.pop(0))
+    trained = dataclasses.replace(config.model.encoder, frozen=False)
+    assert step_flops(dataclasses.replace(config.model, encoder=trained), (1, 2, *SIZE)) == 3 * forward
 
 
+@pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize(
     ("limit", "answer"), [(45, "4 is the largest of 1, 2, 4, 8 clips"), (5, "none of 1, 2, 4, 8 clips"), (1000, "8 is")]
 )
@@ -83,6 +106,7 @@ def test_the_largest_that_fits_is_searched(
     assert ("which do not fit" in lines[1]) == (limit < 25)
 
 
+@pytest.mark.usefixtures("quick")
 def test_clips_that_are_accumulated_are_tried_in_whole_parts(
     config: TrainConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -99,6 +123,7 @@ def test_clips_that_are_accumulated_are_tried_in_whole_parts(
     assert tried == [2, 4, 8] and "4 is the largest of 2, 4, 8, 16 clips a device" in lines[-1]
 
 
+@pytest.mark.usefixtures("quick")
 def test_what_the_compiler_refuses_does_not_fit(config: TrainConfig, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object, **__: object) -> None:
         raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Ran out of memory in memory space hbm")

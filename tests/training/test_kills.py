@@ -17,6 +17,7 @@ import pytest
 
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.metrics_log import read_metrics
+from logvggt_jax.weights.checkpoints import load_model, read_provenance
 from logvggt_jax.weights.digests import digests
 
 # Starts the run with the quick model; says when it trains. A save takes its time, so that many kills fall into one.
@@ -47,12 +48,13 @@ Path(sys.argv[2], "ended.pickle").write_bytes(pickle.dumps(jax.device_get(state)
 def test_twelve_kills_change_nothing(run_config: TrainConfig, pixel_params: Any, tmp_path: Path) -> None:
     stages = [{**stage, "steps": 30} for stage in run_config.to_dict()["stages"]]
     validation = {
-        "source": {**run_config.to_dict()["data"]["sources"][0], "split": "val"},
+        "sources": [{**run_config.to_dict()["data"]["sources"][0], "split": "val"}],
         "every": 4,
         "num_clips": 2,
         "clip_length": 3,
         "stride": 2,
         "size": [28, 42],
+        "best": "abs_rel",
     }
     settings = {**run_config.to_dict(), "stages": stages, "validation": validation, "save_every": 2, "log_every": 2}
     given = tmp_path / "run.pickle"
@@ -86,5 +88,9 @@ def test_twelve_kills_change_nothing(run_config: TrainConfig, pixel_params: Any,
         for found in (read_metrics(tmp_path / name / "metrics.jsonl") for name in ("alone", "killed"))
     ]
     assert lines[0] == lines[1]
+    best = [read_provenance(tmp_path / name / "best").training for name in ("alone", "killed")]
+    assert best[0] is not None and best[1] is not None and best[0].steps == best[1].steps
+    models = [load_model(tmp_path / name / "best")[1] for name in ("alone", "killed")]
+    assert digests(models[0]) == digests(models[1])
     left = sorted(path.name for path in (tmp_path / "killed").iterdir())
     assert not [name for name in left if name.endswith((".partial", ".old"))]

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import Mesh
 
 from logvggt_jax.data.feeding.clips import ClipReader
 from logvggt_jax.errors import InputError
@@ -20,13 +21,15 @@ from logvggt_jax.interruption import StopRequest
 from logvggt_jax.training import loop
 from logvggt_jax.training.checkpoint_files import Position
 from logvggt_jax.training.checkpoints import RunCheckpoints
-from logvggt_jax.training.config import SourceConfig, TrainConfig, ValidationConfig
+from logvggt_jax.training.config import VALIDATION_METRICS, SourceConfig, TrainConfig, ValidationConfig
 from logvggt_jax.training.device_batches import DeviceBatches
 from logvggt_jax.training.loop import NonFiniteTraining, train
 from logvggt_jax.training.metrics_log import MetricsLog, read_metrics
 from logvggt_jax.training.profile import ProfiledSteps
+from logvggt_jax.training.program import Program, make_program
 from logvggt_jax.training.sharding import data_mesh
 from logvggt_jax.training.state import TrainState
+from logvggt_jax.training.validation import Judgement
 from logvggt_jax.weights.checkpoints import digests, load_model, read_provenance
 
 UNTIMED = ("time", "frames_per_second")
@@ -37,6 +40,7 @@ def quick(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, pixel
     """Runs use the model that compiles at once, but for the slow ones."""
     if request.node.get_closest_marker("slow") is None:
         _use(monkeypatch, pixel_model, pixel_params)
+        monkeypatch.setattr(loop, "make_program", _program)
 
 
 @pytest.fixture(scope="module")
@@ -47,6 +51,7 @@ def straight(
     workdir = tmp_path_factory.mktemp("straight")
     with pytest.MonkeyPatch.context() as patch:
         _use(patch, pixel_model, pixel_params)
+        patch.setattr(loop, "make_program", _program)
         return train(run_config, workdir, mesh=data_mesh(2)), workdir
 
 
@@ -60,6 +65,18 @@ def _use(patch: pytest.MonkeyPatch, model: Any, params: Any) -> None:
     patch.setattr(loop, "LogVGGT", lambda _: model)
     patch.setattr(loop, "initial_parameters", lambda *_, **__: jax.tree.map(jnp.array, params))
     patch.setattr(loop, "abstract_parameters", lambda _: jax.eval_shape(lambda: params))
+
+
+_programs: dict[Any, Program] = {}
+
+
+def _program(model: Any, config: TrainConfig, params: Any, mesh: Mesh) -> Program:
+    """Runs whose steps are the same share one: most of a run's time is its compilation."""
+    settings = (config.optimizer, config.loss, config.stages, config.accumulate, config.average)
+    key = (model, mesh, config.model.encoder.frozen, config.shard_parameters, *settings)
+    if key not in _programs:
+        _programs[key] = make_program(model, config, params, mesh)
+    return _programs[key]
 
 
 def _at_step(monkeypatch: pytest.MonkeyPatch, step: int, action: Callable[[], None]) -> None:
@@ -285,12 +302,20 @@ def test_the_data_are_looked_for_before_the_weights_are_read(
 def test_a_step_that_does_not_fit_says_what_it_needs_and_what_lowers_it(
     reason: str, run_config: TrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    compiled = loop._Run._program
+    compiled = loop.compiled_steps
 
     def refuse(*_: object) -> None:
         raise jax.errors.JaxRuntimeError(reason)
 
-    monkeypatch.setattr(loop._Run, "_program", lambda run, *given: compiled(run, *given) and refuse)
+    class Refusing:
+        def __init__(self, step: jax.stages.Compiled) -> None:
+            self.memory_analysis = step.memory_analysis
+
+        __call__ = staticmethod(refuse)
+
+    monkeypatch.setattr(
+        loop, "compiled_steps", lambda *given: [step._replace(run=Refusing(step.run)) for step in compiled(*given)]
+    )
     monkeypatch.setattr(loop, "device_bytes", lambda device: 3 * 2**30)
     if reason.startswith("INTERNAL"):
         with pytest.raises(jax.errors.JaxRuntimeError, match="broken"):
@@ -308,7 +333,7 @@ def test_a_step_that_does_not_fit_says_what_it_needs_and_what_lowers_it(
 
 def test_validation_reports_held_out_clips(run_config: TrainConfig, tmp_path: Path) -> None:
     source = SourceConfig(name="rooms", root=None, split="val", options=run_config.data.sources[0].options)
-    validation = ValidationConfig(source=source, every=4, num_clips=4, clip_length=3, stride=2, size=(28, 42))
+    validation = ValidationConfig(sources=(source,), every=4, num_clips=4, clip_length=3, stride=2, size=(28, 42))
     train(dataclasses.replace(run_config, validation=validation), tmp_path, mesh=data_mesh(2))
     entries = [entry for entry in _numbers(tmp_path) if "validation/abs_rel" in entry]
     # Once before the first step: what cannot be judged says so at once.
@@ -320,10 +345,59 @@ def test_validation_reports_held_out_clips(run_config: TrainConfig, tmp_path: Pa
         )
 
 
-def _validated(config: TrainConfig) -> TrainConfig:
+def _validated(config: TrainConfig, *, best: str | None = None) -> TrainConfig:
     source = SourceConfig(name="rooms", root=None, split="val", options=config.data.sources[0].options)
-    validation = ValidationConfig(source=source, every=3, num_clips=2, clip_length=3, stride=2, size=(28, 42))
+    validation = ValidationConfig(
+        sources=(source,), every=3, num_clips=2, clip_length=3, stride=2, size=(28, 42), best=best
+    )
     return dataclasses.replace(config, validation=validation)
+
+
+@pytest.mark.parametrize(
+    ("metric", "found", "kept"),
+    # After no step, three and six: errors are to be small and shares large, a tie or what is no number is no gain.
+    [("abs_rel", (0.5, 0.2, 0.2), 3), ("delta_1.25", (0.2, float("nan"), 0.3), 6), ("auc_30", (0.5, 0.4, 0.5), 0)],
+)
+def test_the_best_model_by_the_named_metric_is_kept(
+    metric: str, found: tuple[float, ...], kept: int, run_config: TrainConfig, tmp_path: Path
+) -> None:
+    values = {f"validation/{name}": 0.0 for name in (*VALIDATION_METRICS, "constant_abs_rel", "identity_rotation")}
+    with pytest.MonkeyPatch.context() as patch:
+        judged = iter(found)
+        patch.setattr(
+            loop, "Validation", lambda *_: lambda _: Judgement({**values, f"validation/{metric}": next(judged)}, {})
+        )
+        train(_validated(run_config, best=metric), tmp_path, mesh=data_mesh(1))
+    training = read_provenance(tmp_path / "best").training
+    assert training is not None and training.steps == kept
+    last = read_provenance(tmp_path / "model").training
+    assert last is not None and last.steps == 6
+
+
+def test_a_run_that_is_killed_between_its_best_model_and_the_line_about_it_shows_both(
+    run_config: TrainConfig, tmp_path: Path
+) -> None:
+    shown: list[int] = []
+
+    def show(_: MetricsLog, step: int, pictures: dict[str, np.ndarray]) -> None:
+        shown.append(step)
+        assert set(pictures) == {"validation/rooms/clip", "validation/rooms/trajectory"}
+        if shown == [0, 3]:
+            _crash()
+
+    config = _validated(run_config, best="abs_rel")
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyError, match="crash"):
+        patch.setattr(MetricsLog, "show", show)
+        train(config, tmp_path, mesh=data_mesh(1))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(MetricsLog, "show", show)
+        train(config, tmp_path, mesh=data_mesh(1))
+    assert shown == [0, 3, 3, 6]
+    lines = [entry for entry in _numbers(tmp_path) if "validation/abs_rel" in entry]
+    errors = {entry["step"]: entry["validation/abs_rel"] for entry in lines}
+    assert list(errors) == [0, 3, 6]
+    training = read_provenance(tmp_path / "best").training
+    assert training is not None and training.steps == min(errors, key=lambda step: errors[step])
 
 
 def test_a_validation_that_fails_has_its_checkpoint_and_is_made_up_for(
@@ -367,14 +441,14 @@ def test_a_save_or_a_validation_that_fails_says_so_before_the_first_step(
         monkeypatch.setattr("logvggt_jax.training.checkpoints.write_checkpoint", fail)
     else:
         monkeypatch.setattr(loop.Validation, "__call__", fail)
-    monkeypatch.setattr(loop._Run, "_program", lambda *_: pytest.fail("no step is to be compiled"))
+    monkeypatch.setattr(loop._Run, "_compile", lambda *_: pytest.fail("no step is to be compiled"))
     with pytest.raises(OSError, match="cannot be done"):
         train(_validated(run_config), tmp_path, mesh=data_mesh(1))
 
 
 def test_settings_may_change_until_a_step_is_done(run_config: TrainConfig, tmp_path: Path) -> None:
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyError, match="crash"):
-        patch.setattr(loop._Run, "_program", lambda *_: _crash())
+        patch.setattr(loop._Run, "_compile", lambda *_: _crash())
         train(run_config, tmp_path, mesh=data_mesh(1))
     other = dataclasses.replace(run_config, loss=dataclasses.replace(run_config.loss, alpha=0.5))
     assert int(train(other, tmp_path, mesh=data_mesh(1)).step) == 6

@@ -5,9 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from logvggt_jax.training.losses import camera_loss, depth_losses
+from logvggt_jax.training import losses
 
 WEIGHTS = {"translation_weight": 1.0, "rotation_weight": 1.0, "field_of_view_weight": 0.5, "gamma": 0.6}
+# As programs, which training runs: one by one each operation would compile by itself.
+camera_loss = jax.jit(losses.camera_loss, static_argnames=tuple(WEIGHTS))
+depth_losses = jax.jit(losses.depth_losses, static_argnames="alpha")
 
 
 def test_camera_loss_is_the_formula() -> None:
@@ -62,8 +65,30 @@ def test_nothing_valid_gives_zero_with_a_finite_gradient() -> None:
         camera = camera_loss(poses, jnp.zeros((1, 2, 9)), jnp.zeros((1, 2), bool), **WEIGHTS)
         return camera.value() + sum(term.value() for term in terms.values())
 
-    value, gradients = jax.value_and_grad(loss, (0, 1, 2))(jnp.ones(shape), jnp.ones(shape), jnp.ones((1, 2, 4, 9)))
+    value, gradients = jax.jit(jax.value_and_grad(loss, (0, 1, 2)))(
+        jnp.ones(shape), jnp.ones(shape), jnp.ones((1, 2, 4, 9))
+    )
     assert float(value) == 0.0 and all(not np.asarray(gradient).any() for gradient in gradients)
+
+
+def test_masked_pixels_frames_and_clips_have_no_gradient() -> None:
+    generator = np.random.default_rng(4)
+    shape = (3, 3, 4, 5)
+    depth, target, confidence = generator.uniform(1, 2, (3, *shape))
+    poses, wanted = generator.normal(size=(3, 3, 2, 9)), generator.normal(size=(3, 3, 9))
+    pixels, frames = generator.uniform(size=shape) < 0.7, np.ones((3, 3), bool)
+    frames[0, 2], frames[1] = False, False  # a frame of one clip, all of another
+    pixels &= frames[..., None, None]
+
+    def loss(depth: jax.Array, confidence: jax.Array, poses: jax.Array) -> jax.Array:
+        terms = depth_losses(depth, confidence, jnp.asarray(target), jnp.asarray(pixels), alpha=0.2)
+        camera = camera_loss(poses, jnp.asarray(wanted), jnp.asarray(frames), **WEIGHTS)
+        return camera.value() + sum(term.value() for term in terms.values())
+
+    of_depth, of_confidence, of_poses = jax.grad(loss, (0, 1, 2))(*map(jnp.asarray, (depth, confidence, poses)))
+    for gradient in (of_depth, of_confidence):
+        assert not np.asarray(gradient)[~pixels].any() and np.asarray(gradient)[pixels].any()
+    assert not np.asarray(of_poses)[~frames].any() and np.asarray(of_poses)[frames].all((-2, -1)).all()
 
 
 def test_invalid_pixels_have_no_influence() -> None:
@@ -72,5 +97,5 @@ def test_invalid_pixels_have_no_influence() -> None:
     confidence = generator.uniform(1, 3, (1, 2, 4, 5))
     valid = generator.uniform(size=(1, 2, 4, 5)) < 0.7
     other = np.where(valid, depth, 1e6)
-    losses = [depth_losses(*map(jnp.asarray, (d, confidence, target, valid)), alpha=0.2) for d in (depth, other)]
-    jax.tree.map(np.testing.assert_array_equal, *losses)
+    found = [depth_losses(*map(jnp.asarray, (d, confidence, target, valid)), alpha=0.2) for d in (depth, other)]
+    jax.tree.map(np.testing.assert_array_equal, *found)

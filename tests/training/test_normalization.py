@@ -6,10 +6,10 @@ import jax
 import numpy as np
 import pytest
 
-from logvggt_jax.geometry import unproject
+from logvggt_jax import geometry
 from logvggt_jax.training.normalization import Targets, normalize_clips
 
-NORMALIZE = jax.jit(normalize_clips)
+NORMALIZE, unproject = jax.jit(normalize_clips), jax.jit(geometry.unproject)
 
 
 def _normalize(clips: dict[str, np.ndarray], **changes: np.ndarray) -> Targets:
@@ -19,7 +19,7 @@ def _normalize(clips: dict[str, np.ndarray], **changes: np.ndarray) -> Targets:
 
 def test_agrees_with_the_released_trainer(golden_dir: Path) -> None:
     golden = np.load(golden_dir / "vggt_losses.npz")
-    targets = normalize_clips(golden["depths"], golden["intrinsics"], golden["extrinsics"])
+    targets = NORMALIZE(golden["depths"], golden["intrinsics"], golden["extrinsics"])
     valid = golden["point_masks"]
     np.testing.assert_array_equal(targets.depth_valid, valid)
     np.testing.assert_allclose(targets.extrinsics[..., :3, :], golden["norm_extrinsics"], atol=2e-6)

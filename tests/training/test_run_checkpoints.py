@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from logvggt_jax.config import from_mapping
-from logvggt_jax.errors import InputError, OutputExists
+from logvggt_jax.errors import DiskError, InputError, OutputExists
 from logvggt_jax.training import checkpoint_files
 from logvggt_jax.training import checkpoints as module
 from logvggt_jax.training.checkpoint_files import Position
@@ -275,6 +275,24 @@ def test_a_save_that_does_not_end_leaves_no_checkpoint(
     if full:
         assert [entry.name for entry in (saved / "checkpoints").iterdir()] == ["0"]
     _same(_restore(saved, run_config, state)[0], state)
+
+
+def test_a_disk_without_room_is_one_line_before_anything_is_written(
+    run_config: TrainConfig, state: TrainState, saved: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Parameters, two moments and counters, and the parameters once more in the model folder.
+    needed = 4 * 12 * 4 + 5 * 4
+    for room in (needed - 1, needed):
+        monkeypatch.setattr(shutil, "disk_usage", lambda _, room=room: shutil._ntuple_diskusage(room, 0, room))
+        with RunCheckpoints(saved, run_config) as checkpoints:
+            checkpoints.save(_at(state, 3), POSITION)
+            if room < needed:
+                with pytest.raises(DiskError, match=r"checkpoints/3: needs about 0\.0 MB, .*make room, and the same"):
+                    checkpoints.wait()
+                assert checkpoints.steps == [0] and len(list((saved / "checkpoints").iterdir())) == 1
+            else:
+                checkpoints.wait()
+                assert checkpoints.steps == [0, 3]
 
 
 def test_a_failed_save_is_told_by_the_next_step(

@@ -7,61 +7,23 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.sharding import PartitionSpec as P
+from parallel_runs import LayeredModel, Outcome, steps, steps_of_processes
 
-from logvggt_jax import LogVGGT, ModelConfig, Predictions
-from logvggt_jax.model.parameters import stack_layers, whole
+from logvggt_jax import LogVGGT, ModelConfig
+from logvggt_jax.model.parameters import stack_layers
 from logvggt_jax.training import loop
+from logvggt_jax.training.checkpoint_files import Position, StoredCheckpoint
 from logvggt_jax.training.config import LossConfig, TrainConfig
 from logvggt_jax.training.loop import train
 from logvggt_jax.training.program import make_program
-from logvggt_jax.training.sharding import check_batch_size, data_mesh, parameter_layout, put_batch
+from logvggt_jax.training.sharding import Layout, check_batch_size, data_mesh, parameter_layout, put_batch
 from logvggt_jax.training.step import loss_and_gradients, make_loss_terms
+from logvggt_jax.training.watchdog import Watchdog
 
 Clips = dict[str, np.ndarray]
-WIDTH = 16
-
-
-@dataclasses.dataclass(frozen=True)
-class LayeredModel:
-    """A loop over stacked layers before the pixels' model, which compiles at once; the interface of `LogVGGT`."""
-
-    config: ModelConfig
-    pixels: Any
-
-    def apply(
-        self, variables: Any, images: jax.Array, frame_mask: jax.Array | None = None, *, remat: bool = False
-    ) -> Predictions:
-        params = whole(variables["params"])
-
-        @jax.checkpoint
-        def layer(x: jax.Array, one: Any) -> tuple[jax.Array, None]:
-            one = whole(one)
-            return x + jnp.tanh(x @ one["kernel"] + one["bias"]), None
-
-        x = images.astype(jnp.float32) @ params["aggregator"]["embed"]["kernel"] / 255.0
-        x, _ = jax.lax.scan(layer, x, params["aggregator"]["frame_blocks"])
-        heads = {name: params[name] for name in ("depth_head", "camera_head")}
-        return self.pixels.apply({"params": heads}, 255.0 * x[..., :3], frame_mask)
-
-
-@pytest.fixture(scope="module")
-def layered(small_config: ModelConfig, pixel_model: Any) -> LayeredModel:
-    return LayeredModel(small_config, pixel_model)
-
-
-@pytest.fixture(scope="module")
-def layered_params(pixel_params: Any) -> Any:
-    generator = np.random.default_rng(3)
-
-    def normal(*shape: int) -> np.ndarray:
-        return (0.2 * generator.standard_normal(shape)).astype(np.float32)
-
-    blocks = {"kernel": normal(4, WIDTH, WIDTH), "bias": normal(4, WIDTH)}
-    return {**pixel_params, "aggregator": {"embed": {"kernel": normal(3, WIDTH)}, "frame_blocks": blocks}}
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +50,7 @@ def _gradients(
 
 
 @pytest.fixture(scope="module")
-def alone(layered: LayeredModel, loss_config: LossConfig, layered_params: Any, sixteen: Clips) -> Any:
+def alone(layered: Any, loss_config: LossConfig, layered_params: Any, sixteen: Clips) -> Any:
     return _gradients(layered, loss_config, layered_params, sixteen, 1, shard=False, accumulate=1)
 
 
@@ -100,7 +62,7 @@ def test_first_gradient_is_that_of_one_device(
     devices: int,
     shard: bool,
     accumulate: int,
-    layered: LayeredModel,
+    layered: Any,
     loss_config: LossConfig,
     layered_params: Any,
     sixteen: Clips,
@@ -129,6 +91,58 @@ def test_first_gradient_of_the_real_model_is_that_of_one_device(
     _agree(_gradients(model, loss_config, params, short, devices, shard=shard, accumulate=accumulate), one, rel=1e-5)
 
 
+def _gentle(config: TrainConfig, **changes: Any) -> TrainConfig:
+    """A rate at which differences of rounding stay what they are, all modules trained, and no clipping."""
+    encoder = dataclasses.replace(config.model.encoder, frozen=False)
+    return dataclasses.replace(
+        config,
+        model=dataclasses.replace(config.model, encoder=encoder),
+        optimizer=dataclasses.replace(config.optimizer, learning_rate=1e-4, clip_norm=1e9),
+        **changes,
+    )
+
+
+def _same_run(found: Outcome, expected: Outcome) -> None:
+    """The first gradient, module by module, and the losses of all steps."""
+    for module, gradients in expected.gradient.items():
+        difference = _norm(jax.tree.map(np.subtract, found.gradient[module], gradients))
+        assert difference <= 1e-5 * _norm(gradients), module
+    assert len(found.losses) == 20 and found.losses == pytest.approx(expected.losses, rel=1e-3)
+
+
+def test_twenty_steps_on_sixteen_devices_and_in_two_processes_are_those_of_one_device(
+    run_config: TrainConfig, layered: LayeredModel, layered_params: Any, sixteen: Clips, tmp_path: Path
+) -> None:
+    alone = steps(layered, _gentle(run_config), layered_params, sixteen, data_mesh(1), 20)
+    assert alone.losses[-1] < alone.losses[0] - 0.01, "it learns"
+    parts = _gentle(run_config, shard_parameters=True)
+    _same_run(steps(layered, parts, layered_params, sixteen, data_mesh(16), 20), alone)
+    both = dataclasses.replace(parts, accumulate=2)
+    _same_run(steps_of_processes(both, layered_params, sixteen, 20, tmp_path, layered=True), alone)
+
+
+@pytest.mark.slow
+def test_twenty_steps_of_the_real_model_are_the_same_on_all_devices_and_in_two_processes(
+    run_config: TrainConfig, sixteen: Clips, tmp_path: Path
+) -> None:
+    config = _gentle(run_config)
+    model = LogVGGT(config.model)
+    variables = model.init(jax.random.key(0), np.zeros((1, 1, 28, 42, 3), np.float32))
+    generator = np.random.default_rng(0)
+    params = jax.tree.map(
+        lambda x: x + 0.1 * generator.standard_normal(x.shape).astype(np.float32),
+        jax.device_get(stack_layers(variables["params"])),
+    )
+    short = {name: value[:, :3] for name, value in sixteen.items() if name != "frame_mask"}
+    alone = steps(model, config, params, short, data_mesh(1), 20)
+    for devices, shard, accumulate in ((1, False, 4), (4, False, 1), (4, True, 2), (16, False, 1), (16, True, 1)):
+        changed = dataclasses.replace(config, shard_parameters=shard, accumulate=accumulate)
+        _same_run(steps(model, changed, params, short, data_mesh(devices), 20), alone)
+    for shard, accumulate in ((False, 1), (True, 2)):
+        changed = dataclasses.replace(config, shard_parameters=shard, accumulate=accumulate)
+        _same_run(steps_of_processes(changed, params, short, 20, tmp_path, layered=False), alone)
+
+
 def _agree(found: Any, expected: Any, *, rel: float) -> None:
     """Objective, what is logged, and the gradient of every module and of all."""
     assert found[0] == pytest.approx(expected[0], rel=rel)
@@ -154,9 +168,7 @@ def test_matrices_are_split_along_no_axis_of_layers_and_vectors_stay_whole(layer
     assert not parameter_layout(layered_params, data_mesh(4), shard=False).axes
 
 
-def test_the_state_lies_in_its_place_from_the_start(
-    run_config: TrainConfig, layered: LayeredModel, layered_params: Any
-) -> None:
+def test_the_state_lies_in_its_place_from_the_start(run_config: TrainConfig, layered: Any, layered_params: Any) -> None:
     config = dataclasses.replace(run_config, shard_parameters=True, average=0.9)
     shapes = jax.eval_shape(lambda: layered_params)
     program = make_program(layered, config, shapes, data_mesh(4))
@@ -176,8 +188,58 @@ def test_the_state_lies_in_its_place_from_the_start(
     assert len(set(places)) == len(places)
 
 
+@pytest.mark.parametrize("shard", [True, False])
+def test_no_device_ever_holds_a_second_copy_when_a_run_starts_or_goes_on(
+    shard: bool,
+    run_config: TrainConfig,
+    layered: LayeredModel,
+    layered_params: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Shapes, then places, then values: each goes to where it stays, from the host or from the disk."""
+    monkeypatch.setattr(loop, "LogVGGT", lambda _: layered)
+    monkeypatch.setattr(loop, "abstract_parameters", lambda _: jax.eval_shape(lambda: layered_params))
+    monkeypatch.setattr("logvggt_jax.training.checkpoints.save_model", lambda *_: None)
+    config, mesh = dataclasses.replace(run_config, shard_parameters=shard, average=0.5), data_mesh(4)
+    before, held = {id(x) for x in jax.live_arrays()}, []
+
+    def look(*_: Any, **__: Any) -> None:
+        # An array and its parts are the same memory.
+        places = {
+            (part.device, part.data.unsafe_buffer_pointer()): part.data.nbytes
+            for array in (x for x in jax.live_arrays() if id(x) not in before)
+            for part in array.addressable_shards
+        }
+        held.append(max(sum(size for (at, _), size in places.items() if at == device) for device in mesh.devices.flat))
+
+    def initial(*_: Any, **__: Any) -> Any:
+        look()
+        return layered_params
+
+    monkeypatch.setattr(loop, "initial_parameters", initial)
+    put, read, verified = Layout.put, StoredCheckpoint.read, StoredCheckpoint.verified
+    monkeypatch.setattr(Layout, "put", lambda *given: (look(), put(*given), look())[1])
+    monkeypatch.setattr(StoredCheckpoint, "read", lambda *given: (look(), read(*given), look())[1])
+    monkeypatch.setattr(StoredCheckpoint, "verified", lambda *given: (look(), verified(*given), look())[1])
+    for step in (0, 1):
+        run = loop._Run(config, tmp_path, mesh, Watchdog(0))
+        with run.checkpoints as checkpoints:
+            run.start(None)
+            state = run.state
+            look()
+            size = max(sum(leaf.addressable_shards[i].data.nbytes for leaf in jax.tree.leaves(state)) for i in range(4))
+            assert held[0] == 0, "shapes alone until then"
+            assert max(held) == held[-1] == size
+            if step == 0:
+                checkpoints.save(state._replace(step=state.step + 1), Position(0, {}))
+                checkpoints.wait()
+        del run, state
+        before, held[:] = {id(x) for x in jax.live_arrays()}, []
+
+
 def test_steps_in_parts_are_those_of_whole_parameters(
-    run_config: TrainConfig, layered: LayeredModel, layered_params: Any, sixteen: Clips
+    run_config: TrainConfig, layered: Any, layered_params: Any, sixteen: Clips
 ) -> None:
     states = []
     for devices, shard, accumulate in ((1, False, 1), (4, True, 2)):
@@ -200,7 +262,7 @@ def test_steps_in_parts_are_those_of_whole_parameters(
 
 
 def test_the_average_follows_the_parameters(
-    run_config: TrainConfig, layered: LayeredModel, layered_params: Any, sixteen: Clips
+    run_config: TrainConfig, layered: Any, layered_params: Any, sixteen: Clips
 ) -> None:
     config, mesh = dataclasses.replace(run_config, average=0.75), data_mesh(1)
     program = make_program(layered, config, jax.eval_shape(lambda: layered_params), mesh)
@@ -219,7 +281,7 @@ def test_the_average_follows_the_parameters(
 
 def test_a_sharded_run_is_saved_on_sixteen_devices_and_goes_on_with_eight(
     run_config: TrainConfig,
-    layered: LayeredModel,
+    layered: Any,
     layered_params: Any,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,

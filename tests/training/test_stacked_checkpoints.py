@@ -30,7 +30,7 @@ def test_a_checkpoint_layer_by_layer_is_taken_up_as_stacks(
         "aggregator": {f"{kind}_block_{i}": layer() for kind in ("frame", "global") for i in range(4)},
         "camera_head": layer(),
     }
-    optimizer = make_optimizer(optimizer_config, params, frozen=("encoder",))
+    optimizer = make_optimizer(optimizer_config, params, frozen=("encoder/*",))
     state = initial_state(params, optimizer)
     state = jax.tree.map(lambda x: x + generator.standard_normal(x.shape).astype(x.dtype), state)
     rest = {name: value for name, value in state._asdict().items() if name not in ("params", "average")}

@@ -110,7 +110,7 @@ def test_steps_learn_and_are_traced_once(
         traces += 1
         return terms(params, batch)
 
-    optimizer = make_optimizer(optimizer_config, pixel_params, frozen=("encoder",))
+    optimizer = make_optimizer(optimizer_config, pixel_params, frozen=("encoder/*",))
     step = make_train_step(counted, loss_config, optimizer, learning_rate_schedule(optimizer_config, STAGES), layout)
     state = jax.device_put(initial_state(jax.tree.map(jnp.array, pixel_params), optimizer), replicated(mesh))
     losses, kinds = [], jax.tree.map(lambda x: (x.shape, x.dtype, x.weak_type), state)

@@ -31,7 +31,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 def config(run_config: TrainConfig) -> TrainConfig:
     """A hundred steps of four frames, sixty of six; saves at 30, 60, …, 150, and at the ends of the stages."""
     source = SourceConfig(name="rooms", root=None, split="val")
-    validation = ValidationConfig(source=source, every=70, num_clips=2, clip_length=2, stride=1, size=(28, 42))
+    validation = ValidationConfig(sources=(source,), every=70, num_clips=2, clip_length=2, stride=1, size=(28, 42))
     first, second = run_config.stages
     stages = dataclasses.replace(first, steps=100), dataclasses.replace(second, steps=60)
     return dataclasses.replace(run_config, stages=stages, validation=validation, save_every=30)
@@ -74,6 +74,12 @@ def test_means_are_of_finite_values_and_counters_are_the_last() -> None:
     assert means.read() == {"loss/total": 2.0, "learning_rate": 2.0, "skipped": 2.0, "longest_skip": 1.0}
     means.add({"loss/total": math.nan})
     assert math.isnan(means.read()["loss/total"])
+
+
+def test_goodput_is_not_known_where_the_clock_was_set_back() -> None:
+    assert progress.goodput(60, 120) == "goodput 50%: 1:00 of training in 2:00 since the first start"
+    for wall in (59.0, -3600.0):
+        assert progress.goodput(60, wall).startswith("goodput not known, 1:00 of training in less time: the clock was")
 
 
 def test_a_line_says_what_a_person_looks_for() -> None:

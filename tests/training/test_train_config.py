@@ -123,4 +123,4 @@ def test_values_are_checked_under_their_names(run_config: TrainConfig, path: str
 def test_the_size_of_validation_is_checked(run_config: TrainConfig) -> None:
     source = run_config.data.sources[0]
     with pytest.raises(InputError, match=r"^ValidationConfig\.size must be \(H, W\), multiples of 14 pixels, got"):
-        ValidationConfig(source, every=1, num_clips=1, clip_length=2, stride=1, size=(28, 50))
+        ValidationConfig((source,), every=1, num_clips=1, clip_length=2, stride=1, size=(28, 50))

@@ -1,14 +1,16 @@
 """`train.py` itself: one step of a real model, its validation and its files; and what it says when it ends badly."""
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from logvggt_jax.training.metrics_log import read_metrics
-from logvggt_jax.weights.checkpoints import load_model
+from logvggt_jax.weights.checkpoints import load_model, read_provenance
 
 ROOT = Path(__file__).parents[2]
 SETTINGS = (
@@ -23,7 +25,7 @@ SETTINGS = (
     "--config.data.sources.rooms.options.num_frames=24",
     "--config.validation.num_clips=2",
     "--config.validation.clip_length=4",
-    "--config.validation.source.options.num_rooms=2",
+    "--config.validation.sources.rooms.options.num_rooms=2",
 )
 
 
@@ -32,15 +34,36 @@ def run_train(workdir: Path, *arguments: str) -> subprocess.CompletedProcess[str
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600, check=False)
 
 
-def test_a_real_model_is_trained_validated_and_saved(tmp_path: Path) -> None:
-    finished = run_train(tmp_path / "run")
+@pytest.fixture(scope="module")
+def begun(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run that its time limit has ended after the first step."""
+    workdir = tmp_path_factory.mktemp("real") / "run"
+    finished = run_train(workdir, "--config.max_minutes=1e-9")
+    assert finished.returncode == 0, finished.stderr
+    assert "stage_1: step for images of 56 x 70 compiled" in finished.stdout
+    assert "step 1/2 stage_1" in finished.stdout and "stopping after step 1" in finished.stdout
+    return workdir
+
+
+def test_a_real_model_is_trained_validated_and_saved(begun: Path) -> None:
+    before, first = read_metrics(begun / "metrics.jsonl")
+    assert np.isfinite([first["loss/total"], before["validation/abs_rel"]]).all()
+    for name, steps in (("model", 1), ("best", 0)):
+        model, variables = load_model(begun / name)
+        assert model.config.encoder.depth == 1
+        assert set(variables["params"]) >= {"encoder", "aggregator", "camera_head", "depth_head"}
+        training = read_provenance(begun / name).training
+        assert training is not None and training.steps == steps
+
+
+def test_the_same_command_goes_on_with_parameters_in_parts(begun: Path, tmp_path: Path) -> None:
+    workdir = Path(shutil.copytree(begun, tmp_path / "run"))
+    finished = run_train(workdir, "--config.shard_parameters=True")
     assert finished.returncode == 0, finished.stderr
     assert "step 2/2 stage_2" in finished.stdout and "validation after step 2" in finished.stdout
-    *_, first, second, validation = read_metrics(tmp_path / "run" / "metrics.jsonl")
-    assert np.isfinite([first["loss/total"], second["loss/total"], validation["validation/abs_rel"]]).all()
-    model, variables = load_model(tmp_path / "run" / "model")
-    assert model.config.encoder.depth == 1
-    assert set(variables["params"]) >= {"encoder", "aggregator", "camera_head", "depth_head"}
+    earlier, (_, first, second, validation) = (read_metrics(at / "metrics.jsonl") for at in (begun, workdir))
+    assert first == earlier[1] and second["step"] == 2
+    assert np.isfinite([second["loss/total"], validation["validation/abs_rel"]]).all()
 
 
 def test_a_fault_of_ours_keeps_its_traceback(tmp_path: Path) -> None:

@@ -4,12 +4,17 @@ import json
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from logvggt_jax.training import vggt_losses
 from logvggt_jax.training.normalization import Targets, normalize_clips
-from logvggt_jax.training.vggt_losses import camera_losses, depth_losses
+
+# As programs, which training runs: one by one each operation would compile by itself.
+camera_losses = jax.jit(vggt_losses.camera_losses, static_argnames="gamma")
+depth_losses = jax.jit(vggt_losses.depth_losses, static_argnames=("alpha", "quantile"))
 
 Golden = tuple[Any, dict[str, Any], Targets]
 
@@ -18,7 +23,7 @@ Golden = tuple[Any, dict[str, Any], Targets]
 def golden(golden_dir: Path) -> Golden:
     arrays = np.load(golden_dir / "vggt_losses.npz")
     losses = json.loads((golden_dir / "vggt_losses.json").read_text())["losses"]
-    targets = normalize_clips(*(jnp.asarray(arrays[name]) for name in ("depths", "intrinsics", "extrinsics")))
+    targets = jax.jit(normalize_clips)(*(jnp.asarray(arrays[name]) for name in ("depths", "intrinsics", "extrinsics")))
     return arrays, losses, targets
 
 

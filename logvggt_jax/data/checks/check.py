@@ -71,7 +71,11 @@ def check_copy(
         raise InputError(f"max_sequences must be at least 1, got {max_sequences}")
     picture = None if picture is None else check_picture_path(picture)
     dataset = open_dataset(name, root, split)
-    assert isinstance(dataset, FolderDataset)  # as all in folders
+    if not isinstance(dataset, FolderDataset):
+        raise InputError(
+            f"{root} is a packed data set: check the copy that was packed; `logvggt data pack` with this folder as its "
+            "output verifies the shards"
+        )
     chosen = dataset.sequences
     if max_sequences is not None and max_sequences < len(chosen):
         chosen = tuple(chosen[i] for i in _spread(len(chosen), max_sequences))

@@ -37,6 +37,7 @@ class BatchIterator(Iterator[Batch]):
 
     Attributes:
       broken: clips of this process that were replaced.
+      sizes: (H, W) of the batches; one that no sequence is near to does not occur.
       draw: for data drawn on the device, the JAX function that makes a batch of clips from what `next` returns.
       names: of the last batch's clips: data set, sequence and frames.
     """
@@ -46,6 +47,7 @@ class BatchIterator(Iterator[Batch]):
         examples: grain.MapDataset,
         identity: Mapping[str, Any],
         broken: BrokenClips,
+        sizes: Sequence[Size],
         *,
         batch_size: int,
         process_index: int,
@@ -54,7 +56,7 @@ class BatchIterator(Iterator[Batch]):
         num_threads: int,
         draw: Callable[[Any], Any] | None = None,
     ) -> None:
-        self.broken, self.draw = broken, draw
+        self.broken, self.sizes, self.draw = broken, tuple(sizes), draw
         self._examples, self._identity = examples, dict(identity)
         self._batch_size, self._worker_count, self._num_threads = batch_size, worker_count, num_threads
         self._process_index, self._process_count = process_index, process_count
@@ -263,7 +265,7 @@ def training_batches(
         for name, dataset in datasets.items()
     }
     shares = {name: 1.0 if weights is None else float(weights[name]) for name in datasets}
-    examples, identity = mixture(
+    examples, identity, occurring = mixture(
         datasets,
         samplers,
         shares,
@@ -278,6 +280,7 @@ def training_batches(
         examples,
         identity,
         BrokenClips(max_broken),
+        occurring,
         batch_size=batch_size,
         process_index=process_index,
         process_count=process_count,

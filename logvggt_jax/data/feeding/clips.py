@@ -6,7 +6,7 @@ from typing import Any
 import grain
 import numpy as np
 
-from logvggt_jax.data.dataset import Dataset, DrawnOnDevice, check_frames
+from logvggt_jax.data.dataset import ConfidentDataset, Dataset, DrawnOnDevice, check_frames
 from logvggt_jax.data.feeding.augmentation import ColourAugmentation
 from logvggt_jax.data.feeding.broken_clips import describe
 from logvggt_jax.data.feeding.sampling import Sampler, example_rng
@@ -16,6 +16,7 @@ from logvggt_jax.errors import InputError
 Size = tuple[int, int]
 
 FIELDS = ("images", "depth", "intrinsics", "extrinsics")  # of clips that are not drawn on the device
+CONFIDENCE = "confidence"  # field of clips of a `ConfidentDataset`
 NAME = "name"  # field of a clip: its data set, sequence and frames
 BROKEN = "broken"  # field of a clip that took the place of a broken one: what was wrong with that
 # So many clips in a row are broken only if nearly all of those sequences are.
@@ -56,7 +57,14 @@ class ClipReader:
             )
         if self.augmentation is not None:
             self.augmentation(clip.images, rng)
-        return {**{name: getattr(clip, name) for name in FIELDS}, NAME: where}
+        fields = {name: getattr(clip, name) for name in FIELDS}
+        if isinstance(self.dataset, ConfidentDataset):
+            fields[CONFIDENCE] = self.dataset.confidence(sequence, indices)
+            if fields[CONFIDENCE].shape != clip.depth.shape:
+                raise InputError(
+                    f"{where}: labels of {fields[CONFIDENCE].shape[1:]} for clips of {self.size}: use one size"
+                )
+        return {**fields, NAME: where}
 
 
 class ReplaceBroken:

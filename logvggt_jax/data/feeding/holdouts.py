@@ -8,6 +8,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 
+from logvggt_jax.data.dataset import Dataset
+from logvggt_jax.data.frame_range import FrameRange, shared_frames
 from logvggt_jax.errors import InputError
 
 _SHOWN = 10
@@ -58,14 +60,17 @@ def check_held_out(
         )
 
 
-def check_disjoint(name: str, sequences: Sequence[str], evaluated: Sequence[str]) -> None:
-    """Raises InputError naming what training `sequences` of data set `name` share with the `evaluated` ones."""
-    kept = set(evaluated)
-    shared = [sequence for sequence in sequences if sequence in kept]
+def check_disjoint(name: str, trained: Dataset, evaluated: Dataset) -> None:
+    """Raises InputError naming the sequences that two views of data set `name` share, but for other frames of them."""
+    kept = set(evaluated.sequences)
+    shared = [sequence for sequence in trained.sequences if sequence in kept]
+    # Sequences are listed to be counted only where a range says that it matters.
+    if isinstance(trained, FrameRange) or isinstance(evaluated, FrameRange):
+        shared = [sequence for sequence in shared if shared_frames(trained, evaluated, sequence)]
     if shared:
         raise InputError(
             f"{name}: {len(shared)} sequences are trained on and validated on ({shown(shared)}): "
-            "choose other splits for data.sources and validation.source"
+            "choose other splits, or other frames, for data.sources and validation.sources"
         )
 
 

@@ -32,8 +32,9 @@ def mixture(
     augmentation: ColourAugmentation | None,
     min_valid_depth: float,
     replace_broken: bool,
-) -> tuple[grain.MapDataset, dict[str, Any]]:
-    """The endless examples of `training_batches`, and JSON values that say what they are drawn from.
+) -> tuple[grain.MapDataset, dict[str, Any], list[Size]]:
+    """The endless examples of `training_batches`, JSON values that say what they are drawn from, and the sizes that
+    occur among them.
 
     Examples are clips by index, `batch_size` in a row of one size; with `replace_broken` none of them fails, see
     `clips.ReplaceBroken`.
@@ -77,6 +78,7 @@ def mixture(
 
     examples: list[grain.MapDataset] = []
     size_shares: list[float] = []
+    occurring: list[Size] = []
     for size_index in range(len(sizes)):
         parts, part_shares = [], []
         for name in datasets:
@@ -86,6 +88,7 @@ def mixture(
         if parts:
             examples.append(parts[0] if len(parts) == 1 else grain.MapDataset.mix(parts, weights=part_shares))
             size_shares.append(sum(part_shares))
+            occurring.append(sizes[size_index])
     identity = {
         "seed": seed,
         "samplers": {name: repr(sampler) for name, sampler in samplers.items()},
@@ -100,7 +103,7 @@ def mixture(
         schedule = grain.MapDataset.mix(turns, weights=size_shares)
         examples = [grain.MapDataset.source(_OneSizeABatch(examples, schedule, batch_size))]
         identity["batch_size"] = batch_size
-    return examples[0], identity
+    return examples[0], identity, occurring
 
 
 class _OneSizeABatch:

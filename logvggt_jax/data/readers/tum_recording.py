@@ -98,7 +98,18 @@ class TUMRecording(FolderDataset):
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         image = read_rgb(record.image)
         intrinsics = in_pixels(record.intrinsics, image.shape[:2], record.image, record.calibration)
-        return image, read_depth_of(record, image, 1 / record.depth_scale), intrinsics
+        depth = read_depth_of(record, image, 1 / record.depth_scale)
+        # A few pixels tell a unit that is wrong by powers of ten.
+        few = depth[::8, ::8]
+        middle = float(np.median(few[few > 0])) if few.any() else 1.0
+        low, high = self.plausible_depth
+        if not low <= middle <= high:
+            raise InputError(
+                f"{record.depth}: half of the depth is beyond {middle:.3g} m, with depth_scale="
+                f"{1 / record.depth_scale:g} in {record.calibration}: give the units of the files in a metre there "
+                "(`logvggt data check tum_recording` tells more)"
+            )
+        return image, depth, intrinsics
 
 
 def _is_recording(folder: Path, files: SourceFiles) -> bool:

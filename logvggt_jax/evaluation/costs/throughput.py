@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -46,12 +46,14 @@ class TimingConfig:
 
 @dataclasses.dataclass(frozen=True)
 class StreamTime:
-    """One stream: seconds in all, until the first result, of each step; most bytes of arrays alive between frames."""
+    """One stream: seconds in all, until the first result, of each step; most bytes of arrays alive between frames, and
+    most bytes that the stream kept for the frames to come."""
 
     seconds: float
     first_result: float
     steps: list[float]
     live_bytes: int
+    state_bytes: int
 
 
 def random_pictures(image_size: tuple[int, int]) -> np.ndarray:
@@ -66,7 +68,7 @@ def time_stream(predictor: Predictor, pictures: np.ndarray, num_frames: int, *, 
     frames, which takes time of its own. Raises PredictionError where the predictor cannot take so many frames.
     """
     steps: list[float] = []
-    first_result, live = 0.0, 0
+    first_result, live, state = 0.0, 0, 0
     started = time.perf_counter()
     for index in range(num_frames):
         pushed = time.perf_counter()
@@ -75,10 +77,10 @@ def time_stream(predictor: Predictor, pictures: np.ndarray, num_frames: int, *, 
             steps.append(time.perf_counter() - pushed)
             first_result = first_result or time.perf_counter() - started
         if watch:
-            live = max(live, live_device_bytes())
+            live, state = max(live, live_device_bytes()), max(state, predictor.state_bytes)
     predictor.close()
     predictor.cameras()
-    return StreamTime(time.perf_counter() - started, first_result, steps, live)
+    return StreamTime(time.perf_counter() - started, first_result, steps, live, state)
 
 
 def measured_timings(
@@ -121,8 +123,7 @@ def measured_timings(
     rows = [*variant_methods(checkpoint, _MODES), *references]
     code = [code_version("evaluation/costs"), jax.__version__]
     key = record_key(code, setting, [[row.name, row.identity] for row in rows])
-    kept = output / "timings.json"
-    if not fresh and (found := _read(kept)).get("key") == key:
+    if not fresh and (found := kept_timings(output)).get("key") == key:
         return found
     pictures = random_pictures(image_size)
     rates: dict[str, dict[str, Any]] = {row.name: {} for row in rows}
@@ -147,8 +148,7 @@ def measured_timings(
             {"name": name, "seconds": sum(t.calls * t.median for t in times if t.name == name)} for name in PARTS
         ],
     }
-    output.mkdir(parents=True, exist_ok=True)
-    write_text(kept, json.dumps(plain(report), indent=1) + "\n")
+    keep_timings(output, report)
     return report
 
 
@@ -162,9 +162,16 @@ def _rates(row: Method, pictures: np.ndarray, length: int, rounds: int) -> list[
     return [length / run.seconds for run in runs[1:]]
 
 
-def _read(path: Path) -> dict[str, Any]:
+def keep_timings(output: Path, report: Mapping[str, Any]) -> None:
+    """Writes `output`/timings.json, for an evaluation that goes on."""
+    output.mkdir(parents=True, exist_ok=True)
+    write_text(output / "timings.json", json.dumps(plain(report), indent=1) + "\n")
+
+
+def kept_timings(output: Path) -> dict[str, Any]:
+    """What `keep_timings` wrote, or nothing."""
     try:
-        with open_regular(path) as stream:
+        with open_regular(output / "timings.json") as stream:
             found = json.loads(stream.read())
     except (OSError, ValueError, RecursionError):  # not there, or damaged: measured anew
         return {}

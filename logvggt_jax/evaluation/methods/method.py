@@ -71,14 +71,30 @@ def predicted(predictor: Predictor, images: np.ndarray) -> ClipPrediction:
     No frame has been pushed to the predictor, which is closed afterwards; images may be a memory map. Raises
     PredictionError where it cannot take this clip.
     """
+    depth = handed_out(predictor, images)
+    cameras = predictor.cameras()
+    return ClipPrediction(scaled(depth, cameras.depth_scale), cameras.extrinsics, cameras.intrinsics)
+
+
+def handed_out(predictor: Predictor, images: np.ndarray) -> np.ndarray:
+    """The depth [T, H, W] that a predictor hands out, as `predicted`."""
     depth = scratch_array(images.shape[:3], np.float32)
     for image in track(images, len(images), f"network, {len(images)} frames"):
         for result in predictor.push(image):
             depth[result.index] = result.depth
     for result in predictor.close():
         depth[result.index] = result.depth
-    cameras = predictor.cameras()
-    return ClipPrediction(depth, cameras.extrinsics, cameras.intrinsics)
+    return depth
+
+
+def scaled(depth: np.ndarray, scale: np.ndarray | None) -> np.ndarray:
+    """Depth [T, H, W] times factors [T] of its frames, in an array of its own; itself where there are none."""
+    if scale is None:
+        return depth
+    product = scratch_array(depth.shape, np.float32)
+    for index, factor in enumerate(scale):
+        product[index] = depth[index] * factor
+    return product
 
 
 def model_row(

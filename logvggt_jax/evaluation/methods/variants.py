@@ -1,4 +1,4 @@
-"""Ablations: one checkpoint run with parts switched off, other windows, or refinement at other times."""
+"""Ablations: one checkpoint run with parts switched off, other windows, refinement at other times, or loops closed."""
 
 import dataclasses
 import functools
@@ -9,9 +9,9 @@ import numpy as np
 
 from logvggt_jax.config import ModelConfig
 from logvggt_jax.errors import InputError
-from logvggt_jax.evaluation.methods.method import Checkpoint, ClipPrediction, Method, model_row, predicted
+from logvggt_jax.evaluation.methods.method import Checkpoint, ClipPrediction, Method, handed_out, model_row, scaled
 from logvggt_jax.model.logvggt import LogVGGT, Variables
-from logvggt_jax.streaming import StreamSession
+from logvggt_jax.streaming import ChunkPlan, StreamSession, WindowSettings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,6 +22,8 @@ class Variant:
     windows: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # fields of `WindowConfig`
     refinement: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # fields of `RefinementConfig`
     online: bool = False  # refinement after every window
+    loops: bool = False  # loops closed at the end
+    chained: bool = False  # windows that know nothing of one another, chained by what they say of the shared frames
 
     def config(self, base: ModelConfig, *, context: int | None = None) -> ModelConfig:
         """A checkpoint's configuration `base`, changed.
@@ -42,6 +44,8 @@ VARIANTS: Mapping[str, Variant] = {
     "gccr_every_50": Variant("GCCR every 50", refinement={"period": 50}),
     "gccr_every_100": Variant("GCCR every 100", refinement={"period": 100}),
     "gccr_online": Variant("GCCR online", online=True),
+    "gccr_loops": Variant("GCCR with loops", loops=True),
+    "windows_chained": Variant("relative chain of windows", chained=True),
     "no_cwa": Variant("w/o CWA", windows={"cross_window": False}),
     "no_cwa_no_gccr": Variant("w/o CWA and GCCR", windows={"cross_window": False}, refinement={"enabled": False}),
     "cache_output": Variant("cache of outputs", windows={"cache": "output"}),
@@ -57,7 +61,8 @@ VARIANTS: Mapping[str, Variant] = {
 
 
 def variant_methods(checkpoint: Checkpoint, names: Sequence[str]) -> list[Method]:
-    """Every variant of these names twice: the camera head's trunk over all frames, and limited to K.
+    """Every variant of these names twice: the camera head's trunk over all frames, and limited to K; chained windows
+    once, whose trunk sees one window.
 
     All share the checkpoint's sizes and parameters; none was trained for what it changes. A variant that is the same
     model as an earlier one is left out. Raises InputError for a name that is not one of `VARIANTS`.
@@ -66,17 +71,23 @@ def variant_methods(checkpoint: Checkpoint, names: Sequence[str]) -> list[Method
         if name not in VARIANTS:
             raise InputError(f"variants: unknown {name!r}; known are {', '.join(VARIANTS)}")
     base, clips = checkpoint.model.config, _SharedStream(checkpoint.variables)
-    methods: dict[ModelConfig, Method] = {}
+    methods: dict[tuple[ModelConfig, bool] | str, Method] = {}
     for name in names:
         variant = VARIANTS[name]
+        if variant.chained:
+            plan = ChunkPlan(base.windows.size, base.windows.size - base.windows.stride)
+            knows = "its training, which was not for this variant"
+            methods[name] = model_row("chunks", checkpoint, plan, name=variant.label, knows=knows)
+            continue
         for context in (None, variant.windows.get("size", base.windows.size)):
             config = variant.config(base, context=context)
             trunk = f"trunk {context or 'all'}"
             knows = "its training" if config == base else "its training, which was not for this variant"
-            predict = functools.partial(clips.predict, config)
-            row = model_row("windows", dataclasses.replace(checkpoint, model=LogVGGT(config)), knows=knows)
+            predict = functools.partial(clips.predict, config, loops=variant.loops)
+            settings = WindowSettings(loops=True) if variant.loops else None
+            row = model_row("windows", dataclasses.replace(checkpoint, model=LogVGGT(config)), settings, knows=knows)
             row = dataclasses.replace(row, name=f"{variant.label}, {trunk}", predict=predict)
-            methods.setdefault(config, row)
+            methods.setdefault((config, variant.loops), row)
     return list(methods.values())
 
 
@@ -88,16 +99,16 @@ class _SharedStream:
 
     def __init__(self, variables: Variables) -> None:
         self._variables = variables
-        self._last: tuple[np.ndarray, ModelConfig, StreamSession, ClipPrediction] | None = None
+        self._last: tuple[np.ndarray, ModelConfig, bool, StreamSession, np.ndarray] | None = None
 
-    def predict(self, config: ModelConfig, images: np.ndarray) -> ClipPrediction:
+    def predict(self, config: ModelConfig, images: np.ndarray, *, loops: bool) -> ClipPrediction:
         """The variant's prediction of images [T, H, W, 3]."""
         settings = dataclasses.replace(config.refinement, enabled=True, period=None, context=None)
         windows = dataclasses.replace(config, refinement=settings)
-        if self._last is None or self._last[0] is not images or self._last[1] != windows:
+        if self._last is None or self._last[0] is not images or self._last[1:3] != (windows, loops):
             self._last = None  # before the next is made
-            session = StreamSession(LogVGGT(windows), self._variables)
-            self._last = images, windows, session, predicted(session, images)
-        *_, session, prediction = self._last
+            session = StreamSession(LogVGGT(windows), self._variables, loops=loops)
+            self._last = images, windows, loops, session, handed_out(session, images)
+        *_, session, depth = self._last
         cameras = session.cameras_with(config.refinement)
-        return prediction._replace(extrinsics=cameras.extrinsics, intrinsics=cameras.intrinsics)
+        return ClipPrediction(scaled(depth, cameras.depth_scale), cameras.extrinsics, cameras.intrinsics)

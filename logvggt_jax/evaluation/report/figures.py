@@ -1,6 +1,6 @@
 """Pictures of results: trajectories, depth and point clouds beside their truth (matplotlib, no display needed)."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -161,6 +161,40 @@ def curves_plot(
     axis.set_ylim(bottom=0)
     axis.set_title(title, fontsize=9)
     axis.legend(fontsize=8)
+    _save(figure, path)
+
+
+def length_plot(
+    path: Path,
+    panels: Mapping[str, Mapping[str, Sequence[tuple[float, float]]]],
+    title: str,
+    *,
+    logarithmic: Collection[str] = (),
+) -> None:
+    """One panel a quantity side by side, in each the curves of (frames, value) of named methods, as a PNG file.
+
+    A method has one colour in all panels. Axes start at zero, but those of the panels named in `logarithmic`.
+    """
+    figure, axes = _figure(1, len(panels), (4.2 * len(panels), 4.6))
+    names = list(dict.fromkeys(name for curves in panels.values() for name in curves))
+    styles = {name: {"color": f"C{i % 10}", "linestyle": ("-", "--")[i // 10 % 2]} for i, name in enumerate(names)}
+    for axis, (quantity, curves) in zip(axes, panels.items(), strict=True):
+        for name, points in curves.items():
+            if points:
+                axis.plot(*zip(*points, strict=True), marker=".", label=name, **styles[name])
+        axis.set_title(quantity, fontsize=9)
+        axis.set_xlabel("frames of the sequence")
+        if quantity in logarithmic:
+            axis.set_yscale("log")
+        else:
+            axis.set_ylim(bottom=0)
+    labelled: dict[str, Any] = {}
+    for axis in axes:
+        lines, labels = axis.get_legend_handles_labels()
+        labelled |= dict(zip(labels, lines, strict=True))
+    shown = [name for name in names if name in labelled]
+    figure.legend([labelled[name] for name in shown], shown, loc="outside lower center", ncols=6, fontsize=8)
+    figure.suptitle(title, fontsize=9)
     _save(figure, path)
 
 

@@ -15,6 +15,13 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from logvggt_jax.errors import disk_errors, printable
+from logvggt_jax.evaluation.report.by_length import (
+    LENGTH_FIGURE,
+    has_costs,
+    length_panels,
+    length_tables,
+    logarithmic_panels,
+)
 from logvggt_jax.evaluation.report.page import html_page
 from logvggt_jax.evaluation.report.paper_tables import paper_tables
 from logvggt_jax.evaluation.report.tables import MARK, Table, benchmark_tables, coverage_table
@@ -66,7 +73,7 @@ def print_report(results: Mapping[str, Any], console: Console | None = None) -> 
 def write_report(results: Mapping[str, Any], output: Path) -> None:
     """Writes report.md, report.html (self-contained, with the figures) and every table as tables/<n>-<title>.csv."""
     made = tables(results)
-    _draw_ate_against_views(results, output)
+    _draw_curves(results, output)
     write_text(output / "report.md", _markdown(results, made))
     with disk_errors(output / "tables"):
         (output / "tables").mkdir(exist_ok=True)
@@ -74,15 +81,16 @@ def write_report(results: Mapping[str, Any], output: Path) -> None:
             old.unlink()
     for number, table in enumerate(made, start=1):
         write_text(output / "tables" / f"{number:02d}-{_slug(table.title)}.csv", _csv(table))
-    pictures = [output / name for name in [*_ate_figures(results), *results["figures"]]]
+    pictures = [output / name for name in [*_curve_figures(results), *results["figures"]]]
     lines = [*notes(results), f"{AGAIN} {printable(results['command'])}"]
     page = html_page(printable(results["title"]), made, lines, [path for path in pictures if path.is_file()])
     write_text(output / "report.html", page)
 
 
 def tables(results: Mapping[str, Any]) -> list[Table]:
-    """All tables, their text `printable`; for the paper's benchmarks their coverage and the paper's own come first."""
-    made = benchmark_tables(results)
+    """All tables, their text `printable`; those of growing sequences come first, or for the paper's benchmarks their
+    coverage and the paper's own."""
+    made = [*length_tables(results), *benchmark_tables(results)]
     if not all("-clips-" in benchmark["name"] for benchmark in results["benchmarks"]):
         made = [coverage_table(results), *paper_tables(results), *made]
     return [
@@ -154,7 +162,7 @@ def _markdown(results: Mapping[str, Any], made: list[Table]) -> str:
     lines += ["## Notes", ""] + [f"- {_markdown_text(line)}" for line in notes(results)]
     # A block of code: to be copied, and so not escaped.
     lines += ["", AGAIN, "", f"    {printable(results['command'])}"]
-    figures = [*_ate_figures(results), *results["figures"]]
+    figures = [*_curve_figures(results), *results["figures"]]
     if figures:
         lines += ["", "## Figures", ""]
         lines += [f"![{_markdown_text(printable(Path(name).stem))}]({quote(os.fsencode(name))})" for name in figures]
@@ -198,13 +206,17 @@ def _ate_curves(results: Mapping[str, Any]) -> dict[str, dict[str, list[tuple[in
     return curves
 
 
-def _ate_figures(results: Mapping[str, Any]) -> list[str]:
-    return [f"figures/ate_against_views_{dataset}.png" for dataset in _ate_curves(results)]
+def _curve_figures(results: Mapping[str, Any]) -> list[str]:
+    by_length = [LENGTH_FIGURE] if has_costs(results) else []
+    return [*by_length, *(f"figures/ate_against_views_{dataset}.png" for dataset in _ate_curves(results))]
 
 
-def _draw_ate_against_views(results: Mapping[str, Any], output: Path) -> None:
+def _draw_curves(results: Mapping[str, Any], output: Path) -> None:
     from logvggt_jax.evaluation.report import figures as plots
 
+    if has_costs(results):
+        panels, logarithmic = length_panels(results), logarithmic_panels()
+        plots.length_plot(output / LENGTH_FIGURE, panels, results["timings"]["device"], logarithmic=logarithmic)
     for dataset, curves in _ate_curves(results).items():
         path = output / f"figures/ate_against_views_{dataset}.png"
         plots.curves_plot(path, curves, f"ATE on {dataset}", x_label="views", y_label="ATE (m)")

@@ -1,19 +1,34 @@
 """Formats that a reconstruction can be written in: one file each, and its line in the registry.
 
 An exporter is called with the reconstruction, the path to write, and as keywords the `PointFilter` that says which
-pixels become points, and whether to show progress; it uses what its format holds. It reads the reconstruction through
-its handle and nothing else.
+pixels become points (None: the format's own choice), and whether to show progress; it uses what its format holds. It
+reads the reconstruction through its handle and nothing else.
 """
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Protocol
 
+from logvggt_jax.errors import InputError, OutputExists, disk_errors
+from logvggt_jax.files import atomic_folder, check_output, check_writable
+from logvggt_jax.reconstruction.exporters.colmap import export_colmap, export_colmap_text
+from logvggt_jax.reconstruction.exporters.depth_exr import export_depth_exr
+from logvggt_jax.reconstruction.exporters.depth_npz import export_depth_npz
+from logvggt_jax.reconstruction.exporters.depth_png import export_depth_png
+from logvggt_jax.reconstruction.exporters.euroc import export_euroc
+from logvggt_jax.reconstruction.exporters.glb import export_glb
+from logvggt_jax.reconstruction.exporters.kitti import export_kitti
+from logvggt_jax.reconstruction.exporters.libraries import check_library
+from logvggt_jax.reconstruction.exporters.nerfstudio import TRANSFORMS_FILE, export_nerfstudio
+from logvggt_jax.reconstruction.exporters.original_depth import DEPTH_INDEX
 from logvggt_jax.reconstruction.exporters.ply import export_ply
+from logvggt_jax.reconstruction.exporters.rosbag import export_rosbag
 from logvggt_jax.reconstruction.exporters.tum import export_tum
 from logvggt_jax.reconstruction.point_cloud import PointFilter
-from logvggt_jax.reconstruction.result import Reconstruction
+from logvggt_jax.reconstruction.result import EXPORT_FOLDER, Reconstruction
 
 
 class Exporter(Protocol):
@@ -22,8 +37,106 @@ class Exporter(Protocol):
     def __call__(
         self, result: Reconstruction, path: Path, *, point_filter: PointFilter | None = None, progress: bool = True
     ) -> None:
-        """Writes `path`, whole or not at all."""
+        """Writes the file `path`, whole or not at all, or fills `path`, an empty folder."""
 
 
-EXPORTERS: dict[str, Exporter] = {"ply": export_ply, "tum": export_tum}
-"""Exporters by the format's name."""
+@dataclasses.dataclass(frozen=True)
+class Format:
+    """A format of exports.
+
+    Attributes:
+      write: the exporter.
+      file: name of the file or folder that an export makes.
+      marker: a file that every such folder holds; None where a format is one file.
+      library: that it is written with; None for this package's own means.
+    """
+
+    write: Exporter
+    file: str
+    marker: str | None = None
+    library: str | None = None
+
+
+EXPORTERS: dict[str, Format] = {
+    "colmap": Format(export_colmap, "colmap", "sparse/0/cameras.bin", "pycolmap"),
+    "colmap-text": Format(export_colmap_text, "colmap-text", "sparse/0/cameras.txt", "pycolmap"),
+    "nerfstudio": Format(export_nerfstudio, "nerfstudio", TRANSFORMS_FILE),
+    "glb": Format(export_glb, "scene.glb", library="trimesh"),
+    "ply": Format(export_ply, "points.ply"),
+    "tum": Format(export_tum, "tum.txt"),
+    "kitti": Format(export_kitti, "kitti.txt"),
+    "euroc": Format(export_euroc, "euroc.csv"),
+    "depth-png": Format(export_depth_png, "depth-png", DEPTH_INDEX),
+    "depth-exr": Format(export_depth_exr, "depth-exr", DEPTH_INDEX, "OpenEXR"),
+    "depth-npz": Format(export_depth_npz, "depth-npz", DEPTH_INDEX),
+    "rosbag2": Format(export_rosbag, "rosbag2", "metadata.yaml", "rosbags"),
+}
+"""Formats by name."""
+
+
+def check_formats(names: Sequence[str]) -> None:
+    """InputError for a name of no format, MissingPackage for one whose library is not installed."""
+    for name in names:
+        if name not in EXPORTERS:
+            raise InputError(f"there is no format {name!r}: choose among {', '.join(EXPORTERS)}")
+        if (needed := EXPORTERS[name].library) is not None:
+            check_library(needed)
+
+
+def export(
+    result: Reconstruction,
+    names: Sequence[str],
+    output: str | Path | None = None,
+    *,
+    point_filter: PointFilter | None = None,
+    overwrite: bool = False,
+    progress: bool = True,
+) -> list[Path]:
+    """Writes a result in some formats; each is a file or folder of `output` that appears when it is whole.
+
+    All that can be checked is checked before the first is written. The result itself is only read.
+
+    Args:
+      result: the reconstruction.
+      names: keys of `EXPORTERS`.
+      output: folder, made if need be; None for `exports` of the result's own.
+      point_filter: which pixels become points; None leaves that to the formats.
+      overwrite: replace earlier exports.
+      progress: show progress bars where standard error is a terminal.
+
+    Returns:
+      What was written, in the order of the names.
+
+    Raises:
+      InputError: no such format, or a file of the result is damaged.
+      MissingPackage: the library of a format is not installed.
+      OutputExists: something is at a place where a format has to go.
+    """
+    check_formats(names)
+    names = list(dict.fromkeys(names))
+    folder = result.folder / EXPORT_FOLDER if output is None else Path(output).expanduser()
+    targets = [_checked(folder / EXPORTERS[name].file, EXPORTERS[name], overwrite) for name in names]
+    with disk_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    for name, target in zip(names, targets, strict=True):
+        write = EXPORTERS[name].write
+        if EXPORTERS[name].marker is None:
+            write(result, target, point_filter=point_filter, progress=progress)
+            continue
+        with atomic_folder(target, replace=overwrite) as partial, disk_errors(target):
+            write(result, partial, point_filter=point_filter, progress=progress)
+    return targets
+
+
+def _checked(target: Path, kind: Format, overwrite: bool) -> Path:
+    """The absolute path of an export, if it can go there."""
+    if kind.marker is not None:
+        target = check_output(target, overwrite=overwrite, marker=kind.marker)
+    else:
+        target = target.absolute()
+        with disk_errors(target):
+            if target.exists() and not (overwrite and target.is_file()):
+                mend = "choose another output" if target.is_dir() else "pass --overwrite to replace it"
+                raise OutputExists(f"{target} exists: {mend}")
+    check_writable(target)
+    return target

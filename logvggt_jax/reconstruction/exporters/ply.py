@@ -6,11 +6,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
-from rich.progress import track
 
+from logvggt_jax.reconstruction.exporters.cloud import frame_cloud, select_points
 from logvggt_jax.reconstruction.frame_pool import FramePool
-from logvggt_jax.reconstruction.point_cloud import PointFilter, PointSelection, frame_vertices, write_points
+from logvggt_jax.reconstruction.point_cloud import PointFilter, PointSelection, write_points
 from logvggt_jax.reconstruction.result import Reconstruction
 
 
@@ -25,13 +24,8 @@ def export_ply(
       point_filter: which pixels become points; None takes `PointFilter`'s defaults.
       progress: show a progress bar where standard error is a terminal.
     """
-    selection = PointSelection(point_filter or PointFilter(), result.num_frames)
     with FramePool() as pool:
-        frames = pool.map(lambda index: selection.see(index, *_read(result, index)), iter(range(result.num_frames)))
-        console = Console(stderr=True)
-        hidden = not (progress and console.is_terminal)
-        for _ in track(frames, "Points", result.num_frames, console=console, disable=hidden):
-            pass
+        selection = select_points(result, point_filter or PointFilter(), pool, progress=progress)
         write_cloud(result, path, selection, pool)
 
 
@@ -45,17 +39,10 @@ def write_cloud(
 ) -> None:
     """Writes the points that a selection, which has seen all frames, chooses of them; calls `advance` at each."""
 
-    def vertices(index: int) -> np.ndarray:
-        points = selection.choose(index, lambda: _read(result, index))
-        return frame_vertices(points, result.depth_size, result.depth_intrinsics[index], result.extrinsics[index])
-
     def advancing() -> Iterator[np.ndarray]:
-        for found in pool.map(vertices, iter(range(result.num_frames))):
+        frames = iter(range(result.num_frames))
+        for found in pool.map(lambda index: frame_cloud(result, selection, index), frames):
             yield found
             advance()
 
     write_points(path, selection.num_points, advancing())
-
-
-def _read(result: Reconstruction, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    return *result.depth_and_confidence(index), result.image(index)

@@ -58,6 +58,7 @@ class FolderSource(Source):
     def __init__(self, path: Path, options: SourceOptions) -> None:
         listing = list_pictures(path, options.pattern)
         super().__init__(listing.root if is_glob(path) and not path.exists() else path, options)
+        self.address = path
         self.notes += listing.left_out + listing.doubts
         self._doubts = listing.doubts
         self._lock = threading.Lock()

@@ -69,7 +69,9 @@ class VideoSource(Source):
             self._header = self._decoder.header()
             self._check_range(self._header)
             self.notes += self._header.notes
-        elif str(path).isdecimal():
+            return
+        self.address = None
+        if str(path).isdecimal():
             self._name = f"camera {path}"
             self._decoder = OpenCVDecoder(int(str(path)), self._name)
         else:

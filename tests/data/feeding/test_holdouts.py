@@ -5,6 +5,13 @@ import pytest
 from logvggt_jax.data.feeding.holdouts import PUBLISHED, HoldOut, check_disjoint, check_held_out
 
 
+class Named:
+    """A data set of which nothing but names is asked."""
+
+    def __init__(self, count: int) -> None:
+        self.sequences = [f"s{i}" for i in range(count)]
+
+
 def no_split(split: str) -> list[str]:
     raise AssertionError(f"split {split} was opened")
 
@@ -43,7 +50,7 @@ def test_patterns_have_wildcards_and_match_whole_parts():
 
 def test_long_lists_are_cut_short():
     with pytest.raises(ValueError, match=r"s0, s1, .*s9 and 20 more"):
-        check_disjoint("set", [f"s{i}" for i in range(40)], [f"s{i}" for i in range(30)])
+        check_disjoint("set", Named(40), Named(30))
 
 
 def test_a_rule_that_holds_nothing_out_is_refused():

@@ -68,6 +68,12 @@ def test_the_scale_of_depth_is_the_calibrations(recording: Path):
     np.testing.assert_allclose(frames.depth[0], 2 * VIEWS[0].depth, atol=2 * LAYOUT.depth_error)
 
 
+def test_depth_in_units_that_cannot_be_is_named_with_the_file_that_says_so(recording: Path):
+    (recording / "calibration.txt").write_text(f"{CALIBRATION}depth_scale 1\n")
+    with pytest.raises(InputError, match=r"half of the depth is beyond .* m, with depth_scale=1 in .*calibration\.txt"):
+        TUMRecording(recording.parent).read(NAME, [0])
+
+
 def test_intrinsics_follow_resized_pictures_and_refuse_other_shapes(recording: Path):
     path = recording / "calibration.txt"
     path.write_text("width 128\nheight 96\nfx 110\nfy 110\ncx 62\ncy 49.5\n")

@@ -11,6 +11,7 @@ from logvggt_jax.errors import InputError
 from logvggt_jax.evaluation.methods import variants as module
 from logvggt_jax.evaluation.methods.method import Checkpoint, ClipPrediction
 from logvggt_jax.evaluation.methods.variants import VARIANTS, variant_methods
+from logvggt_jax.streaming.loops import LoopCloser
 
 FRAMES = 9
 IMAGES = np.random.default_rng(0).integers(0, 256, (FRAMES, 28, 42, 3), np.uint8)
@@ -54,8 +55,8 @@ def test_windows_run_once_for_all_refinements(
     small_config: ModelConfig, small_variables: dict, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     runs = []
-    original = module.predicted
-    monkeypatch.setattr(module, "predicted", lambda session, images: runs.append(images) or original(session, images))
+    original = module.handed_out
+    monkeypatch.setattr(module, "handed_out", lambda session, images: runs.append(images) or original(session, images))
     names = ("full", "no_gccr", "no_cwa")
     methods = variant_methods(Checkpoint(LogVGGT(small_config), small_variables, ""), names)
     for _ in range(2):
@@ -63,6 +64,27 @@ def test_windows_run_once_for_all_refinements(
         predictions = {method.name: method.predict(images) for method in methods}
     assert np.abs(predictions["w/o GCCR, trunk 4"].extrinsics - predictions["full, trunk 4"].extrinsics).max() > 1e-5
     assert len(runs) == 2 * 2, "with and without cross-window attention, for either clip"
+
+
+def test_loops_and_chained_windows_are_rows(
+    small_config: ModelConfig, small_variables: dict, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Depth and cameras of the variant with loops are those that closing gave, of the others as without it."""
+    monkeypatch.setattr(
+        LoopCloser, "close", lambda self, cameras: cameras._replace(depth_scale=np.arange(FRAMES) + 1.0)
+    )
+    names = ("full", "gccr_loops", "windows_chained")
+    methods = variant_methods(Checkpoint(LogVGGT(small_config), small_variables, ""), names)
+    rows = {method.name: method for method in methods}
+    labels = [f"{label}, trunk {trunk}" for label in ("full", "GCCR with loops") for trunk in ("all", "4")]
+    assert list(rows) == [*labels, "relative chain of windows"]
+    assert len({repr(method.identity) for method in methods}) == 5
+    images = IMAGES.copy()
+    full, looped = (rows[f"{label}, trunk all"].predict(images) for label in ("full", "GCCR with loops"))
+    np.testing.assert_array_equal(looped.extrinsics, full.extrinsics)
+    assert full.depth is not None and looped.depth is not None
+    np.testing.assert_allclose(looped.depth, full.depth * (np.arange(FRAMES) + 1.0)[:, None, None], rtol=1e-6)
+    assert rows["relative chain of windows"].identity[:2] == ["chunks", {"size": 4, "overlap": 2, "loops": False}]
 
 
 def test_the_same_model_has_one_row(small_config: ModelConfig, small_variables: dict) -> None:

@@ -1,0 +1,123 @@
+"""What every method costs on this device, in one run: frames a second, operations and kept bytes of a frame.
+
+    python benchmarks/methods.py
+    python benchmarks/methods.py --checkpoint models/vggt-1b --image-size 392x518 --dtype bfloat16
+
+Without a checkpoint the model is that of configs/tiny.py with random parameters; values do not matter to the time.
+Pictures are in host memory and depth goes back to it, both within the time. A method's first stream of a length
+compiles and does not count; how many programs XLA makes in the timed ones is printed, and should be none.
+
+Operations are those of the program in which a method spends its time at the sequence's last frame, the costliest, over
+the frames that become final with it; a cache counts with its empty places, which a CPU computes as well. Bytes are the
+most that are kept between two frames for those to come, over the sequence's frames.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import statistics
+import sys
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+import jax
+import jax.numpy as jnp
+from rich.console import Console
+from rich.table import Table
+
+from logvggt_jax import LogVGGT, ModelConfig, load_model
+from logvggt_jax.evaluation.costs.by_length import cost_of_length
+from logvggt_jax.evaluation.costs.throughput import random_pictures
+from logvggt_jax.evaluation.environment import describe_device
+from logvggt_jax.evaluation.methods.method import Checkpoint, model_row
+from logvggt_jax.model.parameters import in_compute_type
+from logvggt_jax.streaming import METHODS
+
+
+def subject(options: argparse.Namespace) -> Checkpoint:
+    """The model, its parameters on the device."""
+    if options.checkpoint is None:
+        from configs import tiny
+
+        config, variables = ModelConfig.from_dict(tiny.get_config().to_dict()["model"]), None
+    else:
+        loaded, variables = load_model(options.checkpoint)
+        config = loaded.config
+    model = LogVGGT(dataclasses.replace(config, dtype=options.dtype or config.dtype))
+    if variables is None:
+        variables = model.init(jax.random.key(0), jnp.zeros((1, 1, *options.image_size, 3), jnp.uint8))
+    return Checkpoint(model, jax.device_put(in_compute_type(variables, model.config)), "")
+
+
+def measure(checkpoint: Checkpoint, options: argparse.Namespace) -> list[dict[str, Any]]:
+    """A row for each length and method, shortest first."""
+    pictures, rows = random_pictures(options.image_size), []
+    for length in sorted(options.lengths):
+        for method in options.methods:
+            settings = METHODS[method].settings()
+            if getattr(settings, "max_frames", None) is not None:
+                settings = dataclasses.replace(settings, max_frames=None)
+            cost = cost_of_length(model_row(method, checkpoint, settings), pictures, length, options.rounds)
+            program = METHODS[method].program(checkpoint.model, options.image_size, settings, length)
+            rows.append({"method": method, "frames": length, "flops": program.flops / program.frames, **cost})
+    return rows
+
+
+def print_table(console: Console, rows: list[dict[str, Any]]) -> None:
+    """All rows, and what frames a second are over those of `windows` at the same length."""
+    table = Table("frames", "method", "frames/s", "over windows", "GFLOP a frame", "state, kB a frame", "compilations")
+    rates = {
+        (row["method"], row["frames"]): statistics.median(row["frames_per_second"])
+        for row in rows
+        if "reason" not in row
+    }
+    for row in rows:
+        rate, windows = (rates.get((method, row["frames"])) for method in (row["method"], "windows"))
+        table.add_row(
+            str(row["frames"]),
+            row["method"],
+            row["reason"] if rate is None else f"{rate:.4g}",
+            "-" if rate is None or windows is None else f"{rate / windows:.2f}",
+            f"{row['flops'] / 1e9:,.4g}",
+            "-" if rate is None else f"{row['state_bytes'] / row['frames'] / 1e3:,.4g}",
+            "-" if rate is None else str(row["compilations"]),
+        )
+    console.print(table)
+
+
+def _size(text: str) -> tuple[int, int]:
+    height, separator, width = text.partition("x")
+    if not (separator and height.isdecimal() and width.isdecimal()) or int(height) % 14 or int(width) % 14:
+        raise argparse.ArgumentTypeError(f"expected height x width in multiples of 14 such as 56x70, got {text!r}")
+    return int(height), int(width)
+
+
+def main() -> None:
+    """Measures and prints."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--checkpoint", type=Path, help="model folder; default configs/tiny.py's model, random")
+    parser.add_argument("--image-size", type=_size, default=(56, 70), metavar="HxW", help="default 56x70")
+    parser.add_argument("--lengths", type=int, nargs="+", default=[50, 100, 500], help="frames of the streams")
+    parser.add_argument("--methods", nargs="+", choices=tuple(METHODS), default=list(METHODS), help="default all")
+    parser.add_argument("--rounds", type=int, default=3, help="timed streams of every length and method")
+    parser.add_argument("--dtype", choices=("float32", "bfloat16"), help="compute type instead of the model's own")
+    parser.add_argument("--output", type=Path, help="JSON file to write as well")
+    options = parser.parse_args()
+    console = Console()
+    console.width = max(console.width, 110)
+    checkpoint = subject(options)
+    height, width = options.image_size
+    console.print(f"{describe_device()}, {checkpoint.model.config.dtype}, {width} x {height} pixels, batch 1")
+    rows = measure(checkpoint, options)
+    print_table(console, rows)
+    if options.output is not None:
+        options.output.parent.mkdir(parents=True, exist_ok=True)
+        options.output.write_text(json.dumps(rows, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,126 @@
+"""Recordings of one's own in the form of nerfstudio: `transforms.json` with the cameras, pictures, and depth if any.
+
+Layout: the root is such a recording, or holds folders that are. `transforms.json` holds
+
+- `fl_x`, `fl_y`, `cx`, `cy`, `w`, `h`, for all frames, or in each of them where cameras differ; pixels, the centre of
+  the first one at (0.5, 0.5). `k1` … `k4`, `p1`, `p2` are 0 or left out, `camera_model` is `PINHOLE`, `SIMPLE_PINHOLE`
+  or `OPENCV`, or left out;
+- `frames`, each with a `file_path` relative to the recording, a `transform_matrix` (camera-to-world, [4, 4], axes of
+  OpenGL: x right, y up, z back) and for depth a `depth_file_path`: 16-bit, thousandths of the poses' unit of length, 0
+  where invalid, z and not ray length.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from logvggt_jax.data.dataset import EVALUATION, TRAINING, About
+from logvggt_jax.data.errors import missing_files
+from logvggt_jax.data.formats.calibration import OPENGL_AXES, in_pixels, pinhole, relative, world_to_camera
+from logvggt_jax.data.formats.image import read_rgb
+from logvggt_jax.data.formats.json_values import expecting, read_json, text_of
+from logvggt_jax.data.formats.ordering import natural_order
+from logvggt_jax.data.formats.source_files import SourceFiles
+from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame, read_depth_of
+from logvggt_jax.errors import InputError
+
+_TRANSFORMS = "transforms.json"
+_CAMERA = ("fl_x", "fl_y", "cx", "cy", "w", "h")
+_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+_PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")
+_DEPTH_UNITS = 1000.0
+
+
+class Nerfstudio(FolderDataset):
+    """Reader of nerfstudio's recordings; sequences are named as their folders, frames as their pictures.
+
+    Frames are in the natural order of their names (`img2` before `img10`). Where some have depth those without it do
+    not count (`no depth`); where none has, depth is 0 throughout, no pixel valid. Pictures may be resized copies: the
+    intrinsics follow their size.
+    """
+
+    name = "nerfstudio"
+    title = "own recordings in nerfstudio's form"
+    expects = f"{_TRANSFORMS} with cameras and frames, and the pictures and depth that it names, or folders that do"
+    metric = False
+    splits = ("all",)
+    about = About(
+        source="`ns-process-data` and apps that export nerfstudio's form; pictures undistorted",
+        licence="your own",
+        size="your own",
+        roles=(TRAINING, EVALUATION),
+    )
+
+    def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
+        if files.exists(self.root / _TRANSFORMS):
+            # A root such as "." has no name of its own.
+            return {self.root.resolve().name: self.root}
+        folders = files.folders(self.root, self.expects)
+        return {name: folder for name, folder in folders.items() if files.exists(folder / _TRANSFORMS)}
+
+    def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
+        path = folder / _TRANSFORMS
+        content = read_json(files.text(path, "cameras and frames in nerfstudio's form"), path)
+        with expecting(path, "an object with a list of frames"):
+            entries = [{**content, **entry} for entry in content["frames"]]
+            names = [_inside(path, entry["file_path"]) for entry in entries]
+            depths = [
+                _inside(path, entry["depth_file_path"]) if entry.get("depth_file_path") else None for entry in entries
+            ]
+        _check_present(files, path, [name for name in (*names, *depths) if name is not None])
+        for place in natural_order(names):
+            if depths[place] is None and any(depths):
+                yield Dropped("no depth")
+                continue
+            where = f"{path}, frames[{place}]"
+            with expecting(path, f"in frames[{place}] a camera and a transform_matrix"):
+                intrinsics = _intrinsics(entries[place], where)
+                pose = np.array(entries[place]["transform_matrix"], np.float64).reshape(-1, 4)
+                if len(pose) not in (3, 4):
+                    raise ValueError(f"a matrix of {len(pose)} x 4")
+            extrinsics = world_to_camera(pose @ OPENGL_AXES, where, stored="camera_to_world")
+            # A picture in depth's place stands for no depth.
+            depth = folder / (depths[place] or names[place])
+            yield frame(folder / names[place], depth, intrinsics, extrinsics, name=names[place], calibration=path)
+
+    def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        image = read_rgb(record.image)
+        intrinsics = in_pixels(record.intrinsics, image.shape[:2], record.image, record.calibration)
+        return image, read_depth_of(record, image, _DEPTH_UNITS), intrinsics
+
+
+def _inside(path: Path, name: Any) -> str:
+    """A file's name below the recording; InputError naming `path` for one that leads out of it."""
+    relative_name = PurePosixPath(text_of(name))
+    if relative_name.is_absolute() or ".." in relative_name.parts or not relative_name.name:
+        raise InputError(f"{path}: {name!r} is no file's name below {path.parent}: export the recording again")
+    return str(relative_name)
+
+
+def _check_present(files: SourceFiles, path: Path, names: Sequence[str]) -> None:
+    paths = [path.parent / name for name in names]
+    held = {
+        folder: set(files.names(folder, f"the files that {path} names")) for folder in {path.parent for path in paths}
+    }
+    absent = [each for each in paths if each.name not in held[each.parent]]
+    if absent:
+        raise missing_files(dict.fromkeys(absent, f"but {path} names it; copy it there"))
+
+
+def _intrinsics(entry: Mapping[str, Any], where: str) -> np.ndarray:
+    """Intrinsics [3, 3] of a picture of one pixel; the frame's own values come before those for all."""
+    model = entry.get("camera_model", "PINHOLE")
+    if model not in _PINHOLES or any(float(entry.get(name, 0.0)) for name in _DISTORTION):
+        raise InputError(
+            f"{where}: {model} with distortion, frames need a pinhole: undistort the pictures (`colmap "
+            "image_undistorter`; its output folder can be read as `colmap`)"
+        )
+    if absent := [name for name in _CAMERA if name not in entry]:
+        raise InputError(f"{where}: no {', '.join(absent)}, neither here nor for all frames: add what is missing")
+    fx, fy, cx, cy, width, height = (float(entry[name]) for name in _CAMERA)
+    if not (width >= 1 and height >= 1 and math.isfinite(width * height)):
+        raise InputError(f"{where}: pictures of w={width:g} x h={height:g} do not exist: edit the file")
+    return relative(pinhole(fx, fy, cx - 0.5, cy - 0.5), (int(height), int(width)))

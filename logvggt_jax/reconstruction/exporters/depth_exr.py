@@ -1,0 +1,28 @@
+"""Depth of every frame as OpenEXR, in a channel called Z."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from logvggt_jax.files import atomic_file
+from logvggt_jax.reconstruction.exporters.libraries import library
+from logvggt_jax.reconstruction.exporters.original_depth import original_depth, write_depth_folder
+from logvggt_jax.reconstruction.point_cloud import PointFilter
+from logvggt_jax.reconstruction.result import Reconstruction
+
+
+def export_depth_exr(
+    result: Reconstruction, path: Path, *, point_filter: PointFilter | None = None, progress: bool = True
+) -> None:
+    """Fills a folder with `<frame>.exr`, 32-bit floats at the size of the original images, and `depth.json`.
+
+    Raises MissingPackage without OpenEXR.
+    """
+    exr = library("OpenEXR")
+    header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
+
+    def write(file: Path, index: int) -> None:
+        with atomic_file(file) as temporary, exr.File(header, {"Z": original_depth(result, index)}) as picture:
+            picture.write(str(temporary))
+
+    write_depth_folder(result, path, ".exr", write, {"channel": "Z"}, progress=progress)

@@ -1,0 +1,24 @@
+"""Names of files for frames, which every reader of a format takes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+
+def file_stems(names: Sequence[str]) -> list[str]:
+    """Names without blanks and other characters that formats or shells take for something else; all differ.
+
+    COLMAP's text files separate their fields with blanks. Letters and digits of any script stay, and so do `.`, `-`
+    and `_`; names that nothing is wrong with stay as they are.
+    """
+    stems = ["".join(letter if letter.isalnum() or letter in ".-_" else "_" for letter in name) for name in names]
+    taken = {stem for stem, name in zip(stems, names, strict=True) if stem == name}
+    unique = []
+    for stem, name in zip(stems, names, strict=True):
+        candidate, number = stem, 1
+        while stem != name and candidate in taken:
+            number += 1
+            candidate = f"{stem}-{number}"
+        taken.add(candidate)
+        unique.append(candidate)
+    return unique

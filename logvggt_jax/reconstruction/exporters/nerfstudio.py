@@ -1,0 +1,54 @@
+"""nerfstudio's `transforms.json`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from logvggt_jax.files import write_text
+from logvggt_jax.geometry import invert
+from logvggt_jax.reconstruction.exporters.frame_names import file_stems
+from logvggt_jax.reconstruction.exporters.pictures import Pictures
+from logvggt_jax.reconstruction.exporters.ply import export_ply
+from logvggt_jax.reconstruction.exporters.tracks import NUM_POINTS
+from logvggt_jax.reconstruction.point_cloud import PointFilter
+from logvggt_jax.reconstruction.result import Reconstruction
+
+TRANSFORMS_FILE = "transforms.json"
+_POINTS = "points.ply"
+OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Turns x right, y down, z forward into x right, y up, z backward, and back."""
+
+
+def export_nerfstudio(
+    result: Reconstruction, path: Path, *, point_filter: PointFilter | None = None, progress: bool = True
+) -> None:
+    """Fills a folder with `transforms.json`, `images/` and `points.ply`.
+
+    Cameras are camera-to-world with OpenGL axes, in the world of the points; the centre of the first pixel is at
+    (0.5, 0.5). `point_filter` None gives 100,000 points.
+    """
+    pictures = Pictures.of(result)
+    height, width = pictures.size
+    files = pictures.write(path / "images", file_stems(result.names), progress=progress)
+    poses = np.asarray(invert(result.extrinsics)) @ OPENGL_FROM_OPENCV
+    frames = [
+        {
+            "file_path": f"images/{file}",
+            "fl_x": matrix[0, 0],
+            "fl_y": matrix[1, 1],
+            "cx": matrix[0, 2] + 0.5,
+            "cy": matrix[1, 2] + 0.5,
+            "w": width,
+            "h": height,
+            "transform_matrix": pose.tolist(),
+        }
+        for file, matrix, pose in zip(files, pictures.intrinsics, poses, strict=True)
+    ]
+    export_ply(
+        result, path / _POINTS, point_filter=point_filter or PointFilter(max_points=NUM_POINTS), progress=progress
+    )
+    document = {"camera_model": "OPENCV", "ply_file_path": _POINTS, "frames": frames}
+    write_text(path / TRANSFORMS_FILE, json.dumps(document, indent=1) + "\n")

@@ -1,0 +1,104 @@
+"""A result whose cameras, depth or unit differ from those of the one it is made from."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from logvggt_jax.data.feeding.transforms import ResizeTransform
+from logvggt_jax.errors import InputError, disk_errors
+from logvggt_jax.files import atomic_folder, check_output, check_writable
+from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE, write_cameras
+from logvggt_jax.reconstruction.depth_files import write_depth
+from logvggt_jax.reconstruction.exporters.ply import export_ply
+from logvggt_jax.reconstruction.exporters.tum import export_tum
+from logvggt_jax.reconstruction.frame_pool import FramePool
+from logvggt_jax.reconstruction.result import (
+    DEPTH_FOLDER,
+    IMAGE_FOLDER,
+    POINTS_FILE,
+    PREVIEW_FOLDER,
+    TRAJECTORY_FILE,
+    Reconstruction,
+    depth_file,
+    image_file,
+)
+
+
+def check_derived(result: Reconstruction, output: str | Path, *, overwrite: bool) -> Path:
+    """The absolute path for a result that is made from another; OutputExists or InputError if it cannot go there."""
+    target = check_output(output, overwrite=overwrite, marker=CAMERAS_FILE)
+    source = result.folder.resolve()
+    if target == source or source in target.parents or target in source.parents:
+        raise InputError(f"{target} is the result itself, or one lies in the other: choose another output")
+    check_writable(target)
+    return target
+
+
+def write_derived(
+    result: Reconstruction,
+    output: str | Path,
+    *,
+    frames: Sequence[int],
+    extrinsics: np.ndarray,
+    depth_scales: np.ndarray,
+    intrinsics: np.ndarray,
+    metric: bool,
+    overwrite: bool = False,
+    progress: bool = True,
+) -> Reconstruction:
+    """Writes a result with other cameras: depth is scaled, points are made anew, images stay.
+
+    Args:
+      result: the result that it is made from, which is only read.
+      output: folder to make; it appears when all is done.
+      frames: [n] numbers of the frames that it has.
+      extrinsics: [n, 3|4, 4] world-to-camera.
+      depth_scales: [n], by which the depth is multiplied.
+      intrinsics: [n, 3, 3] in pixels of the original images.
+      metric: whether lengths are metres.
+      overwrite: replace an earlier result.
+      progress: show a progress bar.
+
+    Raises:
+      OutputExists: something is at `output`.
+      InputError: a file of the result is damaged.
+    """
+    target = check_derived(result, output, overwrite=overwrite)
+    transform = ResizeTransform(result.image_size, result.depth_size)
+    names = [result.names[index] for index in frames]
+    with atomic_folder(target, replace=overwrite) as folder, disk_errors(target), FramePool() as pool:
+        for name in (DEPTH_FOLDER, IMAGE_FOLDER, PREVIEW_FOLDER):
+            (folder / name).mkdir()
+
+        def write(place: int) -> None:
+            depth, confidence = result.depth_and_confidence(frames[place])
+            write_depth(depth_file(folder, names[place]), depth_scales[place] * depth, confidence)
+            shutil.copyfile(image_file(result.folder, names[place]), image_file(folder, names[place]))
+            preview = f"{PREVIEW_FOLDER}/{names[place]}.png"
+            if (result.folder / preview).is_file():
+                shutil.copyfile(result.folder / preview, folder / preview)
+
+        for _ in pool.map(write, iter(range(len(frames)))):
+            pass
+        write_cameras(
+            folder / CAMERAS_FILE,
+            names=names,
+            timestamps=result.timestamps[list(frames)].tolist(),
+            extrinsics=np.asarray(extrinsics)[:, :3],
+            intrinsics=intrinsics,
+            image_size=result.image_size,
+            model_intrinsics=transform.intrinsics_from_original(intrinsics),
+            model_size=result.depth_size,
+            complete=result.complete,
+            noted_focal_length=result.noted_focal_length,
+            source=result.source,
+            metric=metric,
+        )
+        made = Reconstruction.with_cameras_of(folder)
+        export_tum(made, folder / TRAJECTORY_FILE)
+        export_ply(made, folder / POINTS_FILE, progress=progress)
+    return Reconstruction.open(target)

@@ -1,0 +1,54 @@
+"""Which frame of a result an external pose belongs to."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from logvggt_jax.errors import InputError
+from logvggt_jax.reconstruction.exporters.frame_names import file_stems
+from logvggt_jax.reconstruction.fusion.pose_files import ExternalPose
+from logvggt_jax.reconstruction.result import Reconstruction
+
+
+def match_poses(result: Reconstruction, poses: Sequence[ExternalPose], path: str | Path) -> dict[int, ExternalPose]:
+    """Poses by the number of their frame, in the order of the frames.
+
+    Names are compared as they are and as exports write them; time stamps belong to the nearest frame, at most half a
+    step away, and of several poses at one frame the nearest counts.
+
+    Raises:
+      InputError: no pose belongs to any frame; `path` is where they are from.
+    """
+    if poses[0].name is not None:
+        by_name = {pose.name: pose for pose in poses}
+        stems = file_stems(result.names)
+        found = {
+            index: by_name.get(name, by_name.get(stem))
+            for index, (name, stem) in enumerate(zip(result.names, stems, strict=True))
+        }
+        matched = {index: pose for index, pose in found.items() if pose is not None}
+        if not matched:
+            raise InputError(
+                f"{path}: none of its {len(poses)} pictures ({poses[0].name!r}, …) has the name of one of the "
+                f"{result.num_frames} frames ({result.names[0]!r}, …)"
+            )
+        return matched
+    times, order = result.timestamps, np.argsort(result.timestamps)
+    step = float(np.median(np.diff(times[order]))) if len(times) > 1 else 1.0
+    given = np.array([pose.timestamp for pose in poses], np.float64)
+    nearest: dict[int, ExternalPose] = {}
+    for pose, time in zip(poses, given, strict=True):
+        index = int(np.abs(times - time).argmin())
+        distance = abs(times[index] - time)
+        other = nearest.get(index)
+        if distance <= step / 2 and (other is None or distance < abs(times[index] - (other.timestamp or 0.0))):
+            nearest[index] = pose
+    if not nearest:
+        raise InputError(
+            f"{path}: its times, {given.min():g} to {given.max():g}, are none of the frames', {times.min():g} to "
+            f"{times.max():g}, to half a step of {step:g}; are they seconds of the same clock?"
+        )
+    return dict(sorted(nearest.items()))

@@ -1,0 +1,121 @@
+"""Cameras from other programs: COLMAP models, nerfstudio's transforms.json, TUM trajectories."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path, PurePosixPath
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from logvggt_jax.data.formats.calibration import check_intrinsics, world_to_camera
+from logvggt_jax.data.formats.colmap_model import read_cameras, read_images
+from logvggt_jax.data.formats.source_files import SourceFiles
+from logvggt_jax.errors import InputError, MissingInput, disk_errors
+from logvggt_jax.files import open_regular
+from logvggt_jax.reconstruction.exporters.nerfstudio import OPENGL_FROM_OPENCV, TRANSFORMS_FILE
+from logvggt_jax.reconstruction.exporters.tum import read_trajectory
+
+# The squares of larger numbers are infinite in float32.
+_LARGEST = 1e18
+
+
+class ExternalPose(NamedTuple):
+    """A camera that another program has found.
+
+    Attributes:
+      name: of its picture, without folder and suffix; None where there is a time stamp instead.
+      timestamp: seconds; None where there is a name instead.
+      extrinsics: [4, 4] float64 world-to-camera, OpenCV axes.
+      intrinsics: [3, 3] float64 in pixels of its picture, centres at integers; None where they are unknown or the
+        lens is no pinhole.
+      size: (H, W) of the picture that the intrinsics belong to.
+    """
+
+    name: str | None
+    timestamp: float | None
+    extrinsics: np.ndarray
+    intrinsics: np.ndarray | None = None
+    size: tuple[int, int] | None = None
+
+
+def read_poses(path: str | Path) -> list[ExternalPose]:
+    """The cameras of a COLMAP folder, of a `transforms.json` (or its folder), or of a trajectory in TUM's format.
+
+    Raises:
+      MissingInput: nothing is there.
+      InputError: it is none of these, damaged, or holds no pose; names file and line or picture.
+    """
+    path = Path(path).expanduser()
+    with disk_errors(path):
+        path.stat()
+        if path.is_dir():
+            if (path / TRANSFORMS_FILE).exists():
+                poses = _nerfstudio(path / TRANSFORMS_FILE)
+            else:
+                poses = _colmap(path)
+        elif path.suffix.lower() == ".json":
+            poses = _nerfstudio(path)
+        else:
+            timestamps, extrinsics = read_trajectory(path)
+            poses = [ExternalPose(None, float(time), pose) for time, pose in zip(timestamps, extrinsics, strict=True)]
+    if not poses:
+        raise InputError(f"{path} holds no pose")
+    for pose in poses:
+        if not (np.abs(pose.extrinsics) < _LARGEST).all():
+            raise InputError(f"{path}: the pose of {pose.name or pose.timestamp!r} is too large to be one")
+        if pose.intrinsics is not None and pose.size is not None:
+            check_intrinsics(pose.intrinsics, pose.size, Path(pose.name or ""), path)
+    return poses
+
+
+def _colmap(folder: Path) -> list[ExternalPose]:
+    models = [folder / "sparse" / "0", folder / "sparse", folder]
+    model = next((each for each in models if any((each / f"images.{kind}").exists() for kind in ("bin", "txt"))), None)
+    if model is None:
+        raise MissingInput(
+            f"{folder} holds no poses: expected {TRANSFORMS_FILE}, or COLMAP's images.bin or images.txt, there, in "
+            "sparse or in sparse/0"
+        )
+    files = SourceFiles()
+    (_, cameras), (file, images) = read_cameras(files, model), read_images(files, model)
+    poses = []
+    for image in images:
+        if image.extrinsics is None:
+            continue
+        if image.camera not in cameras:
+            raise InputError(f"{file}: {image.name!r} has camera {image.camera}, which is not there: export it again")
+        camera = cameras[image.camera]
+        poses.append(
+            ExternalPose(PurePosixPath(image.name).stem, None, image.extrinsics, camera.intrinsics(), camera.size)
+        )
+    return poses
+
+
+def _nerfstudio(path: Path) -> list[ExternalPose]:
+    with open_regular(path) as stream:
+        content = stream.read()
+    try:
+        document = json.loads(content.decode())
+        return [_nerfstudio_frame(document, frame, path) for frame in document["frames"]]
+    except InputError:
+        raise
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+        reason = f"no {error}" if isinstance(error, KeyError) else error
+        raise InputError(f"{path} is no transforms.json of nerfstudio, or damaged: {reason}") from error
+
+
+def _nerfstudio_frame(document: dict[str, Any], frame: dict[str, Any], path: Path) -> ExternalPose:
+    name = PurePosixPath(frame["file_path"]).stem
+    pose = np.array(frame["transform_matrix"], np.float64)
+    if pose.shape not in ((3, 4), (4, 4)) or not (np.abs(pose) < _LARGEST).all():
+        raise InputError(f"{path}: transform_matrix of {name!r} must be [4, 4] finite numbers, got shape {pose.shape}")
+    extrinsics = world_to_camera(pose @ OPENGL_FROM_OPENCV, f"{path}, {name!r}", stored="camera_to_world")
+    assert extrinsics is not None  # it is finite
+    values = {**document, **frame}
+    distorted = any(values.get(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    if distorted or not all(key in values for key in ("fl_x", "fl_y", "cx", "cy", "w", "h")):
+        return ExternalPose(name, None, extrinsics)
+    fx, fy, cx, cy = (float(values[key]) for key in ("fl_x", "fl_y", "cx", "cy"))
+    intrinsics = np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]])
+    return ExternalPose(name, None, extrinsics, intrinsics, (int(values["h"]), int(values["w"])))

@@ -1,0 +1,58 @@
+"""Two predictions of the same frames, each in a world and unit of its own, carried onto one another."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from logvggt_jax.geometry import Similarity, robust_similarity, unproject_pixels
+from logvggt_jax.streaming.offline import PlainPrediction
+
+# Shared pixels that fit a similarity: seven numbers need no more, and every chunk solves for them six times.
+_MOST_POINTS = 200_000
+# Pixels less confident than this share of the median are left out.
+_LEAST_CONFIDENCE = 0.1
+# Residuals count linearly beyond this share of the median depth.
+_HUBER_THRESHOLD = 0.1
+
+
+def align(source: PlainPrediction, target: PlainPrediction) -> Similarity:
+    """The similarity that carries one prediction of some frames onto another of the same frames.
+
+    It fits the points of the same pixels where both are confident, weighted by the geometric mean of both
+    confidences, with Huber weights against what the predictions disagree about.
+
+    Raises:
+      ValueError: fewer than three pixels are valid in both, or their points lie on a line.
+    """
+    valid = confident(source, target)
+    chosen = np.flatnonzero(valid)
+    if len(chosen) > _MOST_POINTS:
+        chosen = chosen[np.linspace(0, len(chosen) - 1, _MOST_POINTS).round().astype(int)]
+    if len(chosen) < 3:
+        raise ValueError(f"{len(chosen)} of {valid.size} pixels have a valid depth and confidence in both")
+    weights = np.sqrt(source.depth_confidence.reshape(-1)[chosen].astype(np.float64))
+    weights *= np.sqrt(target.depth_confidence.reshape(-1)[chosen].astype(np.float64))
+    threshold = _HUBER_THRESHOLD * float(np.median(target.depth.reshape(-1)[chosen]))
+    clouds = [unproject_pixels(each.depth, each.intrinsics, each.extrinsics, chosen) for each in (source, target)]
+    return robust_similarity(clouds[0], clouds[1], weights, threshold=threshold)
+
+
+def move(prediction: PlainPrediction, similarity: Similarity) -> PlainPrediction:
+    """The same prediction in the world and unit that `similarity` maps to; float32."""
+    points = prediction.points
+    return prediction._replace(
+        depth=(similarity.scale * prediction.depth).astype(np.float32),
+        extrinsics=similarity.apply_to_extrinsics(prediction.extrinsics).astype(np.float32),
+        points=None if points is None else similarity.apply(points).astype(np.float32),
+    )
+
+
+def confident(source: PlainPrediction, target: PlainPrediction) -> np.ndarray:
+    """Pixels [n, H, W] that both predictions know something of."""
+    valid = np.ones(source.depth.shape, bool)
+    for prediction in (source, target):
+        valid &= np.isfinite(prediction.depth) & (prediction.depth > 0) & np.isfinite(prediction.depth_confidence)
+    if valid.any():
+        least = _LEAST_CONFIDENCE * min(float(np.median(p.depth_confidence[valid])) for p in (source, target))
+        valid &= (source.depth_confidence > least) & (target.depth_confidence > least)
+    return valid

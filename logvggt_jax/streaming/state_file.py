@@ -1,0 +1,105 @@
+"""A stream's state in a file: what a snapshot holds, which model it belongs to, and a digest of both."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+
+from logvggt_jax.errors import InputError, disk_errors, one_line
+from logvggt_jax.files import atomic_file, to_disk
+from logvggt_jax.model.logvggt import LogVGGT, Variables
+from logvggt_jax.streaming.predictor import Predictor
+from logvggt_jax.streaming.results import FrameResult
+from logvggt_jax.weights.digests import digests, json_digest
+
+
+class State(NamedTuple):
+    """Arrays by name, and what else there is to know, as JSON takes it."""
+
+    arrays: dict[str, np.ndarray]
+    facts: dict[str, Any]
+
+
+def save_stream(path: str | Path, predictor: Predictor, model: LogVGGT, variables: Variables) -> list[FrameResult]:
+    """Writes the state of a stream, for `load_stream`; the frames that became final by now, oldest first.
+
+    The stream goes on as if nothing had been asked. The file is replaced as a whole, and on the disk on return.
+
+    Args:
+      path: of the file, by custom `.safetensors`.
+      predictor: the stream.
+      model: its model.
+      variables: {"params": …}, its parameters, whose digest goes into the file.
+
+    Raises:
+      DiskError: the file cannot be written.
+    """
+    results, arrays = predictor.snapshot()
+    write_state(path, State(arrays, _facts(predictor, model, variables)))
+    return results
+
+
+def load_stream(path: str | Path, predictor: Predictor, model: LogVGGT, variables: Variables) -> None:
+    """Takes up a stream that `save_stream` wrote: it gives what it would have given, to the same bits.
+
+    Args:
+      path: of the file.
+      predictor: one that has seen no frame, of the same method and settings.
+      model: its model.
+      variables: {"params": …}, its parameters.
+
+    Raises:
+      InputError: the file is missing or damaged, or of another method, model or parameters.
+    """
+    state, facts = read_state(path), _facts(predictor, model, variables)
+    if others := sorted(name for name in facts if state.facts.get(name) != facts[name]):
+        raise InputError(f"{path}: the state of a stream that differs in {', '.join(others)}; open the same stream")
+    predictor.restore(state.arrays)
+
+
+def write_state(path: str | Path, state: State) -> None:
+    """Writes arrays and facts with their digest, whole or not at all, and on the disk on return."""
+    path = Path(path)
+    arrays = {name: np.ascontiguousarray(array) for name, array in state.arrays.items()}
+    facts = json.dumps(state.facts)
+    with disk_errors(path), atomic_file(path) as temporary:
+        save_file(arrays, temporary, metadata={"facts": facts, "digest": _digest(facts, arrays)})
+        to_disk([temporary])
+
+
+def read_state(path: str | Path) -> State:
+    """What `write_state` wrote. InputError where the file is missing or damaged."""
+    try:
+        with disk_errors(path), safe_open(path, "numpy") as stored:
+            described = stored.metadata()
+            arrays = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118
+        if described["digest"] != _digest(described["facts"], arrays):
+            raise ValueError("its digest differs")
+    except (SafetensorError, ValueError, KeyError, TypeError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: damaged ({one_line(error)})") from error
+    return State(arrays, json.loads(described["facts"]))
+
+
+def _facts(predictor: Predictor, model: LogVGGT, variables: Variables) -> dict[str, Any]:
+    return {
+        "method": type(predictor).__name__,
+        "model": json_digest(model.config.to_dict()),
+        "parameters": json_digest(digests(variables)),
+    }
+
+
+def _digest(facts: str, arrays: Mapping[str, np.ndarray]) -> str:
+    digest = hashlib.blake2b(facts.encode(), digest_size=16)
+    for name in sorted(arrays):
+        digest.update(f"{name} {arrays[name].dtype.name} {arrays[name].shape}".encode())
+        digest.update(np.ascontiguousarray(arrays[name]).reshape(-1).view(np.uint8).data)  # no copy of its bytes
+    return digest.hexdigest()

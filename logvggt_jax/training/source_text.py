@@ -1,0 +1,61 @@
+"""Data sources as the command line has them: `seven_scenes=/data/7scenes,frames=:700,stride=1:4`."""
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from logvggt_jax.errors import InputError
+
+_FORM = "NAME=FOLDER, then any of ,split=SPLIT ,frames=FIRST:STOP ,stride=LEAST:MOST ,weight=NUMBER"
+_FIELDS = re.compile(r"(.*?)((?:,(?:split|frames|stride|weight)=[^,]*)*)", re.DOTALL)
+
+
+def with_sources(settings: Mapping[str, Any], trained: Sequence[str], validated: str | None) -> dict[str, Any]:
+    """The settings of a run with other sources, as `parse_source` reads them, to train and to validate on.
+
+    No texts, or None, leave what is there. Raises InputError as `parse_source`, for a data set that is named twice, and
+    for a run without validation.
+    """
+    changed = dict(settings)
+    if trained:
+        sources = [parse_source(text) for text in trained]
+        names = [source["name"] for source in sources]
+        for name in names:
+            if names.count(name) > 1:
+                raise InputError(f"--source: {name} is named twice; one folder of it may hold several sequences")
+        changed["data"] = {**settings["data"], "sources": sources}
+    if validated is not None:
+        if settings["validation"] is None:
+            raise InputError("--validation_source: this configuration validates nothing")
+        changed["validation"] = {**settings["validation"], "sources": [parse_source(validated)]}
+    return changed
+
+
+def parse_source(text: str) -> dict[str, Any]:
+    """The fields of a `SourceConfig` from `NAME=FOLDER,split=…,frames=FIRST:STOP,stride=LEAST:MOST,weight=…`.
+
+    All but name and folder may be left out; the split is then `all`. Of `frames` either end may be left out or count
+    from the end, as in a slice. An empty folder is none (`rooms=`). Raises InputError for another form.
+    """
+    name, given, rest = text.partition("=")
+    match = _FIELDS.fullmatch(rest)
+    if not (name and given and match):
+        raise InputError(f"a source is {_FORM}; got {text!r}")
+    source: dict[str, Any] = {"name": name, "root": match[1] or None, "split": "all"}
+    for field in filter(None, match[2].split(",")):
+        key, _, value = field.partition("=")
+        try:
+            source[key] = _READ[key](value)
+        except ValueError:
+            raise InputError(f"{field!r} in {text!r}: a source is {_FORM}") from None
+    return source
+
+
+def _pair(text: str) -> tuple[int | None, int | None]:
+    first, colon, last = text.partition(":")
+    if not colon:
+        raise ValueError(text)
+    return int(first) if first else None, int(last) if last else None
+
+
+_READ: dict[str, Callable[[str], Any]] = {"split": str, "frames": _pair, "stride": _pair, "weight": float}

@@ -1,0 +1,42 @@
+"""Pictures without cameras: in the order of their names, one folder or many."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from room_views import write_image
+
+from logvggt_jax.data import check_frames, open_dataset
+from logvggt_jax.data.errors import MissingFiles
+from logvggt_jax.errors import InputError
+
+
+def write_video(folder: Path, numbers: tuple[int, ...] = (1, 2, 10)) -> Path:
+    for number in numbers:
+        write_image(folder / f"img{number}.png", np.full((28, 42, 3), number, np.uint8))
+    (folder / "notes.txt").write_text("no picture")
+    return folder
+
+
+def test_pictures_come_in_natural_order_without_depth_or_poses(tmp_path: Path):
+    write_video(tmp_path / "walk")
+    write_video(tmp_path / "drive", (3,))
+    (tmp_path / "empty").mkdir()
+    dataset = open_dataset("images", tmp_path)
+    assert dataset.sequences == ("drive", "walk")
+    assert dataset.frame_names("walk") == ["img1.png", "img2.png", "img10.png"]
+    frames = dataset.read("walk", [2, 0])
+    assert frames.images[:, 0, 0, 0].tolist() == [10, 1] and not frames.depth.any() and not frames.metric
+    assert np.isnan(frames.extrinsics).all()
+    check_frames(frames, "walk", poses=False)
+    with pytest.raises(InputError, match="extrinsics must be finite"):
+        check_frames(frames, "walk")
+
+
+def test_the_root_itself_may_hold_the_pictures(tmp_path: Path):
+    assert open_dataset("images", write_video(tmp_path / "walk")).sequences == ("walk",)
+
+
+def test_a_folder_without_pictures_is_named(tmp_path: Path):
+    with pytest.raises(MissingFiles, match="no sequences of pictures of videos; expected pictures"):
+        open_dataset("images", tmp_path)

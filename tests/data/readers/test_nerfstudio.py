@@ -1,0 +1,49 @@
+"""What only nerfstudio's form has: cameras of single frames, recordings without depth, a recording as the root."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from layouts.nerfstudio import LAYOUT, NAME, NAMES
+
+from logvggt_jax.data import open_dataset
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    LAYOUT.write(tmp_path, LAYOUT.views)
+    return tmp_path / NAME
+
+
+def edit(recording: Path, change: Callable[[dict], object]) -> None:
+    path = recording / "transforms.json"
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+def test_the_root_itself_may_be_the_recording(recording: Path):
+    assert open_dataset("nerfstudio", recording).sequences == (NAME,)
+
+
+def test_a_frames_own_camera_comes_before_the_one_for_all(recording: Path):
+    before = open_dataset("nerfstudio", recording).read(NAME, [0, 1]).intrinsics
+    # Frames are written in reverse: the last one is the first in order.
+    edit(recording, lambda content: content["frames"][-1].update(fl_x=1.1 * content["fl_x"]))
+    after = open_dataset("nerfstudio", recording).read(NAME, [0, 1]).intrinsics
+    assert after[0, 0, 0] == pytest.approx(1.1 * before[0, 0, 0], rel=1e-6)
+    np.testing.assert_array_equal(after[1], before[1])
+
+
+def test_without_any_depth_frames_count_and_have_none(recording: Path):
+    edit(recording, lambda content: [entry.pop("depth_file_path") for entry in content["frames"]])
+    dataset = open_dataset("nerfstudio", recording)
+    assert dataset.frame_names(NAME) == list(NAMES) and not dataset.read(NAME, [0]).depth.any()
+
+
+def test_where_some_have_depth_those_without_do_not_count(recording: Path):
+    edit(recording, lambda content: content["frames"][0].pop("depth_file_path"))
+    dataset = open_dataset("nerfstudio", recording)
+    assert dataset.num_frames(NAME) == 3 and dataset.dropped_frames(NAME) == {"no depth": 1}

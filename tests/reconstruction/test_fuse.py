@@ -1,0 +1,250 @@
+"""A map rebuilt from better cameras: on a room whose truth is known, with cameras and depth put out of order."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from room_result import changed, write_room_result
+
+from logvggt_jax.cli import main
+from logvggt_jax.errors import InputError, MissingPackage, OutputExists
+from logvggt_jax.geometry import (
+    Similarity,
+    camera_centres,
+    pose_similarity,
+    quaternion_to_matrix,
+    rotation_angle,
+)
+from logvggt_jax.reconstruction import PointFilter, Reconstruction, export, fuse, write_trajectory
+from logvggt_jax.reconstruction.fusion.matching import match_poses
+from logvggt_jax.reconstruction.fusion.pose_files import read_poses
+
+COUNT, SIZE = 10, (84, 112)
+# From the room's metres to the disordered result's world.
+WORLD = Similarity(0.4, quaternion_to_matrix(np.array([0.1, 0.7, -0.2, 0.6])), np.array([0.5, -1.0, 2.0]))
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory: pytest.TempPathFactory) -> Reconstruction:
+    folder = tmp_path_factory.mktemp("truth")
+    return write_room_result(folder, count=COUNT, size=SIZE, image_size=SIZE, seed=2, clutter=30, period=192)
+
+
+@pytest.fixture(scope="module")
+def growth() -> np.ndarray:
+    """What every frame's depth was multiplied by, beside the world's scale."""
+    logarithms = 0.1 * np.random.default_rng(0).normal(size=COUNT)
+    return np.exp(logarithms - logarithms.mean())
+
+
+@pytest.fixture(scope="module")
+def disordered(truth: Reconstruction, growth: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> Reconstruction:
+    """The room in another world, its cameras off by about 5 mm and a degree, its depth by a tenth."""
+    cameras = WORLD.apply_to_extrinsics(shaken(truth.extrinsics, 0.003))
+    return changed(truth, tmp_path_factory.mktemp("disordered") / "result", cameras, WORLD.scale * growth)
+
+
+def shaken(extrinsics: np.ndarray, metres: float) -> np.ndarray:
+    """Cameras off by about a degree, and by so much along each axis."""
+    generator = np.random.default_rng(1)
+    turns = np.concatenate(
+        [np.radians(0.3) * generator.normal(size=(len(extrinsics), 3)), np.ones((len(extrinsics), 1))], 1
+    )
+    rotations = quaternion_to_matrix(turns) @ extrinsics[:, :3, :3]
+    centres = camera_centres(extrinsics) + metres * generator.normal(size=(len(extrinsics), 3))
+    return np.concatenate([rotations, -(rotations @ centres[:, :, None])], axis=2)
+
+
+def with_colmap(truth: Reconstruction, folder: Path) -> Path:
+    pytest.importorskip("pycolmap")
+    return export(truth, ["colmap"], folder, point_filter=PointFilter(max_points=50), progress=False)[0]
+
+
+def with_colmap_text(truth: Reconstruction, folder: Path) -> Path:
+    pytest.importorskip("pycolmap")
+    (made,) = export(truth, ["colmap-text"], folder, point_filter=PointFilter(max_points=50), progress=False)
+    return made / "sparse" / "0"
+
+
+def with_nerfstudio(truth: Reconstruction, folder: Path) -> Path:
+    return export(truth, ["nerfstudio"], folder, progress=False)[0] / "transforms.json"
+
+
+def with_tum(truth: Reconstruction, folder: Path) -> Path:
+    return export(truth, ["tum"], folder, progress=False)[0]
+
+
+@pytest.mark.parametrize("write", [with_colmap, with_colmap_text, with_nerfstudio, with_tum])
+def test_cameras_of_other_programs_are_read(
+    truth: Reconstruction, tmp_path: Path, write: Callable[[Reconstruction, Path], Path]
+) -> None:
+    path = write(truth, tmp_path / "poses")
+    matched = match_poses(truth, read_poses(path), path)
+    assert list(matched) == list(range(COUNT))
+    for index, pose in matched.items():
+        np.testing.assert_allclose(pose.extrinsics[:3], truth.extrinsics[index], atol=1e-6)
+        if write is not with_tum:
+            np.testing.assert_allclose(pose.intrinsics, truth.intrinsics[index], rtol=1e-9)
+            assert pose.size == SIZE
+
+
+def test_with_true_poses_depth_and_points_come_out_true(
+    truth: Reconstruction, disordered: Reconstruction, tmp_path: Path
+) -> None:
+    poses = with_tum(truth, tmp_path / "poses")
+    made, notes = fuse(disordered, tmp_path / "fused", poses=poses, metric=True, progress=False)
+    assert made.metric and made.names == truth.names
+    np.testing.assert_allclose(made.extrinsics, truth.extrinsics, atol=1e-6)
+    ratios = [np.median(made.depth(index) / truth.depth(index)) for index in range(COUNT)]
+    assert np.mean(ratios) == pytest.approx(1, abs=0.02)
+    assert np.std(ratios) < 0.01, "frames agree with one another, whatever was done to their depth"
+    points, _ = made.points()
+    assert len(points) > 10_000
+    text = "\n".join(notes)
+    assert "similarity: scale" in text and "turned by" in text and "depth: scaled by" in text
+
+
+def test_intrinsics_that_come_with_the_poses_are_taken(truth: Reconstruction, tmp_path: Path) -> None:
+    wrong = changed(truth, tmp_path / "wrong", truth.extrinsics, np.ones(COUNT), focal=1.2)
+    poses = with_nerfstudio(truth, tmp_path)
+    made, _ = fuse(wrong, tmp_path / "fused", poses=poses, progress=False)
+    np.testing.assert_allclose(made.intrinsics, truth.intrinsics, rtol=1e-9)
+    np.testing.assert_allclose(made.depth_intrinsics, truth.depth_intrinsics, rtol=1e-9)
+    document = json.loads(poses.read_text())
+    document["k1"] = 0.1
+    poses.write_text(json.dumps(document))
+    made, notes = fuse(wrong, tmp_path / "kept", poses=poses, progress=False)
+    np.testing.assert_allclose(made.intrinsics, wrong.intrinsics, rtol=1e-9)
+    assert any("intrinsics stay the result's" in note for note in notes)
+
+
+def test_frames_without_a_pose_and_poses_without_a_frame_are_said(
+    truth: Reconstruction, disordered: Reconstruction, tmp_path: Path
+) -> None:
+    times = np.concatenate([truth.timestamps[:6] + 0.01, [99.0]])
+    write_trajectory(tmp_path / "poses.txt", times, truth.extrinsics[[0, 1, 2, 3, 4, 5, 0]])
+    made, notes = fuse(disordered, tmp_path / "fused", poses=tmp_path / "poses.txt", progress=False)
+    assert made.names == truth.names[:6] and not made.metric
+    text = "\n".join(notes)
+    assert "4 of 10 frames have no pose: view 6" in text and "frames without a pose are left out" in text
+    assert "1 of 7 poses belong to no frame" in text
+    assert made.source is None and Reconstruction.open(disordered.folder).num_frames == COUNT
+
+
+def test_bundle_adjustment_brings_cameras_nearer_to_the_truth(truth: Reconstruction, tmp_path: Path) -> None:
+    pytest.importorskip("pycolmap")
+    start = changed(truth, tmp_path / "start", shaken(truth.extrinsics, 0.015), np.ones(COUNT))
+
+    def errors(result: Reconstruction) -> tuple[float, float]:
+        moved = pose_similarity(result.extrinsics, truth.extrinsics).apply_to_extrinsics(result.extrinsics)
+        distances = np.linalg.norm(camera_centres(moved) - camera_centres(truth.extrinsics), axis=1)
+        angles = np.degrees(rotation_angle(moved[:, :3, :3], truth.extrinsics[:, :, :3]))
+        return float(distances.mean()), float(angles.mean())
+
+    made, notes = fuse(start, tmp_path / "adjusted", adjust=True, progress=False)
+    (distance, angle), (before, turned) = errors(made), errors(start)
+    assert distance < before / 2 and angle < turned / 2
+    np.testing.assert_array_equal(made.intrinsics, start.intrinsics)
+    found = pose_similarity(made.extrinsics, start.extrinsics)
+    assert found.scale == pytest.approx(1, abs=1e-3), "the world keeps its scale"
+    assert any("bundle adjustment:" in note and "before" in note for note in notes)
+
+
+def test_images_that_show_nothing_move_no_camera(truth: Reconstruction, tmp_path: Path) -> None:
+    pytest.importorskip("pycolmap")
+    from logvggt_jax.reconstruction.depth_files import write_picture
+
+    blank = changed(truth, tmp_path / "blank", truth.extrinsics, np.ones(COUNT))
+    for file in (blank.folder / "images").iterdir():
+        write_picture(file, np.full((*SIZE, 3), 128, np.uint8))
+    with pytest.raises(InputError, match="too few to move a camera"):
+        fuse(blank, tmp_path / "out", adjust=True, progress=False)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("content", "complaint"),
+    [
+        ("1000 0 0 0 0 0 0 1\n1001 1 0 0 0 0 0 1\n", r"its times, 1000 to 1001, are none of the frames', 0 to 1\.125"),
+        ("0 0 0 0 0 0 0 1\n", "needs? at least 2"),
+        ("0 1 1 1 0 0 0 1\n0.125 1 1 1 0 0 0 1\n", "do not move alike"),
+        ("0 1 1\n", "poses.txt:1: expected 8 numbers"),
+        ("", "holds no pose"),
+    ],
+)
+def test_poses_that_tell_nothing_are_refused(
+    disordered: Reconstruction, tmp_path: Path, content: str, complaint: str
+) -> None:
+    (tmp_path / "poses.txt").write_text(content)
+    with pytest.raises(InputError, match=complaint) as caught:
+        fuse(disordered, tmp_path / "out", poses=tmp_path / "poses.txt", progress=False)
+    assert "\n" not in str(caught.value) and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("content", "complaint"),
+    [
+        ("{", "is no transforms.json"),
+        ("[]", "is no transforms.json"),
+        ('{"frames": [{"file_path": "a.png"}]}', "no 'transform_matrix'"),
+        ('{"frames": [{"file_path": "a.png", "transform_matrix": [[1]]}]}', r"must be \[4, 4\] finite numbers"),
+        ('{"frames": []}', "holds no pose"),
+    ],
+)
+def test_damaged_transforms_are_refused(
+    disordered: Reconstruction, tmp_path: Path, content: str, complaint: str
+) -> None:
+    (tmp_path / "transforms.json").write_text(content)
+    with pytest.raises(InputError, match=complaint) as caught:
+        fuse(disordered, tmp_path / "out", poses=tmp_path, progress=False)
+    assert "\n" not in str(caught.value)
+
+
+def test_names_that_match_no_frame_are_shown(truth: Reconstruction, disordered: Reconstruction, tmp_path: Path) -> None:
+    poses = with_nerfstudio(truth, tmp_path)
+    poses.write_text(poses.read_text().replace("view_", "photo"))
+    with pytest.raises(
+        InputError, match=r"none of its 10 pictures \('photo0', …\) has the name of one of the 10 frames"
+    ):
+        fuse(disordered, tmp_path / "out", poses=poses, progress=False)
+
+
+def test_a_folder_without_poses_and_targets_in_the_way(
+    disordered: Reconstruction, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match=r"expected transforms\.json, or COLMAP's images\.bin"):
+        fuse(disordered, tmp_path / "out", poses=tmp_path / "empty")
+    with pytest.raises(InputError, match=r"nowhere\.txt: No such file"):
+        fuse(disordered, tmp_path / "out", poses=tmp_path / "nowhere.txt")
+    with pytest.raises(OutputExists, match="--overwrite"):
+        fuse(disordered, tmp_path / "empty", poses=tmp_path / "empty")
+    with pytest.raises(InputError, match="is the result itself"):
+        fuse(disordered, disordered.folder, poses=tmp_path / "empty", overwrite=True)
+    with pytest.raises(InputError, match="nothing to fuse"):
+        fuse(disordered, tmp_path / "out")
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    with pytest.raises(MissingPackage, match=r'pip install "logvggt-jax\[colmap\]"'):
+        fuse(disordered, tmp_path / "out", adjust=True)
+
+
+def test_the_command_says_how_well_it_fits(
+    truth: Reconstruction, disordered: Reconstruction, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    poses = with_tum(truth, tmp_path)
+    assert main(["fuse", str(disordered.folder), "--poses", str(poses), "--output", str(tmp_path / "out")]) == 0
+    printed = capsys.readouterr().out
+    assert "similarity: scale" in printed and "cameras.json" in printed
+    assert main(["fuse", str(disordered.folder), "--output", str(tmp_path / "out2")]) == 2
+    assert capsys.readouterr().err.startswith("logvggt: error: nothing to fuse")
+
+
+def test_one_frame_has_no_scale(tmp_path: Path) -> None:
+    one = write_room_result(tmp_path / "one", count=1, size=(42, 56), image_size=(42, 56))
+    write_trajectory(tmp_path / "poses.txt", one.timestamps, one.extrinsics)
+    with pytest.raises(InputError, match="at least 2"):
+        fuse(one, tmp_path / "out", poses=tmp_path / "poses.txt")

@@ -1,0 +1,118 @@
+"""Metres from what is known of a scene."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from room_result import changed, write_room_result
+
+from logvggt_jax.cli import main
+from logvggt_jax.errors import InputError
+from logvggt_jax.geometry import camera_centres, unproject
+from logvggt_jax.reconstruction import Reconstruction, rescale, write_trajectory
+from logvggt_jax.reconstruction.depth_files import write_picture
+
+COUNT, SCALE = 4, 0.25
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory: pytest.TempPathFactory) -> Reconstruction:
+    return write_room_result(tmp_path_factory.mktemp("truth"), count=COUNT)
+
+
+@pytest.fixture(scope="module")
+def result(truth: Reconstruction, tmp_path_factory: pytest.TempPathFactory) -> Reconstruction:
+    """The room at a quarter of its size."""
+    cameras = truth.extrinsics * [1, 1, 1, SCALE]
+    return changed(truth, tmp_path_factory.mktemp("small") / "result", cameras, np.full(COUNT, SCALE))
+
+
+def assert_true(made: Reconstruction, truth: Reconstruction, tolerance: float = 1e-3) -> None:
+    assert made.metric
+    np.testing.assert_allclose(made.extrinsics, truth.extrinsics, rtol=tolerance, atol=tolerance)
+    np.testing.assert_allclose(made.depth(2), truth.depth(2), rtol=2e-3 + tolerance)
+    np.testing.assert_array_equal(made.intrinsics, truth.intrinsics)
+    assert made.num_points > 1000
+
+
+def test_from_the_distance_of_two_frames(truth: Reconstruction, result: Reconstruction, tmp_path: Path) -> None:
+    first, *_, last = camera_centres(truth.extrinsics)
+    distance = float(np.linalg.norm(last - first))
+    made, notes = rescale(result, tmp_path / "a", frames=("0", "view 3"), distance=distance, progress=False)
+    assert_true(made, truth)
+    assert "all lengths are multiplied by 4" in notes[-1]
+
+
+def test_from_the_distance_of_two_pixels(truth: Reconstruction, result: Reconstruction, tmp_path: Path) -> None:
+    (height, width), (rows, columns) = truth.image_size, truth.depth_size
+    points = unproject(truth.depth(1), truth.depth_intrinsics[1], truth.extrinsics[1])
+    distance = float(np.linalg.norm(points[30, 50] - points[5, 8]))
+    pixels = [
+        f"view 1,{(u + 0.5) * width / columns - 0.5},{(v + 0.5) * height / rows - 0.5}" for v, u in ((5, 8), (30, 50))
+    ]
+    made, _ = rescale(result, tmp_path / "a", pixels=(pixels[0], pixels[1]), distance=distance, progress=False)
+    assert_true(made, truth)
+
+
+def test_from_a_sensors_depth(truth: Reconstruction, result: Reconstruction, tmp_path: Path) -> None:
+    (tmp_path / "depth").mkdir()
+    for index in (0, 2):
+        # Half of the pixels know nothing, some are wrong.
+        millimetres = np.rint(truth.depth(index) * 1000).astype(np.uint16)
+        millimetres[:, ::2], millimetres[:8] = 0, 500
+        write_picture(tmp_path / "depth" / f"view {index}.depth.png", millimetres)
+    made, notes = rescale(result, tmp_path / "a", depth=tmp_path / "depth", progress=False)
+    assert_true(made, truth, 2e-3)
+    assert "sensor depth of 2 of 4 frames" in notes[0] and "%" in notes[0]
+
+
+def test_from_poses_in_metres(truth: Reconstruction, result: Reconstruction, tmp_path: Path) -> None:
+    write_trajectory(tmp_path / "poses.txt", truth.timestamps, truth.extrinsics)
+    made, notes = rescale(result, tmp_path / "a", poses=tmp_path / "poses.txt", progress=False)
+    assert_true(made, truth)
+    assert "similarity: scale 4" in notes[0]
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        ({"frames": ("0", "1"), "distance": 0.0}, "a distance must be above 0 metres, got 0"),
+        ({"frames": ("0", "1"), "distance": float("nan")}, "above 0"),
+        ({"frames": ("0", "1")}, "above 0 metres, got None"),
+        ({"frames": ("2", "2"), "distance": 1.0}, "at one place in the result"),
+        (
+            {"frames": ("0", "9"), "distance": 1.0},
+            "no frame '9': give a name such as 'view 0', or a number from 0 to 3",
+        ),
+        ({"pixels": ("0,1", "0,2,3"), "distance": 1.0}, "no frame|expected a pixel as FRAME,U,V"),
+        ({"pixels": ("0,1,x", "0,2,3"), "distance": 1.0}, "expected a pixel as FRAME,U,V, got '0,1,x'"),
+        ({"pixels": ("0,1,1", "0,2,900"), "distance": 1.0}, "outside of the image, which has 128 x 96 pixels"),
+        ({"pixels": ("0,1,1", "0,1,1"), "distance": 1.0}, "at one place"),
+        ({"depth": "."}, "holds no PNG file whose name begins with that of a frame"),
+        ({"depth": "nowhere"}, "nowhere"),
+        ({}, "give one of them"),
+        ({"depth": ".", "poses": "x"}, "give one of them"),
+    ],
+)
+def test_what_tells_no_scale_is_refused(
+    result: Reconstruction,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    options: dict[str, object],
+    complaint: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=complaint) as caught:
+        rescale(result, tmp_path / "out", progress=False, **options)  # type: ignore[arg-type]
+    assert "\n" not in str(caught.value) and not list(tmp_path.iterdir())
+
+
+def test_the_command(result: Reconstruction, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["scale", str(result.folder), "--output", str(tmp_path / "out"), "--between-frames", "0", "3"]
+    assert main([*arguments, "--distance", "0"]) == 2
+    assert "above 0 metres" in capsys.readouterr().err
+    assert main([*arguments, "--distance", "2"]) == 0
+    assert "2 m in truth" in capsys.readouterr().out
+    assert Reconstruction.open(tmp_path / "out").metric

@@ -1,0 +1,121 @@
+"""The same steps of the same clips on any number of devices and processes, to be compared.
+
+Started as a script this is one of several processes: FILE NUMBER PROCESSES ADDRESS.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import pickle
+import socket
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax.sharding import Mesh
+
+from logvggt_jax import LogVGGT, ModelConfig, Predictions
+from logvggt_jax.model.parameters import whole
+from logvggt_jax.training.config import TrainConfig
+from logvggt_jax.training.program import make_program
+from logvggt_jax.training.sharding import data_mesh, put_batch
+from logvggt_jax.weights.digests import whole_array
+
+Clips = dict[str, np.ndarray]
+
+
+@dataclasses.dataclass(frozen=True)
+class LayeredModel:
+    """A loop over stacked layers before the pixels' model, which compiles at once; the interface of `LogVGGT`."""
+
+    config: ModelConfig
+    pixels: Any
+
+    def apply(
+        self, variables: Any, images: jax.Array, frame_mask: jax.Array | None = None, *, remat: bool = False
+    ) -> Predictions:
+        params = whole(variables["params"])
+
+        @jax.checkpoint
+        def layer(x: jax.Array, one: Any) -> tuple[jax.Array, None]:
+            one = whole(one)
+            return x + jnp.tanh(x @ one["kernel"] + one["bias"]), None
+
+        x = images.astype(jnp.float32) @ params["aggregator"]["embed"]["kernel"] / 255.0
+        x, _ = jax.lax.scan(layer, x, params["aggregator"]["frame_blocks"])
+        heads = {name: params[name] for name in ("depth_head", "camera_head")}
+        return self.pixels.apply({"params": heads}, 255.0 * x[..., :3], frame_mask)
+
+
+class Outcome(NamedTuple):
+    """The gradient of the first step, on the host, and the loss of every step."""
+
+    gradient: Any
+    losses: list[float]
+
+
+def steps(model: Any, config: TrainConfig, params: Any, clips: Clips, mesh: Mesh, count: int) -> Outcome:
+    """`count` steps on this process's share of `clips`. The configuration's clipping must not be felt."""
+    program = make_program(model, config, jax.eval_shape(lambda: params), mesh)
+    state, batch = program.initial_state(params), put_batch(clips, mesh)
+    step = program.step.lower(state, batch).compile()
+    gradient, losses = None, []
+    for _ in range(count):
+        state, metrics, _ = step(state, batch)
+        losses.append(float(metrics["loss/total"]))
+        if gradient is None:
+            # Adam's first moment is the gradient, but for a factor.
+            moments = [x for x in jax.tree.leaves(state.opt_state, is_leaf=_is_adam) if _is_adam(x)]
+            gradient = jax.tree.map(lambda x: np.asarray(whole_array(x)) / (1 - config.optimizer.b1), moments[0].mu)
+    return Outcome(gradient, losses)
+
+
+def _is_adam(state: Any) -> bool:
+    return isinstance(state, optax.ScaleByAdamState)
+
+
+def steps_of_processes(
+    config: TrainConfig, params: Any, clips: Clips, count: int, folder: Path, *, layered: bool, processes: int = 2
+) -> Outcome:
+    """`steps` of real processes with two devices each, as the first one sees it."""
+    given = folder / "given.pickle"
+    given.write_bytes(pickle.dumps((config.to_dict(), params, clips, count, layered)))
+    with socket.socket() as probe:
+        probe.bind(("localhost", 0))
+        address = f"localhost:{probe.getsockname()[1]}"
+    started = [
+        subprocess.Popen(
+            [sys.executable, __file__, str(given), str(number), str(processes), address],
+            text=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+        )
+        for number in range(processes)
+    ]
+    outputs = [process.communicate(timeout=1200)[0] for process in started]
+    assert [process.returncode for process in started] == [0] * processes, outputs
+    return Outcome(*pickle.loads((folder / "outcome.pickle").read_bytes()))
+
+
+def _main(given: Path, number: int, processes: int, address: str) -> None:
+    from conftest import PixelModel
+
+    jax.config.update("jax_num_cpu_devices", 2)
+    jax.distributed.initialize(address, processes, number)
+    settings, params, clips, count, layered = pickle.loads(given.read_bytes())
+    config = TrainConfig.from_dict(settings)
+    share = len(clips["images"]) // processes
+    own = {name: value[number * share : (number + 1) * share] for name, value in clips.items()}
+    model = LayeredModel(config.model, PixelModel(config.model)) if layered else LogVGGT(config.model)
+    outcome = steps(model, config, params, own, data_mesh(), count)
+    if number == 0:
+        (given.parent / "outcome.pickle").write_bytes(pickle.dumps(tuple(outcome)))
+
+
+if __name__ == "__main__":
+    _main(Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), sys.argv[4])

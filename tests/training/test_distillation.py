@@ -1,0 +1,241 @@
+"""A student learns from a teacher alone: labels in the truth's place, kept on disk, and what is refused."""
+
+import dataclasses
+import functools
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from absl import logging
+
+from logvggt_jax import ModelConfig
+from logvggt_jax.data import open_dataset
+from logvggt_jax.data.errors import BrokenPicture
+from logvggt_jax.data.feeding.batches import training_batches
+from logvggt_jax.errors import InputError
+from logvggt_jax.metrics.depth import depth_metrics
+from logvggt_jax.training import loop
+from logvggt_jax.training.config import (
+    LossConfig,
+    OptimizerConfig,
+    SourceConfig,
+    TeacherConfig,
+    TrainConfig,
+    ValidationConfig,
+)
+from logvggt_jax.training.distillation import label
+from logvggt_jax.training.losses import distilled_depth_losses
+from logvggt_jax.training.metrics_log import read_metrics
+from logvggt_jax.training.optimizer import make_optimizer
+from logvggt_jax.training.sharding import data_mesh, parameter_layout, put_batch
+from logvggt_jax.training.state import initial_state
+from logvggt_jax.training.step import make_loss_terms, make_train_step
+from logvggt_jax.training.taught import TaughtDataset, taught
+from logvggt_jax.training.teacher import Labels, PlainVGGT
+from logvggt_jax.weights.checkpoints import save_model
+from logvggt_jax.weights.folder import write_description
+from logvggt_jax.weights.provenance import Provenance
+
+SIZE = (28, 42)
+OPTIONS = {"height": 28, "width": 42, "num_frames": 10, "num_rooms": 2}
+TEACHER = TeacherConfig("anything", clip_length=4, stride=1)
+
+
+class PixelTeacher:
+    """A teacher whose depth is a function of colour, which the pixel model can learn."""
+
+    def __init__(self, digest: str = "first") -> None:
+        self.digest, self.calls = digest, 0
+
+    def label(self, images: np.ndarray) -> Labels:
+        self.calls += 1
+        grey = images.astype(np.float32).mean(-1) / 255
+        frames = len(images)
+        extrinsics = np.tile(np.eye(4, dtype=np.float32), (frames, 1, 1))
+        extrinsics[:, 0, 3] = 0.1 * np.arange(frames)
+        intrinsics = np.array([[30.0, 0.0, 21.0], [0.0, 30.0, 14.0], [0.0, 0.0, 1.0]], np.float32)
+        return Labels(np.exp(grey), 1 + grey, np.tile(intrinsics, (frames, 1, 1)), extrinsics)
+
+
+@pytest.fixture(scope="module")
+def rooms() -> Any:
+    return open_dataset("rooms", None, "train", **OPTIONS)
+
+
+def labelled(rooms: Any, cache: Path, teacher: PixelTeacher | None = None, **changes: Any) -> TaughtDataset:
+    config = dataclasses.replace(TEACHER, **changes)
+    return taught("rooms", rooms, teacher or PixelTeacher(), config, [SIZE], cache)
+
+
+def test_clips_have_the_teachers_labels_and_never_the_truth(rooms: Any, tmp_path: Path) -> None:
+    dataset, name = labelled(rooms, tmp_path), rooms.sequences[0]
+    assert [each for each in dataset.sequences if each.startswith(name)] == [f"{name}@{i}" for i in (0, 4, 6)]
+    assert dataset.num_frames(f"{name}@6") == 4 and dataset.image_size(f"{name}@6") == SIZE
+    assert list(dataset.frame_names(f"{name}@6")) == list(rooms.frame_names(name))[6:]
+    frames = dataset.read(f"{name}@6", [3, 1])
+    np.testing.assert_array_equal(frames.images, rooms.read(name, [9, 7]).images)
+    expected = PixelTeacher().label(rooms.read(name, range(6, 10)).images)
+    np.testing.assert_array_equal(frames.depth, expected.depth[[3, 1]])
+    np.testing.assert_array_equal(frames.extrinsics, expected.extrinsics[[3, 1]])
+    np.testing.assert_array_equal(dataset.confidence(f"{name}@6", [3, 1]), expected.confidence[[3, 1]])
+    with training_batches({"rooms": dataset}, clip_length=3, batch_size=2, sizes=[SIZE], seed=0) as batches:
+        batch = next(batches)
+    assert batch["confidence"].shape == batch["depth"].shape == (2, 3, *SIZE)
+    np.testing.assert_allclose(np.log(batch["depth"]) + 1, batch["confidence"], rtol=1e-5)
+
+
+def test_what_was_labelled_once_is_not_labelled_again_unless_teacher_or_pictures_differ(
+    rooms: Any, tmp_path: Path
+) -> None:
+    first, again, other = PixelTeacher(), PixelTeacher(), PixelTeacher("second")
+    dataset = labelled(rooms, tmp_path, first)
+    labelled(rooms, tmp_path, again)
+    labelled(rooms, tmp_path, other)
+    assert (first.calls, again.calls, other.calls) == (6, 0, 6)
+    folders = sorted((tmp_path / "teacher").iterdir())
+    assert len(folders) == 12 and not list((tmp_path / "teacher").glob("*.partial"))
+    (next(iter(dataset._clips.values())).labels / "depth.npy").write_bytes(b"cut short")
+    with pytest.raises(InputError, match=r"depth\.npy: cannot be read .*start the run again"):
+        dataset.read(dataset.sequences[0], [0])
+    mended = PixelTeacher()
+    labelled(rooms, tmp_path, mended)
+    assert mended.calls == 1
+
+
+def test_sequences_shorter_than_a_clip_give_what_they_have(rooms: Any, tmp_path: Path) -> None:
+    dataset = labelled(rooms, tmp_path, clip_length=64, stride=3)
+    assert [dataset.num_frames(name) for name in dataset.sequences] == [4, 4]
+
+
+def test_a_clip_that_cannot_be_read_is_left_out_and_named(
+    rooms: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole, broken = rooms.read, {(rooms.sequences[0], 5)}
+
+    def read(sequence: str, indices: Any) -> Any:
+        if any((sequence, int(i)) in broken for i in indices):
+            raise BrokenPicture("frame 5 is broken")
+        return whole(sequence, indices)
+
+    monkeypatch.setattr(rooms, "read", read)
+    logging.use_python_logging(quiet=True)
+    assert len(labelled(rooms, tmp_path).sequences) == 5
+    assert f"{rooms.sequences[0]}@4: left out, its pictures cannot be read: frame 5 is broken" in caplog.text
+    broken |= {(name, i) for name in rooms.sequences for i in range(10)}
+    with pytest.raises(InputError, match="rooms: no clip of two frames or more that can be read"):
+        labelled(rooms, tmp_path)
+
+
+def test_a_teacher_of_another_kind_is_refused(small_config: ModelConfig, tmp_path: Path) -> None:
+    provenance = Provenance("windows", 42).to_dict()
+    (tmp_path / "model").mkdir()
+    description = {"config": small_config.to_dict(), "digests": {}, "provenance": provenance}
+    write_description(tmp_path / "model", description)
+    with pytest.raises(InputError, match=r"model: trained for 'windows', a teacher is plain VGGT"):
+        PlainVGGT(TeacherConfig(str(tmp_path / "model"), 4))
+
+
+def test_objective_and_teacher_belong_together(run_config: TrainConfig, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="belong together"):
+        dataclasses.replace(run_config, teacher=TEACHER)
+    loss = dataclasses.replace(run_config.loss, name="distillation")
+    with pytest.raises(InputError, match="belong together"):
+        dataclasses.replace(run_config, loss=loss)
+    with pytest.raises(InputError, match=r"give data\.cache_dir a folder"):
+        dataclasses.replace(run_config, loss=loss, teacher=TEACHER)
+    data = dataclasses.replace(run_config.data, cache_dir=str(tmp_path))
+    with pytest.raises(InputError, match=r"stages second: clips are longer than the teacher's"):
+        dataclasses.replace(run_config, loss=loss, data=data, teacher=dataclasses.replace(TEACHER, clip_length=2))
+    kept = dataclasses.replace(run_config, loss=loss, data=data, teacher=TEACHER)
+    assert TrainConfig.from_dict(kept.to_dict()) == kept
+
+
+def test_errors_count_relative_to_the_teachers_confidence() -> None:
+    target, valid = np.ones((2, 1, 2, 2), np.float32), np.ones((2, 1, 2, 2), bool)
+    depth = target.copy()
+    depth[0, 0, 0, 0] = depth[1, 0, 0, 0] = 3.0
+    # Both clips are as sure of the wrong pixel in proportion to the others: 3 times the mean of the rest.
+    trust = np.where(np.arange(4).reshape(1, 1, 2, 2) == 0, 3.0, 1.0) * np.array([1.0, 7.0]).reshape(2, 1, 1, 1)
+    losses = jax.jit(functools.partial(distilled_depth_losses, alpha=0.2))
+    found = losses(depth, trust, target, valid, trust)
+    assert float(found["depth_error"].numerator) == pytest.approx(2 * 2.0 * 3 / 1.5)
+    assert float(found["depth_confidence"].numerator) == 0.0
+    found = losses(depth, np.e * trust, target, valid, trust)
+    assert float(found["depth_confidence"].value()) == pytest.approx(0.2)
+    nothing = losses(depth, trust, target, np.zeros_like(valid), 0 * trust)
+    assert all(float(mean.value()) == 0.0 for mean in nothing.values())
+
+
+def test_a_student_that_never_saw_the_truth_comes_nearer_to_its_teacher(
+    pixel_model: Any,
+    pixel_params: Any,
+    loss_config: LossConfig,
+    optimizer_config: OptimizerConfig,
+    run_config: TrainConfig,
+    rooms: Any,
+    tmp_path: Path,
+) -> None:
+    """The whole way from pictures to updates, with a model that compiles at once; on rooms it was not taught on."""
+    loss = dataclasses.replace(loss_config, name="distillation")
+    data = dataclasses.replace(run_config.data, cache_dir=str(tmp_path))
+    validation = ValidationConfig(
+        SourceConfig("rooms", None, "val", options=tuple(sorted(OPTIONS.items()))), 1, 2, 4, 1, SIZE
+    )
+    config = dataclasses.replace(run_config, loss=loss, data=data, teacher=TEACHER, validation=validation)
+    datasets, held_out = label(config, TEACHER, PixelTeacher(), {"rooms": rooms})
+    assert held_out is not None
+
+    predict = jax.jit(lambda params, images: pixel_model.apply({"params": params}, images).depth)
+
+    def distance(params: Any) -> float:
+        errors = []
+        for name in held_out.sequences:
+            clip = held_out.read(name, range(4))
+            depth = np.asarray(predict(params, clip.images[None]))[0]
+            errors.append(depth_metrics(depth, clip.depth, alignment="median")["abs_rel"])
+        return float(np.mean(errors))
+
+    layout = parameter_layout(pixel_params, data_mesh(1), shard=False)
+    optimizer = make_optimizer(optimizer_config, pixel_params, frozen=())
+    step = make_train_step(make_loss_terms(pixel_model, loss), loss, optimizer, lambda _: jnp.float32(0.03), layout)
+    state = jax.device_put(
+        initial_state(jax.tree.map(jnp.array, pixel_params), optimizer),
+        layout.shardings(initial_state(pixel_params, optimizer)),
+    )
+    with training_batches(datasets, clip_length=3, batch_size=4, sizes=[SIZE], seed=0) as batches:
+        for _ in range(30):
+            state, metrics, _ = step(state, put_batch(next(batches), layout.mesh))
+    assert np.isfinite(float(metrics["loss/total"]))
+    assert distance(jax.device_get(state.params)) < 0.5 * distance(pixel_params)
+
+
+@pytest.mark.slow
+def test_a_real_student_comes_nearer_to_a_real_teacher(
+    small_config: ModelConfig, small_variables: dict[str, Any], run_config: TrainConfig, tmp_path: Path
+) -> None:
+    """`train` with LoG-VGGT as the student of plain VGGT, both small, on rooms of which it sees pictures alone."""
+    thawed = dataclasses.replace(small_config, encoder=dataclasses.replace(small_config.encoder, frozen=False))
+    save_model(tmp_path / "teacher", thawed, small_variables["params"], Provenance("vggt", 42))
+    rooms = tuple(sorted({**OPTIONS, "num_rooms": 16}.items()))
+    data = dataclasses.replace(
+        run_config.data, sources=(SourceConfig("rooms", None, "train", options=rooms),), cache_dir=str(tmp_path)
+    )
+    stage = dataclasses.replace(run_config.stages[0], steps=150, clip_length=4, max_stride=1, batch_size=8)
+    config = dataclasses.replace(
+        run_config,
+        model=thawed,
+        loss=dataclasses.replace(run_config.loss, name="distillation"),
+        optimizer=dataclasses.replace(run_config.optimizer, learning_rate=3e-3),
+        stages=(stage,),
+        data=data,
+        validation=ValidationConfig(SourceConfig("rooms", None, "val", options=rooms), 150, 8, 4, 1, SIZE),
+        teacher=TeacherConfig(str(tmp_path / "teacher"), clip_length=4),
+        log_every=50,
+        save_every=150,
+    )
+    loop.train(config, tmp_path / "run", mesh=data_mesh(1))
+    first, last = (entry for entry in read_metrics(tmp_path / "run" / "metrics.jsonl") if "validation/abs_rel" in entry)
+    assert last["validation/abs_rel"] < 0.7 * first["validation/abs_rel"]
