@@ -1,14 +1,13 @@
-"""The small LoG-VGGT that ships as `rooms`: 5 M parameters on images of 168 x 224 of procedural rooms.
+"""A small LoG-VGGT for a GPU: 5 M parameters on images of 168 x 224 of procedural rooms.
 
     python train.py --config=configs/small.py --workdir=runs/small
 
 Written for one large GPU, which draws the rooms itself, in pieces: a run stops after eight minutes, and the same
 command goes on, to the same numbers, until all steps are done. On a CPU it runs at less than a tenth of the pace, in
 float32: add --config.model.dtype=float32 and a larger --config.max_minutes. Where the memory of a GPU does not
-suffice, lower the stages' batch_size. To go on from the weights that ship, with clips of the last stage alone
-(scripts/train_small.sh does it):
+suffice, lower the stages' batch_size. To go on from weights of these sizes, with clips of the last stage alone:
 
-    python train.py --config=configs/small.py:rooms --workdir=runs/small-more
+    python train.py --config=configs/small.py:runs/small/model --workdir=runs/small-more
 
 Windows of four frames, the cache, GCCR and the losses are the paper's. A study of tiny models on rooms gave the rest,
 which is `configs/tiny.py`'s where it is not written below: compass rooms, in which pose is learned at all, half of

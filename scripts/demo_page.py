@@ -1,4 +1,4 @@
-"""The page of `make demo`: an unseen room reconstructed, eight rooms measured, the training before; pictures first.
+"""The page of `make demo`: an unseen room reconstructed, eight rooms measured, a short training; pictures first.
 
     python scripts/demo_page.py runs/demo
 
@@ -48,7 +48,8 @@ def write_page(folder: Path) -> Path:
     parts = [
         page.paragraph(
             "LoG-VGGT saw the frames of a walk through a room, nothing else, and gave a depth map and a camera pose "
-            "for each of them. It had never seen this room, which a program has drawn, so that the truth is known."
+            "for each of them. It had never seen this room, which a program has drawn, so that the truth is known. "
+            "The model is the one that ships with the package as `rooms`; `logvggt info rooms` says how it was trained."
         ),
         *_room_pictures(room, result, folder / "figures"),
         *_evaluation(folder / "evaluation"),
@@ -188,7 +189,7 @@ def _evaluation(folder: Path) -> list[str]:
 
 
 def _training(folder: Path, figures_folder: Path) -> list[str]:
-    """What training from nothing learned within the demo's time; the model above."""
+    """What training from nothing learned within the demo's time."""
     with disk_errors(folder / FILE_NAME):
         entries = read_metrics(folder / FILE_NAME)
     training = [(entry["step"], entry["train/abs_rel"]) for entry in entries if "train/abs_rel" in entry]
@@ -210,8 +211,11 @@ def _training(folder: Path, figures_folder: Path) -> list[str]:
     figures.curves_plot(path, curves, "Error of depth", x_label="steps", y_label="Abs Rel")
     return [
         page.heading("Training from nothing"),
-        page.figure(path, "How the error of its depth falls while a tiny model learns, from random numbers on."),
-        page.paragraph(f"{sentence}. Camera poses take longer to learn: see README."),
+        page.figure(
+            path,
+            "How the error of depth falls while a tiny model, another one than above, learns from random numbers on.",
+        ),
+        page.paragraph(f"{sentence}. Camera poses take hours: the model above had them."),
     ]
 
 

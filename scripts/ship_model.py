@@ -1,7 +1,7 @@
 """Puts a trained model into the package, as the one that ships under a name.
 
-    python scripts/ship_model.py runs/small/model rooms --minutes 24 \
-        --command "python train.py --config=configs/small.py --workdir=runs/small"
+    python scripts/ship_model.py runs/rooms/model rooms --minutes 90 \
+        --command "python train.py --config=configs/rooms.py --workdir=runs/rooms"
 
 Writes logvggt_jax/weights/shipped/NAME/: the parameters at 16 bits, and config.json with sizes, provenance and digests.
 Refuses a model whose provenance says too little, or that is too large for the package. Steps, configuration, data and

@@ -31,7 +31,7 @@ def _config(name: str, monkeypatch: pytest.MonkeyPatch) -> TrainConfig:
     return TrainConfig.from_dict(importlib.import_module(f"configs.{name}").get_config().to_dict())
 
 
-@pytest.mark.parametrize("name", ["tiny", "demo", "small", "h20", "finetune", "distill"])
+@pytest.mark.parametrize("name", ["tiny", "demo", "rooms", "small", "h20", "finetune", "distill"])
 def test_configuration_builds_its_run(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     config = _config(name, monkeypatch)
     schedule = learning_rate_schedule(config.optimizer, config.stages)
@@ -86,16 +86,22 @@ def test_the_small_models_step_is_traced_at_its_shortest_and_longest_clips(
         assert all(value.shape == () for value in metrics.values())
 
 
-def test_the_small_model_goes_on_from_weights_with_its_last_stage(monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = _config("small", monkeypatch)
-    more = TrainConfig.from_dict(importlib.import_module("configs.small").get_config("rooms").to_dict())
-    assert more.initial_weights == "rooms" and whole.initial_weights is None
-    assert more.stages == whole.stages[-1:] and more.model == whole.model
+@pytest.mark.parametrize(("name", "kept"), [("small", 1), ("rooms", 2)])
+def test_a_model_of_rooms_goes_on_from_weights_with_its_last_stages(
+    name: str, kept: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = _config(name, monkeypatch)
+    more = TrainConfig.from_dict(importlib.import_module(f"configs.{name}").get_config("weights").to_dict())
+    assert more.initial_weights == "weights" and whole.initial_weights is None
+    assert more.stages == whole.stages[-kept:] and more.model == whole.model
     assert more.optimizer.learning_rate < whole.optimizer.learning_rate
+
+
+def test_what_ships_is_trained_on_by_a_script() -> None:
     script = ["scripts/train_small.sh", "--config.max_minutes=120"]
     shown = subprocess.run(script, cwd=ROOT, env={**os.environ, "PYTHON": "echo"}, capture_output=True, text=True)
     words = shown.stdout.split()
-    assert words[:2] == ["train.py", "--config=configs/small.py:rooms"] and words[-1] == script[-1]
+    assert words[:2] == ["train.py", "--config=configs/rooms.py:rooms"] and words[-1] == script[-1]
 
 
 def test_finetuning_takes_sizes_and_pictures_from_the_model_it_starts_from(

@@ -5,7 +5,7 @@ from pathlib import Path
 from logvggt_jax.errors import MissingInput
 from logvggt_jax.weights.folder import is_model_folder, run_model
 
-# `rooms`: the model of configs/small.py, procedural rooms at 168 x 224 pixels.
+# `rooms`: the model of configs/rooms.py, procedural rooms at 56 x 70 pixels.
 SHIPPED = ("rooms",)
 ROOT = Path(__file__).parent / "shipped"
 

@@ -1,0 +1,36 @@
+"""The model that ships as `rooms`: 2 M parameters on images of 56 x 70 of procedural rooms, from nothing on a CPU.
+
+    python train.py --config=configs/rooms.py --workdir=runs/rooms
+
+The same command goes on with the run until all steps are done; on one core that takes about an hour and a half. To
+train the weights that ship further, on clips of 12 and of 32 frames (scripts/train_small.sh does it):
+
+    python train.py --config=configs/rooms.py:rooms --workdir=runs/rooms-more
+
+`configs/small.py` is the larger model for a GPU, `configs/tiny.py` the one for half an hour.
+"""
+
+from ml_collections import ConfigDict
+
+from configs import tiny
+
+
+def get_config(initial_weights: str = "") -> ConfigDict:
+    """`configs/tiny.py` with wider blocks, a moving average, and a stage of clips that return to where they began.
+
+    From random numbers, or without single windows from `initial_weights`, which `from_pretrained` reads.
+    """
+    config = tiny.get_config()
+    config.model.encoder.embed_dim = 96
+    config.stages.stage_1.steps = 3000
+    config.stages.stage_2.update(steps=2300, max_stride=6)
+    # Camera paths close after 96 frames at the mean speed.
+    config.data.sources.rooms.options.num_frames = 96
+    config.stages.stage_3 = {**config.stages.stage_2, "steps": 250, "clip_length": 32, "batch_size": 2, "max_stride": 3}
+    config.average = 0.999
+    config.validation.every = 1000
+    if initial_weights:
+        config.initial_weights = initial_weights
+        del config.stages.stage_1
+        config.optimizer.learning_rate = 5e-4
+    return config
