@@ -162,6 +162,8 @@ def _reconstruct(options: argparse.Namespace) -> int:
         print(f"logvggt: note: {printable(note)}", file=sys.stderr)
     print(result.summary())
     if not result.complete:
+        if options.export:
+            print("logvggt: note: not exported, since it is incomplete; see logvggt export --help", file=sys.stderr)
         return INTERRUPTED
     return _exports(result, options.export)
 

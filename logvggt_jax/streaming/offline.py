@@ -47,7 +47,7 @@ def plain_vggt(model: LogVGGT, num_frames: int) -> LogVGGT:
     size = max(2, num_frames)
     # One window leaves no work for the stride; half the size lets encoder and dense heads run in two halves.
     windows = WindowConfig(size=size, stride=size // 2, cross_window=False)
-    refinement = dataclasses.replace(model.config.refinement, period=None, context=None)
+    refinement = dataclasses.replace(model.config.refinement, period=None, context=None, max_registers=None)
     return LogVGGT(dataclasses.replace(model.config, windows=windows, refinement=refinement))
 
 

@@ -15,9 +15,9 @@ from safetensors.numpy import save_file
 from logvggt_jax.errors import InputError, disk_errors, one_line
 from logvggt_jax.files import atomic_file, to_disk
 from logvggt_jax.model.logvggt import LogVGGT, Variables
-from logvggt_jax.streaming.predictor import Predictor
+from logvggt_jax.streaming.predictor import METHODS, Predictor, open_predictor
 from logvggt_jax.streaming.results import FrameResult
-from logvggt_jax.weights.digests import digests, json_digest
+from logvggt_jax.weights.digests import json_digest, named_leaves
 
 
 class State(NamedTuple):
@@ -27,7 +27,15 @@ class State(NamedTuple):
     facts: dict[str, Any]
 
 
-def save_stream(path: str | Path, predictor: Predictor, model: LogVGGT, variables: Variables) -> list[FrameResult]:
+def save_stream(
+    path: str | Path,
+    predictor: Predictor,
+    model: LogVGGT,
+    variables: Variables,
+    *,
+    method: str = "windows",
+    settings: Any = None,
+) -> list[FrameResult]:
     """Writes the state of a stream, for `load_stream`; the frames that became final by now, oldest first.
 
     The stream goes on as if nothing had been asked. The file is replaced as a whole, and on the disk on return.
@@ -36,32 +44,39 @@ def save_stream(path: str | Path, predictor: Predictor, model: LogVGGT, variable
       path: of the file, by custom `.safetensors`.
       predictor: the stream.
       model: its model.
-      variables: {"params": …}, its parameters, whose digest goes into the file.
+      variables: {"params": …}, its parameters, by whose sizes and first values the file knows them.
+      method: its name in `METHODS`.
+      settings: of the method, as the stream was opened with them; None for its defaults.
 
     Raises:
       DiskError: the file cannot be written.
     """
     results, arrays = predictor.snapshot()
-    write_state(path, State(arrays, _facts(predictor, model, variables)))
+    write_state(path, State(arrays, _facts(model, variables, method, settings)))
     return results
 
 
-def load_stream(path: str | Path, predictor: Predictor, model: LogVGGT, variables: Variables) -> None:
-    """Takes up a stream that `save_stream` wrote: it gives what it would have given, to the same bits.
+def load_stream(
+    path: str | Path, model: LogVGGT, variables: Variables, *, method: str = "windows", settings: Any = None
+) -> Predictor:
+    """A stream that goes on where `save_stream` left it: it gives what that one would have given, to the same bits.
 
     Args:
       path: of the file.
-      predictor: one that has seen no frame, of the same method and settings.
-      model: its model.
+      model: the stream's model.
       variables: {"params": …}, its parameters.
+      method: its name in `METHODS`.
+      settings: of the method; None for its defaults.
 
     Raises:
-      InputError: the file is missing or damaged, or of another method, model or parameters.
+      InputError: the file is missing or damaged, or of another method, model or parameters, or of other settings.
     """
-    state, facts = read_state(path), _facts(predictor, model, variables)
+    state, facts = read_state(path), _facts(model, variables, method, settings)
     if others := sorted(name for name in facts if state.facts.get(name) != facts[name]):
-        raise InputError(f"{path}: the state of a stream that differs in {', '.join(others)}; open the same stream")
+        raise InputError(f"{path}: a stream that differs in {', '.join(others)}; give those that it was saved with")
+    predictor = open_predictor(method, model, variables, settings)
     predictor.restore(state.arrays)
+    return predictor
 
 
 def write_state(path: str | Path, state: State) -> None:
@@ -89,12 +104,18 @@ def read_state(path: str | Path) -> State:
     return State(arrays, json.loads(described["facts"]))
 
 
-def _facts(predictor: Predictor, model: LogVGGT, variables: Variables) -> dict[str, Any]:
+def _facts(model: LogVGGT, variables: Variables, method: str, settings: Any) -> dict[str, Any]:
     return {
-        "method": type(predictor).__name__,
+        "method": method,
+        "settings": str(METHODS[method].settings() if settings is None else settings),
         "model": json_digest(model.config.to_dict()),
-        "parameters": json_digest(digests(variables)),
+        "parameters": json_digest([[name, *_glimpse(leaf)] for name, leaf in named_leaves(variables)]),
     }
+
+
+def _glimpse(leaf: Any) -> tuple[list[int], str, str]:
+    """Shape, type and first values: enough to know parameters by, without reading gigabytes at every save."""
+    return list(leaf.shape), leaf.dtype.name, np.asarray(leaf.reshape(-1)[:64]).tobytes().hex()
 
 
 def _digest(facts: str, arrays: Mapping[str, np.ndarray]) -> str:

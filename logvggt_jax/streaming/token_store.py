@@ -111,7 +111,7 @@ class TokenStore:
         if self.camera is None:
             return 0
         tokens = 2 * self.camera.nbytes * self.position(self.count) // self.capacity
-        kept = self.position(self.count) if self._max_frames is None else int((self._slots >= 0).sum())
+        kept = self.count if self._max_frames is None else int((self._slots >= 0).sum())
         return tokens + sum(x.nbytes * kept // x.shape[1] for x in jax.tree.leaves(self.registers))
 
     def append(self, camera: jax.Array, registers: RegisterKeys | None, valid: int) -> None:
@@ -161,6 +161,8 @@ class TokenStore:
 
     def reserve(self, frames: int) -> None:
         """Makes room until `frames` frames fit; call after the first `append`."""
+        if self._max_frames is None and self.registers is not None and frames > self._register_capacity:
+            self._grow_registers(self._doubled(frames) - self._register_capacity)
         if self.position(frames) <= self.capacity:
             return
         if self._reach is not None and self.capacity:
@@ -169,21 +171,32 @@ class TokenStore:
             self.camera, self.refined = _slide(buffers, jnp.int32(forgotten - self._forgotten))
             self._forgotten = forgotten
             return
-        wanted = self._first_capacity
-        while wanted < frames:
-            wanted *= 2
-        self._grow(wanted - self.capacity)
+        self._grow(self._doubled(frames) - self.capacity)
+
+    def _doubled(self, frames: int) -> int:
+        """The smallest capacity that holds so many frames."""
+        capacity = self._first_capacity
+        while capacity < frames:
+            capacity *= 2
+        return capacity
+
+    @property
+    def _register_capacity(self) -> int:
+        return 0 if self.registers is None else self.registers.key.shape[1]
 
     def _grow(self, room: int) -> None:
         self.camera, self.refined = _grown((self.camera, self.refined), room=room)
-        if self._max_frames is None:
-            self.registers = _grown(self.registers, room=room)
+
+    def _grow_registers(self, room: int) -> None:
+        self.registers = _grown(self.registers, room=room)
 
     def resize(self, unit: int) -> None:
         """Brings a store that keeps all camera tokens to the smallest multiple of `unit` frames that holds them."""
         room = -(-self.count // unit) * unit
         if room > self.capacity:
             self._grow(room - self.capacity)
+            if self._max_frames is None and self.registers is not None:
+                self._grow_registers(room - self._register_capacity)
             return
         self.camera, self.refined = jax.tree.map(lambda x: x[:, :room], (self.camera, self.refined))
         if self._max_frames is None:
@@ -205,7 +218,7 @@ class TokenStore:
         arrays = {
             "camera": np.asarray(self.camera[:, :stop]),
             "refined": np.asarray(self.refined[:, :stop]),
-            "sizes": np.array([self.count, self.capacity]),
+            "sizes": np.array([self.count, self.capacity, self._register_capacity]),
         }
         if self.registers is not None:
             self._admit(self.count)
@@ -216,10 +229,12 @@ class TokenStore:
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Takes up what `arrays` gave, in buffers of the same capacity, so that no program compiles for another."""
-        self.count, capacity = (int(size) for size in arrays["sizes"])
+        self.count, capacity, register_capacity = (int(size) for size in arrays["sizes"])
         self.camera, self.refined = (jnp.asarray(arrays[name]) for name in ("camera", "refined"))
         if "slots" in arrays:
             self.registers = RegisterKeys(*(jnp.asarray(arrays[name]) for name in RegisterKeys._fields))
             self._slots, self._admitted = arrays["slots"].copy(), self.count
         self._forgotten = self.count - self.camera.shape[1]
         self._grow(capacity - self.capacity)
+        if self.registers is not None:
+            self._grow_registers(register_capacity - self._register_capacity)

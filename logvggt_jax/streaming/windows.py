@@ -257,11 +257,13 @@ class StreamSession:
         the stream goes on as if nothing had been asked.
         """
         other = copy.copy(self)
+        other._loops = None  # they are closed at the end, and cost more than a window
         other._pending, other._flights, other._arrivals = self._pending[:], self._flights.copy(), self._arrivals.copy()
         other._final, other._overlap = Rows(self._final.array), Rows(self._overlap.array)
         other._state, other._poses = jax.tree.map(jnp.copy, self._state), self._poses.copy()
         known = self._poses.num_frames
-        return [dataclasses.replace(r, pose_is_final=r.index < known and r.pose_is_final) for r in other.close()]
+        final = self._num_final if self._loops is not None else known
+        return [dataclasses.replace(r, pose_is_final=r.index < final and r.pose_is_final) for r in other.close()]
 
     def signals(self) -> Signals:
         """How well the windows agree, frame by frame of those handed out."""

@@ -213,6 +213,15 @@ def test_names_that_match_no_frame_are_shown(truth: Reconstruction, disordered: 
         fuse(disordered, tmp_path / "out", poses=poses, progress=False)
 
 
+def test_poses_of_several_cameras_under_one_name_are_refused(
+    truth: Reconstruction, disordered: Reconstruction, tmp_path: Path
+) -> None:
+    poses = with_nerfstudio(truth, tmp_path)
+    poses.write_text(poses.read_text().replace("view_3", "view_2"))
+    with pytest.raises(InputError, match=r"several of its pictures are named 'view_2', .* poses of one camera"):
+        fuse(disordered, tmp_path / "out", poses=poses, progress=False)
+
+
 def test_a_folder_without_poses_and_targets_in_the_way(
     disordered: Reconstruction, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -6,12 +6,22 @@ import dataclasses
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from logvggt_jax import LogVGGT, ModelConfig, RefinementConfig
 from logvggt_jax.errors import InputError
-from logvggt_jax.streaming import FrameResult, StreamSession, load_stream, pose_stream, save_stream, token_store
+from logvggt_jax.model.gccr import RegisterKeys
+from logvggt_jax.streaming import (
+    FrameResult,
+    StreamSession,
+    WindowSettings,
+    load_stream,
+    pose_stream,
+    save_stream,
+    token_store,
+)
 from logvggt_jax.streaming import windows as windows_module
 
 COUNT = 13
@@ -29,6 +39,26 @@ def frames() -> np.ndarray:
 
 def stream(session: StreamSession, frames: np.ndarray) -> list[FrameResult]:
     return [result for frame in frames for result in session.push(frame)] + session.close()
+
+
+def test_registers_grow_where_camera_tokens_are_forgotten() -> None:
+    """Without `max_registers` GCCR reads those of every frame, long after the camera tokens are gone."""
+
+    def tokens(frame: int) -> jax.Array:
+        return jnp.full((1, 1, 4, 2), frame, jnp.float32)
+
+    store = token_store.TokenStore(first_capacity=4, reach=3)
+    for frame in range(40):
+        store.append(tokens(frame)[:, :, 0], RegisterKeys(tokens(frame), -tokens(frame)), 1)
+    stored = store.arrays()
+    again = token_store.TokenStore(first_capacity=4, reach=3)
+    again.restore(stored)
+    for each in (store, again):
+        registers, seen = each.registers_at(40)
+        assert registers is not None and int(seen[0]) == 40 and each.capacity < 10
+        np.testing.assert_array_equal(registers.key[0, :40, 0, 0], np.arange(40))
+        np.testing.assert_array_equal(each.camera[0, : each.position(40), 0][-3:], [37, 38, 39])
+    assert again.registers.key.shape == store.registers.key.shape
 
 
 def test_a_stream_that_forgets_gives_the_numbers_of_the_whole_sequence_at_constant_size(
@@ -164,14 +194,12 @@ def test_a_stream_goes_on_from_a_file_of_the_same_model_alone(
 ) -> None:
     model, file = with_refinement(small_config, **CONSTANT), tmp_path / "stream.safetensors"
 
-    def opened() -> StreamSession:
-        return StreamSession(model, small_variables, first_capacity=16)
-
-    straight, session = opened(), opened()
+    settings = WindowSettings(first_capacity=16)
+    straight, begun = (StreamSession(model, small_variables, settings) for _ in range(2))
     expected = stream(straight, frames[:COUNT])
-    results = session.push(frames[:7]) + save_stream(file, session, model, small_variables)
-    session = opened()
-    load_stream(file, session, model, small_variables)
+    results = begun.push(frames[:7]) + save_stream(file, begun, model, small_variables, settings=settings)
+    session = load_stream(file, model, small_variables, settings=settings)
+    assert isinstance(session, StreamSession)
     results += session.push(frames[7:COUNT]) + session.close()
     for each, other in zip(results, expected, strict=True):
         np.testing.assert_array_equal(each.depth, other.depth)
@@ -179,14 +207,16 @@ def test_a_stream_goes_on_from_a_file_of_the_same_model_alone(
     np.testing.assert_array_equal(session.signals().overlap_change, straight.signals().overlap_change)
 
     other = jax.tree.map(lambda x: x + 1, small_variables)
-    with pytest.raises(InputError, match=r"differs in parameters; open the same stream"):
-        load_stream(file, opened(), model, other)
+    with pytest.raises(InputError, match=r"differs in parameters; give those that it was saved with"):
+        load_stream(file, model, other, settings=settings)
     with pytest.raises(InputError, match=r"differs in model"):
-        load_stream(file, opened(), with_refinement(small_config), small_variables)
+        load_stream(file, with_refinement(small_config), small_variables, settings=settings)
+    with pytest.raises(InputError, match=r"differs in method, settings"):
+        load_stream(file, model, small_variables, method="causal")
     damaged = bytearray(file.read_bytes())
     damaged[-1] ^= 1
     file.write_bytes(damaged)
     with pytest.raises(InputError, match=r"stream\.safetensors: damaged"):
-        load_stream(file, opened(), model, small_variables)
+        load_stream(file, model, small_variables, settings=settings)
     with pytest.raises(InputError, match="No such file"):
-        load_stream(tmp_path / "nothing", opened(), model, small_variables)
+        load_stream(tmp_path / "nothing", model, small_variables)

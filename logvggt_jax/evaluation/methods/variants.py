@@ -103,7 +103,7 @@ class _SharedStream:
 
     def predict(self, config: ModelConfig, images: np.ndarray, *, loops: bool) -> ClipPrediction:
         """The variant's prediction of images [T, H, W, 3]."""
-        settings = dataclasses.replace(config.refinement, enabled=True, period=None, context=None)
+        settings = dataclasses.replace(config.refinement, enabled=True, period=None, context=None, max_registers=None)
         windows = dataclasses.replace(config, refinement=settings)
         if self._last is None or self._last[0] is not images or self._last[1:3] != (windows, loops):
             self._last = None  # before the next is made

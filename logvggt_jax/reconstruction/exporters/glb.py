@@ -150,4 +150,5 @@ def _times(timestamps: np.ndarray) -> np.ndarray:
     if (np.diff(times.astype(np.float32)) <= 0).any():
         times = np.arange(len(times), dtype=np.float64)
         steps = np.diff(times)
-    return times / _FRAMES_PER_SECOND if (steps == np.rint(steps)).all() else times
+    # Frames without a time of their own have their position for one.
+    return times / _FRAMES_PER_SECOND if timestamps[0] == 0 and (steps == 1).all() else times

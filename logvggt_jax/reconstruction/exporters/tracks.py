@@ -19,6 +19,7 @@ NUM_POINTS = 100_000
 _TOLERANCE = 0.03
 # Observations of a point, evenly over the frames that see it; more make files of gigabytes and tell nothing new.
 _MOST_OBSERVATIONS = 32
+_GATHERED = 64  # observations a point that are held before they are thinned
 
 
 class Tracks(NamedTuple):
@@ -52,11 +53,15 @@ def find_tracks(result: Reconstruction, point_filter: PointFilter | None, *, pro
         vertices = np.concatenate(list(clouds))
         points = np.stack([vertices[axis] for axis in "xyz"], axis=-1).astype(np.float64)
         views = pool.map(lambda index: _seen(result, index, points), iter(range(count)))
-        seen = list(tracked(views, "Tracks", count, progress=progress))
-    indices = np.concatenate(seen).astype(np.int64)
-    frames = np.repeat(np.arange(count), [len(each) for each in seen])
-    kept = _evenly(indices, len(points))
-    indices, frames = indices[kept], frames[kept]
+        indices, frames = np.zeros(0, np.int32), np.zeros(0, np.int32)
+        waiting: list[tuple[np.ndarray, np.ndarray]] = []
+        for index, seen in enumerate(tracked(views, "Tracks", count, progress=progress)):
+            waiting.append((seen, np.full(len(seen), index, np.int32)))
+            # A camera that stays sees every point in every frame: what is gathered is thinned on the way.
+            if sum(len(each) for each, _ in waiting) > _GATHERED * len(points) or index == count - 1:
+                indices, frames = (np.concatenate(each) for each in zip((indices, frames), *waiting, strict=True))
+                kept = _evenly(indices, len(points), _MOST_OBSERVATIONS * (1 if index == count - 1 else 4))
+                indices, frames, waiting = indices[kept], frames[kept], []
     pixels = np.empty((len(indices), 2))
     borders = np.searchsorted(frames, np.arange(count + 1))
     for index in range(count):
@@ -79,12 +84,12 @@ def _seen(result: Reconstruction, index: int, points: np.ndarray) -> np.ndarray:
     return candidates[near].astype(np.int32)
 
 
-def _evenly(indices: np.ndarray, num_points: int) -> np.ndarray:
-    """Which observations [k] stay, so that no point has too many; `indices` [K] are their points in order of frames."""
+def _evenly(indices: np.ndarray, num_points: int, most: int) -> np.ndarray:
+    """Which observations [k] stay, so that no point has more than `most`; `indices` [K] are their points, by frames."""
     counts = np.bincount(indices, minlength=num_points)
     order = np.argsort(indices, kind="stable")
     first = np.cumsum(counts) - counts
     places = np.empty(len(indices), np.int64)
     places[order] = np.arange(len(indices)) - np.repeat(first, counts)
-    step = np.maximum(1, -(-counts // _MOST_OBSERVATIONS))
+    step = np.maximum(1, -(-counts // most))
     return np.flatnonzero(places % step[indices] == 0)

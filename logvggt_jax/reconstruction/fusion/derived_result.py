@@ -95,6 +95,7 @@ def write_derived(
             model_size=result.depth_size,
             complete=result.complete,
             noted_focal_length=result.noted_focal_length,
+            skipped=[(name, "left out of the result that this one is made from") for name in result.skipped],
             source=result.source,
             metric=metric,
         )

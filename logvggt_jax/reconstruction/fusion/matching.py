@@ -23,8 +23,14 @@ def match_poses(result: Reconstruction, poses: Sequence[ExternalPose], path: str
       InputError: no pose belongs to any frame; `path` is where they are from.
     """
     if poses[0].name is not None:
-        by_name = {pose.name: pose for pose in poses}
+        by_name: dict[str | None, ExternalPose] = {}
+        twice = {pose.name for pose in poses if by_name.setdefault(pose.name, pose) is not pose}
         stems = file_stems(result.names)
+        if of_two := sorted(name for name in (*result.names, *stems) if name in twice):
+            raise InputError(
+                f"{path}: several of its pictures are named {of_two[0]!r}, as those of several cameras are; keep the "
+                "poses of one camera in it"
+            )
         found = {
             index: by_name.get(name, by_name.get(stem))
             for index, (name, stem) in enumerate(zip(result.names, stems, strict=True))

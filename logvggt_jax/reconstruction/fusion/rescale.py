@@ -54,6 +54,8 @@ def rescale(
     """
     if sum(way is not None for way in (poses, depth, frames, pixels)) != 1:
         raise InputError("a scale comes from poses, depth, two frames or two pixels: give one of them")
+    if distance is not None and frames is None and pixels is None:
+        raise InputError("a distance is one between two frames or two pixels: poses and depth have metres already")
     check_derived(result, output, overwrite=overwrite)
     notes: list[str] = []
     if poses is not None:
