@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from logvggt_jax.colours import DEPTHS_IN_MATPLOTLIB
 from logvggt_jax.errors import MissingPackage, install_line
 from logvggt_jax.files import atomic_file
 from logvggt_jax.geometry import camera_centres, invert
@@ -74,8 +75,12 @@ def depth_panel(
         error = np.abs(scale * prediction[row] - masked) / masked
         shown: list[tuple[str, np.ndarray, dict[str, Any]]] = [
             (f"frame {t}", images[row], {}),
-            ("true depth", masked, {"vmin": limits[0], "vmax": limits[1], "cmap": "viridis"}),
-            ("predicted", scale * prediction[row], {"vmin": limits[0], "vmax": limits[1], "cmap": "viridis"}),
+            ("true depth", masked, {"vmin": limits[0], "vmax": limits[1], "cmap": DEPTHS_IN_MATPLOTLIB}),
+            (
+                "predicted",
+                scale * prediction[row],
+                {"vmin": limits[0], "vmax": limits[1], "cmap": DEPTHS_IN_MATPLOTLIB},
+            ),
             ("relative error", error, {"vmin": 0.0, "vmax": 0.5, "cmap": "magma"}),
         ]
         for column, (title, picture, options) in enumerate(shown):
