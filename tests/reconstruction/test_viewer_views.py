@@ -131,9 +131,8 @@ def test_colours_say_depth_confidence_and_time(tmp_path: Path) -> None:
     limits = (1.0, 5.0)
     levels = point_levels("depth", made, np.array([0, 998]), result, limits)
     assert levels.tolist() == [1, 0]
-    np.testing.assert_allclose(
-        point_levels("depth", made, np.array([499]), result, limits), (1 / 3 - 1 / 5) / (1 - 1 / 5)
-    )
+    middle = point_levels("depth", made, np.array([499]), result, limits)
+    np.testing.assert_allclose(middle, (1 / 3 - 1 / 5) / (1 - 1 / 5))
 
 
 def test_near_is_yellow_and_far_is_violet_and_neither_is_the_black_of_no_depth() -> None:
