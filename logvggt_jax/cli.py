@@ -278,8 +278,13 @@ def _render_room(options: argparse.Namespace) -> None:
 
 
 def _view(options: argparse.Namespace) -> None:
-    from logvggt_jax.reconstruction.viewer import access_note, open_viewer, serve_forever
+    from logvggt_jax.reconstruction.viewer import access_note, open_viewer, save_page, serve_forever
 
+    if options.save is not None:
+        shown, stored = save_page(options.folder, options.save, overwrite=options.overwrite)
+        size = options.save.expanduser().stat().st_size / 1e6
+        print(f"{printable(str(options.save))}: {shown:,} of {stored:,} points, {size:.1f} MB; open it in a browser")
+        return
     server = open_viewer(options.folder, host=options.host, port=options.port)
     print(f"open http://{server.get_host()}:{server.get_port()} in a browser; Ctrl-C ends the viewer", flush=True)
     if note := access_note(options.host, server.get_port()):
@@ -676,11 +681,16 @@ def _parser() -> argparse.ArgumentParser:
         "look at a reconstruction in the browser",
         "logvggt view runs/walk",
         details=" Only this machine's browser reaches the page. From another machine, open a tunnel: "
-        "ssh -N -L 8080:localhost:8080 USER@THIS_MACHINE.",
+        "ssh -N -L 8080:localhost:8080 USER@THIS_MACHINE. With --save nothing is served: one file of less than 25 MB "
+        "holds the scene, thinned to fit, and opens anywhere.",
     )
     sub.add_argument("folder", type=Path, help="output of `logvggt reconstruct`")
     sub.add_argument("--port", type=int, default=8080, help="of the web page; the next free one if in use")
     sub.add_argument("--host", default="127.0.0.1", help="serve at this address, to the network that it belongs to")
+    sub.add_argument(
+        "--save", type=Path, default=None, metavar="PAGE", help="write one HTML file to keep or send instead of serving"
+    )
+    sub.add_argument("--overwrite", action="store_true", help="replace an earlier page")
 
     sub = command(
         "info",

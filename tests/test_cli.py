@@ -12,6 +12,7 @@ import cv2
 import jax
 import numpy as np
 import pytest
+from result_folder import write_result
 
 from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.cli import FORMATS, MODES, main
@@ -370,3 +371,14 @@ def test_compilation_cache_follows_flag_environment_and_user_folder(
     finally:
         for name, value in before.items():
             jax.config.update(name, value)
+
+
+def test_view_saves_a_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "result").mkdir()
+    write_result(tmp_path / "result")
+    page = str(tmp_path / "page.html")
+    assert main(["view", str(tmp_path / "result"), "--save", page]) == 0
+    assert "10 of 10 points" in capsys.readouterr().out and Path(page).stat().st_size < 25_000_000
+    assert main(["view", str(tmp_path / "result"), "--save", page]) == 2
+    assert "page.html exists: choose another name or pass --overwrite" in capsys.readouterr().err
+    assert main(["view", str(tmp_path / "result"), "--save", page, "--overwrite"]) == 0

@@ -22,13 +22,17 @@ from logvggt_jax.errors import InputError, MissingInput
 from logvggt_jax.files import atomic_file, open_regular
 from logvggt_jax.geometry import unproject_pixels
 
-VERTEX = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")])
+_COLOURED = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
+VERTEX = np.dtype([*_COLOURED, ("confidence", "<f4"), ("frame", "<i4")])
+# The other one is that of files of earlier versions.
+_VERTICES = (VERTEX, np.dtype(_COLOURED))
+_PLY_TYPES = {np.dtype("<f4"): "float", np.dtype("u1"): "uchar", np.dtype("<i4"): "int"}
 
-_HEADER = (
-    "ply\nformat binary_little_endian 1.0\nelement vertex {count}\n"
-    + "".join(f"property {'float' if VERTEX[name] == np.float32 else 'uchar'} {name}\n" for name in VERTEX.names or ())
-    + "end_header\n"
-)
+
+def _header(vertex: np.dtype, count: str) -> str:
+    properties = "".join(f"property {_PLY_TYPES[vertex[name]]} {name}\n" for name in vertex.names or ())
+    return f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}end_header\n"
+
 
 # Confidences are counted as float16, as which they are stored: a bin a value, up to infinity.
 _NUM_BINS = int(np.float16(np.inf).view(np.uint16))
@@ -84,23 +88,45 @@ class FramePoints(NamedTuple):
       indices: [n] flat pixel indices.
       depth: [n] float32 z-depth.
       colours: [n, 3] uint8 RGB.
+      confidence: [n] float16, not negative.
     """
 
     indices: np.ndarray
     depth: np.ndarray
     colours: np.ndarray
+    confidence: np.ndarray
+
+    @property
+    def bins(self) -> np.ndarray:
+        """Bins [n] uint16 of the confidences."""
+        return self.confidence.view(np.uint16)
 
     def at(self, places: np.ndarray) -> FramePoints:
         """The points at these places of the list."""
-        return FramePoints(self.indices[places], self.depth[places], self.colours[places])
+        return FramePoints(*(values[places] for values in self))
+
+
+class Cloud(NamedTuple):
+    """A point cloud as it is stored.
+
+    Attributes:
+      points: [M, 3] float32 in the world, all finite.
+      colours: [M, 3] uint8 RGB.
+      confidence: [M] float32; None in files of versions that did not store it.
+      frame: [M] int32, the number of the frame that a point is a pixel of, in rising order; None likewise.
+    """
+
+    points: np.ndarray
+    colours: np.ndarray
+    confidence: np.ndarray | None
+    frame: np.ndarray | None
 
 
 class _Sample(NamedTuple):
-    """The first candidates that a frame's random order meets, their places in it, their bins; and the number of all."""
+    """The first candidates that a frame's random order meets, their places in it, and the number of all."""
 
     points: FramePoints
     places: np.ndarray
-    bins: np.ndarray
     candidates: int
 
     def shortened(self, size: int) -> _Sample:
@@ -110,7 +136,7 @@ class _Sample(NamedTuple):
             return self
         # Copies, so that what is left out is let go.
         points = FramePoints(*(values[:kept].copy() for values in self.points))
-        return _Sample(points, self.places[:kept].copy(), self.bins[:kept].copy(), self.candidates)
+        return _Sample(points, self.places[:kept].copy(), self.candidates)
 
 
 class PointSelection:
@@ -146,12 +172,11 @@ class PointSelection:
           image: [H, W, 3] uint8 RGB.
         """
         candidates = self._filter.candidates(depth, confidence).reshape(-1)
-        counts = np.bincount(_bins(confidence, np.flatnonzero(candidates)), minlength=_NUM_BINS)
+        counts = np.bincount(_stored(confidence, np.flatnonzero(candidates)).view(np.uint16), minlength=_NUM_BINS)
         size = self._sample_size
         order = _random_order(frame, depth.size)[: _LOOK_AHEAD * size]
         places = np.flatnonzero(candidates[order])[:size].astype(np.int32)
-        indices = order[places]
-        sample = _Sample(_points(depth, image, indices), places, _bins(confidence, indices), int(counts.sum()))
+        sample = _Sample(_points(depth, confidence, image, order[places]), places, int(counts.sum()))
         with self._lock:
             self._histogram += counts
             self._samples[frame] = sample.shortened(self._sample_size)
@@ -174,9 +199,9 @@ class PointSelection:
             "expected": np.array([self._frames]),
             "frames": np.array(frames, np.int64),
             "candidates": np.array([sample.candidates for sample in samples], np.int64),
-            "lengths": np.array([len(sample.bins) for sample in samples], np.int64),
+            "lengths": np.array([len(sample.places) for sample in samples], np.int64),
             "places": np.concatenate([sample.places for sample in samples] or [np.zeros(0, np.int32)]),
-            "bins": np.concatenate([sample.bins for sample in samples] or [np.zeros(0, np.uint16)]),
+            "confidence": np.concatenate([each.confidence for each in points] or [np.zeros(0, np.float16)]),
             "indices": np.concatenate([each.indices for each in points] or [np.zeros(0, np.int64)]),
             "depth": np.concatenate([each.depth for each in points] or [np.zeros(0, np.float32)]),
             "colours": np.concatenate([each.colours for each in points] or [np.zeros((0, 3), np.uint8)]),
@@ -191,7 +216,7 @@ class PointSelection:
         ):
             part = slice(stop - length, stop)
             points = FramePoints(*(arrays[name][part] for name in FramePoints._fields))
-            self._samples[frame] = _Sample(points, arrays["places"][part], arrays["bins"][part], candidates)
+            self._samples[frame] = _Sample(points, arrays["places"][part], candidates)
 
     @functools.cached_property
     def threshold_bin(self) -> int:
@@ -217,7 +242,8 @@ class PointSelection:
         frames = sorted(self._samples)
         samples = [self._samples[frame] for frame in frames]
         total = np.cumsum(
-            [np.sum(s.bins >= self.threshold_bin) * s.candidates / max(len(s.bins), 1) for s in samples], dtype=float
+            [np.sum(s.points.bins >= self.threshold_bin) * s.candidates / max(len(s.places), 1) for s in samples],
+            dtype=float,
         )
         # Shares rounded on the running total add up exactly.
         shares = np.floor(total / max(total[-1], 1e-9) * self.num_points).astype(int)
@@ -227,22 +253,22 @@ class PointSelection:
         """The points of a frame, in the order of its pixels; `read` gives what `see` was given, if need be."""
         if self.num_points < self.num_qualified:
             quota, sample = self._quotas[frame], self._samples[frame]
-            places = np.flatnonzero(sample.bins >= self.threshold_bin)[:quota]
-            if len(places) == quota or len(sample.bins) == sample.candidates:
+            places = np.flatnonzero(sample.points.bins >= self.threshold_bin)[:quota]
+            if len(places) == quota or len(sample.places) == sample.candidates:
                 return sample.points.at(places[np.argsort(sample.points.indices[places])])
         depth, confidence, image = read()
         indices = np.flatnonzero(self._filter.candidates(depth, confidence))
-        indices = indices[_bins(confidence, indices) >= self.threshold_bin]
+        indices = indices[_stored(confidence, indices).view(np.uint16) >= self.threshold_bin]
         if self.num_points < self.num_qualified:
             qualified = np.zeros(depth.size, bool)
             qualified[indices] = True
             order = _random_order(frame, depth.size)
             indices = np.sort(order[qualified[order]][:quota])
-        return _points(depth, image, indices)
+        return _points(depth, confidence, image, indices)
 
 
 def frame_vertices(
-    points: FramePoints, size: tuple[int, int], intrinsics: np.ndarray, extrinsics: np.ndarray
+    points: FramePoints, size: tuple[int, int], intrinsics: np.ndarray, extrinsics: np.ndarray, frame: int
 ) -> np.ndarray:
     """Coloured points [n] of dtype `VERTEX` in the world.
 
@@ -251,6 +277,7 @@ def frame_vertices(
       size: (H, W) of the frame.
       intrinsics: [3, 3] in its pixels.
       extrinsics: [3|4, 4] world-to-camera.
+      frame: its number.
     """
     depth = np.zeros(size, np.float32)
     depth.reshape(-1)[points.indices] = points.depth
@@ -260,6 +287,7 @@ def frame_vertices(
         vertices[name] = positions[:, axis]
     for channel, name in enumerate(("red", "green", "blue")):
         vertices[name] = points.colours[:, channel]
+    vertices["confidence"], vertices["frame"] = points.confidence, frame
     return vertices
 
 
@@ -276,7 +304,7 @@ def write_points(path: str | Path, most: int, frames: Iterable[np.ndarray]) -> N
     """
     written = 0
     with atomic_file(path) as temporary, temporary.open("wb") as stream:
-        stream.write(_HEADER.format(count=most).encode())
+        stream.write(_header(VERTEX, str(most)).encode())
         for vertices in frames:
             stream.write(vertices.data)
             written += len(vertices)
@@ -284,7 +312,7 @@ def write_points(path: str | Path, most: int, frames: Iterable[np.ndarray]) -> N
             raise ValueError(f"{path}: {most} vertices announced, {written} given")
         stream.seek(0)
         # As long as before: readers skip blanks.
-        stream.write(_HEADER.format(count=str(written).rjust(len(str(most)))).encode())
+        stream.write(_header(VERTEX, str(written).rjust(len(str(most)))).encode())
 
 
 def count_points(path: str | Path) -> int:
@@ -299,6 +327,11 @@ def count_points(path: str | Path) -> int:
 
 def read_points(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     """Points [M, 3] float32, all finite, and colours [M, 3] uint8 of such a file; errors as `count_points`."""
+    return read_cloud(path)[:2]
+
+
+def read_cloud(path: str | Path) -> Cloud:
+    """All that such a file holds; errors as `count_points`."""
     vertices = _stored_points(Path(path))
     points = np.stack([vertices[name] for name in "xyz"], axis=-1)
     finite = np.isfinite(points).all(axis=1)
@@ -307,27 +340,34 @@ def read_points(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
             f"{path} is damaged: {np.count_nonzero(~finite):,} of its {len(points):,} points are not finite; "
             "reconstruct again"
         )
-    return points, np.stack([vertices[name] for name in ("red", "green", "blue")], axis=-1)
+    colours = np.stack([vertices[name] for name in ("red", "green", "blue")], axis=-1)
+    if "frame" not in (vertices.dtype.names or ()):
+        return Cloud(points, colours, None, None)
+    confidence, frame = np.array(vertices["confidence"]), np.array(vertices["frame"])
+    if not np.isfinite(confidence).all() or (np.diff(frame) < 0).any() or (frame[:1] < 0).any():
+        raise InputError(f"{path} is damaged: its points' confidences or frames make no sense; reconstruct again")
+    return Cloud(points, colours, confidence, frame)
 
 
 def _stored_points(path: Path) -> np.ndarray:
     """The vertices [M] of a file, mapped and not read."""
     try:
         with open_regular(path) as stream:
-            start, found = stream.read(2 * len(_HEADER)), os.fstat(stream.fileno()).st_size
+            start, found = stream.read(2 * len(_header(VERTEX, ""))), os.fstat(stream.fileno()).st_size
             # More digits could not be a size.
             match = re.search(rb"element vertex ( *\d{1,18})\n", start)
-            header = _HEADER.format(count=match[1].decode() if match else "").encode()
-            if match is None or not start.startswith(header):
+            count = int(match[1]) if match else 0
+            headers = {each: _header(each, match[1].decode()).encode() for each in _VERTICES} if match else {}
+            vertex = next((each for each, header in headers.items() if start.startswith(header)), None)
+            if vertex is None:
                 raise InputError(f"{path} is {_other_file(start)}: expected the output of `logvggt reconstruct`")
-            count = int(match[1])
-            size = len(header) + count * VERTEX.itemsize
+            size = len(headers[vertex]) + count * vertex.itemsize
             if found != size:
                 raise InputError(
                     f"{path} is {'cut off' if found < size else 'longer than its header says'}: {count:,} points need "
                     f"{size:,} bytes, it has {found:,}; copy it again or reconstruct again"
                 )
-            return np.memmap(stream, VERTEX, "r", len(header), (count,)) if count else np.empty(0, VERTEX)
+            return np.memmap(stream, vertex, "r", len(headers[vertex]), (count,)) if count else np.empty(0, vertex)
     except MissingInput:
         raise MissingInput(f"{path} does not exist: expected the output of `logvggt reconstruct`") from None
 
@@ -341,14 +381,15 @@ def _other_file(start: bytes) -> str:
     return "cut off in its header" if b"end_header" not in start else "a PLY file of another program, or damaged"
 
 
-def _points(depth: np.ndarray, image: np.ndarray, indices: np.ndarray) -> FramePoints:
-    return FramePoints(indices, depth.reshape(-1)[indices], image.reshape(-1, 3)[indices])
+def _points(depth: np.ndarray, confidence: np.ndarray, image: np.ndarray, indices: np.ndarray) -> FramePoints:
+    colours = image.reshape(-1, 3)[indices]
+    return FramePoints(indices, depth.reshape(-1)[indices], colours, _stored(confidence, indices))
 
 
-def _bins(confidence: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """Bins [n] of the confidences of some pixels."""
+def _stored(confidence: np.ndarray, indices: np.ndarray) -> np.ndarray:
+    """The confidences [n] float16 of some pixels, whose bits are their bins."""
     values = np.clip(confidence.reshape(-1)[indices], 0.0, np.finfo(np.float16).max)
-    return np.abs(values).astype(np.float16).view(np.uint16)  # -0.0 would be a bin of its own
+    return np.abs(values).astype(np.float16)  # -0.0 would be a bin of its own
 
 
 @functools.lru_cache(4)

@@ -10,7 +10,7 @@ import numpy as np
 from logvggt_jax.errors import InputError, disk_errors, printable
 from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE, read_cameras
 from logvggt_jax.reconstruction.depth_files import read_depth, read_picture
-from logvggt_jax.reconstruction.point_cloud import count_points, read_points
+from logvggt_jax.reconstruction.point_cloud import Cloud, count_points, read_cloud, read_points
 from logvggt_jax.reconstruction.sources.record import SourceRecord
 
 TRAJECTORY_FILE = "trajectory.txt"
@@ -146,6 +146,16 @@ class Reconstruction:
         """The cloud: points [M, 3] float32 in the world, and colours [M, 3] uint8."""
         return read_points(self.folder / POINTS_FILE)
 
+    def cloud(self) -> Cloud:
+        """The cloud with the confidence and the frame of every point, where the file holds them."""
+        cloud = read_cloud(self.folder / POINTS_FILE)
+        if cloud.frame is not None and (cloud.frame[-1:] >= self.num_frames).any():
+            raise InputError(
+                f"{self.folder / POINTS_FILE} is not of this reconstruction: it has points of frame "
+                f"{cloud.frame[-1]:,}, there are {self.num_frames:,}; reconstruct again"
+            )
+        return cloud
+
     def summary(self) -> str:
         """One line a result, with its place; for people, so that a name's control characters are shown as escapes."""
         height, width = self.depth_size
@@ -186,3 +196,8 @@ def depth_file(folder: Path, name: str) -> Path:
 def image_file(folder: Path, name: str) -> Path:
     """Where a result folder keeps the image of the frame of this name."""
     return folder / IMAGE_FOLDER / f"{name}.jpg"
+
+
+def preview_file(folder: Path, name: str) -> Path:
+    """Where a result folder keeps the preview of the frame of this name, if it has one."""
+    return folder / PREVIEW_FOLDER / f"{name}.png"

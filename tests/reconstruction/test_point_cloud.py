@@ -17,6 +17,7 @@ from logvggt_jax.reconstruction.point_cloud import (
     PointSelection,
     count_points,
     frame_vertices,
+    read_cloud,
     read_points,
     write_points,
 )
@@ -55,8 +56,10 @@ def test_points_are_the_unprojected_pixels_with_their_colours() -> None:
     rotation = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
     extrinsics = np.concatenate([rotation, [[0.5], [-1], [2]]], axis=1)
     indices = np.array([0, 9, 23])
-    points = FramePoints(indices, depth.reshape(-1)[indices], image.reshape(-1, 3)[indices])
-    vertices = frame_vertices(points, depth.shape, intrinsics, extrinsics)
+    confidence = np.array([1, 2, 4], np.float16)
+    points = FramePoints(indices, depth.reshape(-1)[indices], image.reshape(-1, 3)[indices], confidence)
+    vertices = frame_vertices(points, depth.shape, intrinsics, extrinsics, 7)
+    assert vertices["confidence"].tolist() == [1, 2, 4] and vertices["frame"].tolist() == [7, 7, 7]
     for vertex, (row, column) in zip(vertices, [(0, 0), (1, 3), (3, 5)], strict=True):
         z = depth[row, column]
         camera = np.array([(column - 3) * z / 5, (row - 2) * z / 6, z])
@@ -71,6 +74,8 @@ def test_ply_holds_what_was_written(tmp_path: Path) -> None:
     for chunk in chunks:
         for name in VERTEX.names:
             chunk[name] = generator.integers(0, 256, len(chunk))
+    for number, chunk in enumerate(chunks):
+        chunk["frame"] = number
     write_points(tmp_path / "p.ply", 12, iter(chunks))
     written = np.concatenate(chunks)
     points, colours = read_points(tmp_path / "p.ply")
@@ -80,6 +85,9 @@ def test_ply_holds_what_was_written(tmp_path: Path) -> None:
     for found, colour in ((points, colours), (cloud.vertices, cloud.colors[:, :3])):
         np.testing.assert_array_equal(found, np.stack([written[name] for name in "xyz"], axis=-1))
         np.testing.assert_array_equal(colour, np.stack([written[name] for name in ("red", "green", "blue")], axis=-1))
+    cloud = read_cloud(tmp_path / "p.ply")
+    for name in ("confidence", "frame"):
+        np.testing.assert_array_equal(getattr(cloud, name), written[name])
     assert count_points(tmp_path / "p.ply") == 12
     assert [path.name for path in tmp_path.iterdir()] == ["p.ply"]
 
@@ -97,8 +105,8 @@ def test_other_and_damaged_files_are_named(tmp_path: Path) -> None:
     write_points(path, 3, [np.zeros(3, VERTEX)])
     whole = path.read_bytes()
     for content, complaint in (
-        (whole[:-1], "cut off: 3 points need 220 bytes, it has 219"),
-        (whole + b"\0", "longer than its header says: 3 points need 220 bytes, it has 221"),
+        (whole[:-1], "cut off: 3 points need 289 bytes, it has 288"),
+        (whole + b"\0", "longer than its header says: 3 points need 289 bytes, it has 290"),
         (whole[:50], "cut off in its header"),
         (b"", "empty"),
         (b"\x89PNG", "no PLY file"),
@@ -108,6 +116,29 @@ def test_other_and_damaged_files_are_named(tmp_path: Path) -> None:
         path.write_bytes(content)
         with pytest.raises(InputError, match=rf"p\.ply is {complaint}"):
             count_points(path)
+
+
+def test_clouds_of_earlier_versions_without_confidence_and_frame_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "p.ply"
+    vertices = np.zeros(2, VERTEX)
+    vertices["x"], vertices["blue"] = [1, 2], [3, 4]
+    write_points(path, 2, [vertices])
+    header = path.read_bytes().split(b"end_header\n")[0]
+    header = header.replace(b"property float confidence\nproperty int frame\n", b"")
+    body = b"".join(vertex.tobytes()[:15] for vertex in vertices)
+    path.write_bytes(header + b"end_header\n" + body)
+    cloud = read_cloud(path)
+    assert cloud.confidence is None and cloud.frame is None
+    assert cloud.points[:, 0].tolist() == [1, 2] and cloud.colours[:, 2].tolist() == [3, 4]
+
+
+@pytest.mark.parametrize(("name", "values"), [("frame", [2, 1]), ("frame", [-1, 0]), ("confidence", [1, np.inf])])
+def test_a_cloud_whose_confidences_or_frames_make_no_sense_is_refused(tmp_path: Path, name: str, values: list) -> None:
+    vertices = np.zeros(2, VERTEX)
+    vertices[name] = values
+    write_points(tmp_path / "p.ply", 2, [vertices])
+    with pytest.raises(InputError, match=r"p\.ply is damaged: its points' confidences or frames"):
+        read_cloud(tmp_path / "p.ply")
 
 
 def test_a_cloud_with_points_that_are_not_finite_is_refused(tmp_path: Path) -> None:
@@ -211,6 +242,7 @@ def test_thinning_gives_the_announced_number_evenly(limit: int) -> None:
         np.testing.assert_array_equal(points.depth, depth.reshape(-1)[points.indices])
         np.testing.assert_array_equal(points.colours, image.reshape(-1, 3)[points.indices])
         assert confidence.reshape(-1)[points.indices].min(initial=9) >= np.quantile(confidence, 0.08)
+        np.testing.assert_array_equal(points.confidence, confidence.reshape(-1)[points.indices].astype(np.float16))
     for again, before in zip(select(point_filter, frames, seed=1)[1], chosen, strict=True):
         np.testing.assert_array_equal(again.indices, before.indices)
 

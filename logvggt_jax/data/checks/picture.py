@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from logvggt_jax.colours import DEPTHS_IN_MATPLOTLIB
 from logvggt_jax.data.checks.report import SequenceReport
 from logvggt_jax.data.errors import MissingFiles
 from logvggt_jax.data.readers.folder_dataset import FolderDataset
@@ -81,7 +82,7 @@ def _draw_frame(figure: Any, axes: Any, frames: Frames, name: str) -> None:
     axes[0].imshow(frames.images[0])
     axes[0].set_title(name, fontsize=8)
     limit = float(np.nanpercentile(depth, 99)) if np.isfinite(depth).any() else 1.0
-    drawn = axes[1].imshow(depth, cmap="viridis", vmax=limit)
+    drawn = axes[1].imshow(depth, cmap=DEPTHS_IN_MATPLOTLIB, vmax=limit)
     axes[1].set_title("depth (m)" if frames.metric else "depth", fontsize=8)
     figure.colorbar(drawn, ax=axes[1], fraction=0.04, pad=0.02).ax.tick_params(labelsize=6)
 

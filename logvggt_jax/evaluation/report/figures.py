@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from logvggt_jax.colours import DEPTHS_IN_MATPLOTLIB
 from logvggt_jax.errors import MissingPackage, install_line
 from logvggt_jax.files import atomic_file
 from logvggt_jax.geometry import camera_centres, invert
@@ -45,8 +46,8 @@ def trajectory_plot(path: Path, predicted_extrinsics: np.ndarray, true_extrinsic
         axis.plot(x[0], y[0], "s", color=axis.lines[-1].get_color(), markersize=6)
     axis.set_aspect("equal", adjustable="datalim")
     axis.set_title(f"{len(true)} cameras, square: first frame{note}", fontsize=9, wrap=True)
-    axis.set_xlabel("m")
-    axis.set_ylabel("m")
+    axis.set_xlabel("where the camera moves most (m)")
+    axis.set_ylabel("across it (m)")
     axis.legend()
     _save(figure, path)
 
@@ -72,10 +73,15 @@ def depth_panel(
     for row, t in enumerate(chosen):
         masked = np.where(valid[row], target[row], np.nan)
         error = np.abs(scale * prediction[row] - masked) / masked
+        depths = {"vmin": limits[0], "vmax": limits[1], "cmap": DEPTHS_IN_MATPLOTLIB}
         shown: list[tuple[str, np.ndarray, dict[str, Any]]] = [
             (f"frame {t}", images[row], {}),
-            ("true depth", masked, {"vmin": limits[0], "vmax": limits[1], "cmap": "viridis"}),
-            ("predicted", scale * prediction[row], {"vmin": limits[0], "vmax": limits[1], "cmap": "viridis"}),
+            ("true depth (m)", masked, depths),
+            (
+                "predicted depth (m)",
+                scale * prediction[row],
+                depths,
+            ),
             ("relative error", error, {"vmin": 0.0, "vmax": 0.5, "cmap": "magma"}),
         ]
         for column, (title, picture, options) in enumerate(shown):

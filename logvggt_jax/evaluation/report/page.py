@@ -3,7 +3,7 @@
 import base64
 import html
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from logvggt_jax.errors import printable
@@ -16,21 +16,34 @@ h1 { font-size: 1.6rem; } h2 { font-size: 1.1rem; margin-top: 2rem; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; white-space: nowrap; }
 th, td { padding: 0.2rem 0.7rem; text-align: right; border-bottom: 1px solid #ddd; }
 th:first-child, td:first-child { text-align: left; }
-tr.own { background: #eef4fb; }
+td:first-child, th:first-child { position: sticky; left: 0; background: #fff; }
+tr.own, tr.own td:first-child { background: #e3eefb; } tr.own td:first-child { font-weight: 600; }
 p.note, li { color: #555; font-size: 0.9rem; }
 pre { background: #f5f5f5; padding: 0.6rem 0.8rem; overflow-x: auto; }
 figure { margin: 1.5rem 0; } img { max-width: 100%; } figcaption { color: #555; font-size: 0.85rem; }
 """
 
 
-def html_page(title: str, tables: Sequence[Table], notes: Sequence[str], pictures: Sequence[Path]) -> str:
-    """A report as text: tables, notes, and pictures (PNG files) under their files' names."""
+def html_page(
+    title: str,
+    summary: Sequence[str],
+    tables: Sequence[Table],
+    notes: Sequence[str],
+    pictures: Mapping[Path, str],
+    own: str,
+) -> str:
+    """A report as text: a summary, tables, notes, and pictures (PNG files) over their captions.
+
+    Rows that begin with `own`, or with the words of the paper's tables for this run's, are marked.
+    """
     parts = [
-        *(table(each) for each in tables),
+        heading("Summary"),
+        f"<ul>{''.join(f'<li>{html.escape(line)}</li>' for line in summary)}</ul>",
+        *(table(each, own) for each in tables),
         heading("Notes"),
         f"<ul>{''.join(f'<li>{html.escape(note)}</li>' for note in notes)}</ul>",
         *([heading("Figures")] if pictures else []),
-        *(figure(path, path.stem) for path in pictures),
+        *(figure(path, caption) for path, caption in pictures.items()),
     ]
     return document(title, parts)
 
@@ -61,10 +74,10 @@ def command(text: str) -> str:
     return f"<pre><code>{html.escape(text)}</code></pre>"
 
 
-def table(content: Table) -> str:
-    """A table under its title, its notes below."""
+def table(content: Table, own: str = "") -> str:
+    """A table under its title, its notes below; rows that begin with `own` are marked."""
     head = "".join(f"<th>{html.escape(cell)}</th>" for cell in content.header)
-    rows = "\n".join(_row(row) for row in content.rows)
+    rows = "\n".join(_row(row, own) for row in content.rows)
     notes = "".join(f'<p class="note">{html.escape(note)}</p>' for note in content.notes)
     return (
         f'{heading(content.title)}\n<div class="scroll"><table><thead><tr>{head}</tr></thead>\n'
@@ -79,9 +92,9 @@ def figure(path: Path, caption: str) -> str:
     return f'<figure><img alt="{text}" src="data:image/png;base64,{data}"><figcaption>{text}</figcaption></figure>'
 
 
-def _row(row: Sequence[str]) -> str:
-    own = ' class="own"' if row[0].startswith("this run") else ""
-    return f"<tr{own}>{''.join(f'<td>{_cell(cell)}</td>' for cell in row)}</tr>"
+def _row(row: Sequence[str], own: str) -> str:
+    marked = ' class="own"' if row[0].startswith("this run") or (own and row[0] == own) else ""
+    return f"<tr{marked}>{''.join(f'<td>{_cell(cell)}</td>' for cell in row)}</tr>"
 
 
 def _cell(text: str) -> str:

@@ -22,6 +22,7 @@ from logvggt_jax.evaluation.report.by_length import (
     length_tables,
     logarithmic_panels,
 )
+from logvggt_jax.evaluation.report.captions import caption, summary
 from logvggt_jax.evaluation.report.page import html_page
 from logvggt_jax.evaluation.report.paper_tables import paper_tables
 from logvggt_jax.evaluation.report.tables import MARK, Table, benchmark_tables, coverage_table
@@ -83,7 +84,9 @@ def write_report(results: Mapping[str, Any], output: Path) -> None:
         write_text(output / "tables" / f"{number:02d}-{_slug(table.title)}.csv", _csv(table))
     pictures = [output / name for name in [*_curve_figures(results), *results["figures"]]]
     lines = [*notes(results), f"{AGAIN} {printable(results['command'])}"]
-    page = html_page(printable(results["title"]), made, lines, [path for path in pictures if path.is_file()])
+    captions = {path: caption(path.stem) for path in pictures if path.is_file()}
+    own = printable(results["methods"][0]["name"])
+    page = html_page(printable(results["title"]), summary(results), made, lines, captions, own)
     write_text(output / "report.html", page)
 
 

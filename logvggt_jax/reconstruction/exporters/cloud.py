@@ -37,7 +37,8 @@ def chosen_points(result: Reconstruction, selection: PointSelection, index: int)
 def frame_cloud(result: Reconstruction, selection: PointSelection, index: int) -> np.ndarray:
     """The points of one frame in the world, [n] of dtype `VERTEX`."""
     points = chosen_points(result, selection, index)
-    return frame_vertices(points, result.depth_size, result.depth_intrinsics[index], result.extrinsics[index])
+    cameras = result.depth_intrinsics[index], result.extrinsics[index]
+    return frame_vertices(points, result.depth_size, *cameras, index)
 
 
 def tracked(items: Iterable[Item], what: str, total: int, *, progress: bool) -> Iterator[Item]:

@@ -16,15 +16,16 @@ from logvggt_jax.reconstruction.depth_files import write_depth
 from logvggt_jax.reconstruction.exporters.ply import export_ply
 from logvggt_jax.reconstruction.exporters.tum import export_tum
 from logvggt_jax.reconstruction.frame_pool import FramePool
+from logvggt_jax.reconstruction.previews import write_previews
 from logvggt_jax.reconstruction.result import (
     DEPTH_FOLDER,
     IMAGE_FOLDER,
     POINTS_FILE,
-    PREVIEW_FOLDER,
     TRAJECTORY_FILE,
     Reconstruction,
     depth_file,
     image_file,
+    preview_file,
 )
 
 
@@ -71,16 +72,13 @@ def write_derived(
     transform = ResizeTransform(result.image_size, result.depth_size)
     names = [result.names[index] for index in frames]
     with atomic_folder(target, replace=overwrite) as folder, disk_errors(target), FramePool() as pool:
-        for name in (DEPTH_FOLDER, IMAGE_FOLDER, PREVIEW_FOLDER):
+        for name in (DEPTH_FOLDER, IMAGE_FOLDER):
             (folder / name).mkdir()
 
         def write(place: int) -> None:
             depth, confidence = result.depth_and_confidence(frames[place])
             write_depth(depth_file(folder, names[place]), depth_scales[place] * depth, confidence)
             shutil.copyfile(image_file(result.folder, names[place]), image_file(folder, names[place]))
-            preview = f"{PREVIEW_FOLDER}/{names[place]}.png"
-            if (result.folder / preview).is_file():
-                shutil.copyfile(result.folder / preview, folder / preview)
 
         for _ in pool.map(write, iter(range(len(frames)))):
             pass
@@ -100,6 +98,10 @@ def write_derived(
             metric=metric,
         )
         made = Reconstruction.with_cameras_of(folder)
+        # Of the same frames: depths have changed, and so has what their scale says.
+        before = [preview_file(result.folder, name) for name in names]
+        write_previews(made, [place for place, file in enumerate(before) if file.is_file()], pool)
+        pool.finish()
         export_tum(made, folder / TRAJECTORY_FILE)
         export_ply(made, folder / POINTS_FILE, progress=progress)
     return Reconstruction.open(target)

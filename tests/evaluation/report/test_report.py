@@ -11,6 +11,7 @@ import pytest
 from rich.console import Console
 
 from logvggt_jax.errors import printable
+from logvggt_jax.evaluation.report.captions import caption, summary
 from logvggt_jax.evaluation.report.report import print_report, write_report
 
 HOSTILE = [
@@ -101,3 +102,21 @@ def test_names_are_text_in_markdown_html_and_on_the_terminal(name: str, tmp_path
 def test_control_characters_reach_no_terminal_with_colours(tmp_path: Path) -> None:
     print_report(results("clear\x1b[2J"), Console(file=(terminal := io.StringIO()), force_terminal=True, width=400))
     assert r"clear\x1b[2J" in terminal.getvalue() and "\x1b[2J" not in terminal.getvalue()
+
+
+def test_the_page_begins_with_a_summary_and_marks_the_first_row(tmp_path: Path) -> None:
+    made = results("ours")
+    made["methods"].append({"name": "theirs", "knows": "nothing", "static": False})
+    made["summary"].append({**made["summary"][0], "method": "theirs", "scale/abs_rel": 0.25})
+    rank = "ours is number 2 of 2 rows by Abs Rel (scale), 0.5000; the best is theirs with 0.2500."
+    assert summary(made)[1] == f"ours: {rank}"
+    write_report(made, tmp_path)
+    text = (tmp_path / "report.html").read_text()
+    assert text.index("Summary") < text.index(rank) < text.index("<table>")
+    assert re.findall(r'<tr class="own"><td>(.*?)</td>', text) == ["ours"]
+
+
+def test_captions_are_words() -> None:
+    words = caption("rooms_a_b_from_3_24_frames_0123abcd_trajectory")
+    assert words.startswith("rooms_a_b, 24 frames from frame 3 on: true and predicted camera positions")
+    assert caption("ate_against_views_tum") == "Ate against views tum."

@@ -1,4 +1,4 @@
-"""A reconstruction in the browser: point cloud and cameras (extra `viewer`)."""
+"""The server behind the viewer: where it is reached, and how long it runs (extra `viewer`)."""
 
 from __future__ import annotations
 
@@ -8,11 +8,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from logvggt_jax.errors import InputError, MissingPackage, install_line
-from logvggt_jax.geometry import camera_centres, matrix_to_quaternion
 from logvggt_jax.reconstruction.result import Reconstruction
+from logvggt_jax.reconstruction.viewer.window import Window
 
 HOST = "127.0.0.1"
 _LAST_PORT, _PORTS_TRIED = 65535, 100
@@ -31,33 +29,15 @@ def open_viewer(folder: str | Path, *, host: str = HOST, port: int = 8080) -> An
       MissingPackage: viser is not installed.
     """
     result = Reconstruction.open(folder)
-    points, colours = result.points()
     port = _free_port(host, port)
     try:
         import viser
     except ImportError as error:
-        raise MissingPackage(f"the viewer needs viser: {install_line('viewer')}") from error
-
-    centres = camera_centres(result.extrinsics)
-    shown = points[:: max(1, len(points) // 10_000)].astype(np.float64)
-    span = float(np.ptp(np.concatenate([centres, shown]), axis=0).max())
+        raise MissingPackage(
+            f"the viewer needs viser: {install_line('viewer')}; a page that needs nothing is written with --save"
+        ) from error
     server = viser.ViserServer(host=host, port=port, verbose=False)
-    server.scene.set_up_direction("-y")
-    server.scene.add_point_cloud("/points", points, colours, point_size=span / 1000)
-    height, width = result.image_size
-    quaternions = matrix_to_quaternion(np.swapaxes(result.extrinsics[:, :3, :3], -1, -2))
-    for index, (x, y, z, w) in enumerate(quaternions):
-        server.scene.add_camera_frustum(
-            f"/cameras/{index:06d}",
-            fov=2 * float(np.arctan(height / 2 / result.intrinsics[index, 1, 1])),
-            aspect=width / height,
-            scale=span / 40,
-            wxyz=(w, x, y, z),
-            position=tuple(centres[index]),
-        )
-    if len(centres) > 1:
-        segments = np.stack([centres[:-1], centres[1:]], axis=1)
-        server.scene.add_line_segments("/trajectory", segments, colors=(230, 60, 40))
+    Window(server, result)
     return server
 
 

@@ -1,0 +1,238 @@
+"""What the viewer's page shows and what its controls do; viser draws it."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import threading
+from typing import Any
+
+import cv2
+import numpy as np
+from PIL import Image
+
+from logvggt_jax.colours import depth_picture
+from logvggt_jax.geometry import camera_centres, matrix_to_quaternion
+from logvggt_jax.reconstruction.previews import depth_range
+from logvggt_jax.reconstruction.result import IMAGE_FOLDER, Reconstruction
+from logvggt_jax.reconstruction.viewer.colouring import IMAGE, colourings, level_limits, point_colours
+from logvggt_jax.reconstruction.viewer.detail import MOST_SHOWN, USUALLY_SHOWN, Detail
+from logvggt_jax.reconstruction.viewer.opening_view import (
+    View,
+    camera_view,
+    opening_view,
+    point_spacing,
+    scene_span,
+)
+
+# Cameras that are drawn, evenly over the sequence, and the width of their pictures in pixels.
+MOST_FRUSTA, _THUMBNAIL = 100, 96
+_PICTURE = 320
+_PATH, _FRUSTUM, _PRESENT = (230, 80, 50), (120, 150, 200), (255, 190, 40)
+_LINES: dict[str, Any] = {"thickness": 1.5, "thickness_units": "screen"}
+_SCREENSHOT = (1080, 1920)
+# From which the scale of colours is taken.
+_SCALE_POINTS = 200_000
+
+
+class Window:
+    """Puts a reconstruction and its controls on the page of a viser server.
+
+    Args:
+      server: `viser.ViserServer`, which nothing else draws on.
+      result: the reconstruction.
+
+    Raises:
+      InputError: a file of the result is damaged.
+    """
+
+    def __init__(self, server: Any, result: Reconstruction) -> None:
+        self._server, self._result = server, result
+        self._cloud = result.cloud()
+        self._detail = Detail(self._cloud)
+        self._centres = camera_centres(result.extrinsics)
+        self._span = scene_span(self._cloud.points, self._centres)
+        self._spacing = point_spacing(self._span, min(len(self._cloud.points), USUALLY_SHOWN))
+        self._view = opening_view(result.extrinsics, result.intrinsics, result.image_size, self._cloud.points)
+        sample = self._detail.choose(_SCALE_POINTS)
+        # The ends of each scale are the same whatever part of the cloud is shown.
+        self._limits = {each: level_limits(each, self._cloud, sample, result) for each in colourings(self._cloud)}
+        self._depth_range = depth_range(result)
+        self._has_images = (result.folder / IMAGE_FOLDER).exists()  # results of earlier versions have none
+        # Callbacks come in threads of the server's, and some call one another.
+        self._lock = threading.RLock()
+        self._shown: int | None = None
+        self._playing: threading.Event | None = None
+        self._open_at(self._view)
+        self._add_controls()
+        self._draw_cameras()
+        self._set_ground()
+        self._show_frame()
+
+    def _open_at(self, view: View) -> None:
+        self._server.scene.set_up_direction(tuple(view.up))
+        camera = self._server.initial_camera
+        camera.position, camera.look_at = tuple(view.position), tuple(view.target)
+        camera.fov, camera.near, camera.far = view.field_of_view, self._span / 1000, 100 * self._span
+
+    def _add_controls(self) -> None:
+        gui, frames, points = self._server.gui, self._result.num_frames, len(self._cloud.points)
+        shown = max(min(points, MOST_SHOWN), 1)
+        with gui.add_folder("Points"):
+            self.colouring = gui.add_dropdown("colour", colourings(self._cloud), initial_value=IMAGE)
+            self.point_size = gui.add_slider("size", 0.1, 4.0, 0.1, 1.0)
+            self.left_out = gui.add_slider("least sure, % hidden", 0, 99, 1, 0, disabled=self._cloud.confidence is None)
+            self.most = gui.add_slider(f"shown of {points:,}", 1, shown, 1, min(shown, USUALLY_SHOWN))
+        with gui.add_folder("Frames"):
+            self.frame = gui.add_slider("frame", 0, max(frames - 1, 1), 1, 0, disabled=frames == 1)
+            self.alone = gui.add_checkbox("its points alone", False, disabled=self._cloud.frame is None)
+            self.play = gui.add_checkbox("play", False, disabled=frames == 1)
+            self.rate = gui.add_slider("frames a second", 1, 30, 1, 8)
+            jump = gui.add_button("look through this camera")
+            self._image = gui.add_image(np.zeros((1, 1, 3), np.uint8), label="image", visible=self._has_images)
+            self._depth = gui.add_image(np.zeros((1, 1, 3), np.uint8), label="depth")
+        with gui.add_folder("View"):
+            self.dark = gui.add_checkbox("dark ground", True)
+            self.cameras = gui.add_checkbox("cameras", True)
+            home = gui.add_button("where it began")
+            fly = gui.add_button("fly along the cameras")
+            screenshot = gui.add_button("screenshot")
+        for control in (self.colouring, self.left_out, self.most, self.alone):
+            control.on_update(lambda _: self._draw_points())
+        self.point_size.on_update(lambda _: self._set_point_size())
+        self.frame.on_update(lambda _: self._show_frame())
+        self.play.on_update(lambda _: self._start_or_stop())
+        self.dark.on_update(lambda _: self._set_ground())
+        self.cameras.on_update(lambda _: self._show_cameras())
+        jump.on_click(lambda event: self._look(event.client, self._camera_view(int(self.frame.value))))
+        home.on_click(lambda event: self._look(event.client, self._view))
+        fly.on_click(lambda event: self._fly(event.client))
+        screenshot.on_click(lambda event: self._screenshot(event.client))
+
+    def _draw_points(self) -> None:
+        with self._lock:
+            frame = int(self.frame.value) if self.alone.value else None
+            lowest = self._detail.confidence_at(float(self.left_out.value))
+            chosen = self._detail.choose(int(self.most.value), lowest=lowest, frame=frame)
+            colouring = self.colouring.value
+            colours = point_colours(colouring, self._cloud, chosen, self._result, self._limits[colouring])
+            self.points = self._server.scene.add_point_cloud(
+                "/points",
+                self._cloud.points[chosen],
+                colours,
+                point_size=self._point_size,
+                point_shape="circle",
+                point_shading="flat",
+                precision="float32",  # of half precision a scene shows the steps
+            )
+
+    @property
+    def _point_size(self) -> float:
+        return float(self.point_size.value) * self._spacing
+
+    def _set_point_size(self) -> None:
+        with self._lock:
+            self.points.point_size = self._point_size
+
+    def _draw_cameras(self) -> None:
+        result, scene = self._result, self._server.scene
+        self._frusta = []
+        for index in np.unique(np.linspace(0, result.num_frames - 1, MOST_FRUSTA).round().astype(int)).tolist():
+            frustum = self._frustum(f"/cameras/{index:06d}", index, self._span / 40, _FRUSTUM, _THUMBNAIL)
+            frustum.on_click(lambda event, index=index: self._look(event.client, self._camera_view(index)))
+            self._frusta.append(frustum)
+        if len(self._centres) > 1:
+            segments = np.stack([self._centres[:-1], self._centres[1:]], axis=1)
+            self._frusta.append(scene.add_line_segments("/path", segments, colors=_PATH, **_LINES))
+
+    def _frustum(self, name: str, index: int, size: float, colour: tuple[int, int, int], width: int) -> Any:
+        height, image_width = self._result.image_size
+        x, y, z, w = matrix_to_quaternion(self._result.extrinsics[index : index + 1, :3, :3].swapaxes(-1, -2))[0]
+        return self._server.scene.add_camera_frustum(
+            name,
+            fov=2 * float(np.arctan(height / 2 / self._result.intrinsics[index, 1, 1])),
+            aspect=image_width / height,
+            scale=size,
+            color=colour,
+            **_LINES,
+            image=_shrunk(self._result.image(index), width) if self._has_images else None,
+            format="jpeg",
+            wxyz=(w, x, y, z),
+            position=tuple(self._centres[index]),
+        )
+
+    def _show_cameras(self) -> None:
+        for drawn in (*self._frusta, self._present):
+            drawn.visible = bool(self.cameras.value)
+
+    def _show_frame(self) -> None:
+        with self._lock:
+            index = min(int(self.frame.value), self._result.num_frames - 1)
+            if index == self._shown:
+                return
+            self._shown = index
+            near, far = self._depth_range
+            self._depth.image = _shrunk(depth_picture(self._result.depth(index), near=near, far=far), _PICTURE)
+            self._depth.label = f"depth, {near:.3g} (yellow) to {far:.3g}{' m' if self._result.metric else ''}"
+            if self._has_images:
+                self._image.image = _shrunk(self._result.image(index), _PICTURE)
+                self._image.label = f"{self._result.names[index]}, {self._result.timestamps[index]:g}"
+            self._present = self._frustum("/present", index, self._span / 25, _PRESENT, _THUMBNAIL)
+            self._present.visible = bool(self.cameras.value)
+            if self.alone.value or not hasattr(self, "points"):
+                self._draw_points()
+
+    def _set_ground(self) -> None:
+        dark = bool(self.dark.value)
+        self._server.gui.configure_theme(dark_mode=dark, show_logo=False, show_share_button=False)
+        self._server.scene.set_background_image(np.full((1, 1, 3), 18 if dark else 250, np.uint8), format="png")
+
+    def _camera_view(self, index: int) -> View:
+        height = self._result.image_size[0]
+        field_of_view = 2 * float(np.arctan(height / 2 / self._result.intrinsics[index, 1, 1]))
+        distance = float(np.linalg.norm(self._view.target - self._centres[0])) or 1.0
+        return camera_view(self._result.extrinsics[index], self._view.up, field_of_view, distance)
+
+    def _look(self, client: Any, view: View) -> None:
+        with client.atomic():
+            client.camera.up_direction = tuple(view.up)
+            client.camera.position = tuple(view.position)
+            client.camera.look_at = tuple(view.target)
+            client.camera.fov = view.field_of_view
+
+    def _start_or_stop(self) -> None:
+        with self._lock:
+            if self._playing is not None:
+                self._playing.set()
+                self._playing = None
+            if self.play.value:
+                self._playing = threading.Event()
+                threading.Thread(target=self._advance, args=(self._playing,), daemon=True).start()
+
+    def _advance(self, stop: threading.Event) -> None:
+        """Shows frame after frame, from the first again after the last."""
+        with contextlib.suppress(RuntimeError):  # the server has stopped
+            while not stop.wait(1 / float(self.rate.value)):
+                self.frame.value = (int(self.frame.value) + 1) % self._result.num_frames
+                self._show_frame()  # here, too, so that frames do not come faster than they can be shown
+
+    def _fly(self, client: Any) -> None:
+        """Takes one browser's camera through all the cameras, once."""
+        stop = threading.Event()
+        for index in range(self._result.num_frames):
+            if client.client_id not in self._server.get_clients() or stop.wait(1 / float(self.rate.value)):
+                return
+            self._look(client, self._camera_view(index))
+
+    def _screenshot(self, client: Any) -> None:
+        picture = client.get_render(*_SCREENSHOT, transport_format="png")
+        content = io.BytesIO()
+        Image.fromarray(picture[..., :3]).save(content, "PNG")
+        client.send_file_download(f"{self._result.folder.resolve().name}.png", content.getvalue())
+
+
+def _shrunk(picture: np.ndarray, width: int) -> np.ndarray:
+    """The picture [h, w, 3] at this width."""
+    height = max(1, round(picture.shape[0] * width / picture.shape[1]))
+    smaller = width < picture.shape[1]
+    return cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA if smaller else cv2.INTER_NEAREST)
