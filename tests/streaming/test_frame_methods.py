@@ -248,8 +248,8 @@ def test_caches_are_given_to_the_step(
     """The buffers of before a frame are those of after it: no second cache is ever there."""
     stream = opened(method, small_config, small_variables, settings)
     stream.push(IMAGES[0])
-    before = jax.tree.leaves(stream._memory)
-    places = {leaf.unsafe_buffer_pointer() for leaf in before if leaf.ndim > 1}
+    before = [leaf for leaf in jax.tree.leaves(stream._memory) if leaf.ndim > 1]
+    places = {leaf.unsafe_buffer_pointer() for leaf in before}
     stream.push(IMAGES[1])
     assert all(leaf.is_deleted() for leaf in before)
     after = {leaf.unsafe_buffer_pointer() for leaf in jax.tree.leaves(stream._memory) if leaf.ndim > 1}

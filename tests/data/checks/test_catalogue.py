@@ -16,7 +16,7 @@ def test_every_data_set_says_what_it_is():
 
 def test_roles_are_the_papers():
     # After the paper's own sets and the rooms.
-    others = {"kitti_odometry", "tum_recording", "colmap"}
+    others = {"kitti_odometry", "tum_recording", "colmap", "nerfstudio", "images"}
     roles = {
         role: {name for name in DATASETS if name not in others and role in READERS[name].about.roles}
         for role in ("training", "evaluation")

@@ -106,8 +106,10 @@ def test_the_checkpoint_is_ablated_from_the_full_model(small_config: ModelConfig
 
 def test_every_variant_is_a_valid_model() -> None:
     configs = {VARIANTS[name].config(ModelConfig(), context=context) for name in VARIANTS for context in (None, 16)}
-    # cache_output and windows_4_2 are the full model at the paper's configuration.
-    assert len(configs) == 2 * (len(VARIANTS) - 2)
+    # cache_output and windows_4_2 are the full model at the paper's configuration, as are the rows of loops and chains,
+    # which differ in what is done with the windows.
+    plain = [name for name, variant in VARIANTS.items() if not (variant.loops or variant.chained)]
+    assert len(configs) == 2 * (len(plain) - 2)
 
 
 def test_an_unknown_variant_is_named(small_config: ModelConfig, small_variables: dict) -> None:
