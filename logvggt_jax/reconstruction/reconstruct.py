@@ -6,14 +6,12 @@ import dataclasses
 import hashlib
 import importlib.metadata
 import json
-import shutil
 import time
 import warnings
 from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -26,26 +24,17 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from logvggt_jax.colours import depth_picture
 from logvggt_jax.data.feeding.transforms import LONGER_EDGE
 from logvggt_jax.errors import InputError
 from logvggt_jax.interruption import StopRequest
 from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.reconstruction.calibration import Calibration
 from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE
-from logvggt_jax.reconstruction.depth_files import write_picture
-from logvggt_jax.reconstruction.exporters.ply import write_cloud
-from logvggt_jax.reconstruction.exporters.tum import export_tum
+from logvggt_jax.reconstruction.finishing import finish
 from logvggt_jax.reconstruction.frame_pool import FramePool
 from logvggt_jax.reconstruction.point_cloud import PointFilter, PointSelection
 from logvggt_jax.reconstruction.request import check_request
-from logvggt_jax.reconstruction.result import (
-    EXPORT_FOLDER,
-    POINTS_FILE,
-    PREVIEW_FOLDER,
-    TRAJECTORY_FILE,
-    Reconstruction,
-)
+from logvggt_jax.reconstruction.result import Reconstruction
 from logvggt_jax.reconstruction.run import Run
 from logvggt_jax.reconstruction.sources import Source, open_source
 from logvggt_jax.reconstruction.work_folder import WorkFolder
@@ -150,15 +139,8 @@ def reconstruct(
         seconds = time.monotonic() - started
         run.write_cameras(calibration, complete=complete)
         result = Reconstruction.with_cameras_of(work.path)
-        for name in (PREVIEW_FOLDER, EXPORT_FOLDER):  # of an incomplete result
-            shutil.rmtree(work.path / name, ignore_errors=True)
-        (work.path / PREVIEW_FOLDER).mkdir()
-        for index in set(np.linspace(0, result.num_frames - 1, num_previews).round().astype(int).tolist()):
-            pool.submit(_write_preview, result, index)
-        export_tum(result, work.path / TRAJECTORY_FILE)
         bars.reset(task, description="Points", total=result.num_frames)
-        write_cloud(result, work.path / POINTS_FILE, run.selection, pool, advance=lambda: bars.advance(task))
-        pool.finish()
+        finish(result, run.selection, pool, num_previews=num_previews, advance=lambda: bars.advance(task))
         work.commit(complete=complete)
     if source.skipped:
         warnings.warn(
@@ -176,11 +158,3 @@ class _Rate(ProgressColumn):
         # Rich forgets the speed when the total is corrected, as it is at the end of a video.
         speed = task.finished_speed or task.speed or (task.completed / task.elapsed if task.elapsed else 0.0)
         return Text(f"{speed:.2f} frames/s")
-
-
-def _write_preview(result: Reconstruction, index: int) -> None:
-    depth = result.depth(index)
-    valid = depth[np.isfinite(depth) & (depth > 0)]
-    near, far = np.percentile(valid, (2, 98)) if valid.size else (1.0, 2.0)
-    picture = np.concatenate([result.image(index), depth_picture(depth, near=near, far=far)], axis=1)
-    write_picture(result.folder / PREVIEW_FOLDER / f"{result.names[index]}.png", picture)
