@@ -81,10 +81,13 @@ class LiveReport:
 
     def line(self) -> str:
         """Everything on one line: medians, and 95 % quantiles in brackets, in milliseconds."""
-        rate = "" if self.fps is None else f" {self.fps:.1f} fps"
         stages = (f"{name} {1e3 * t.median:.0f} ({1e3 * t.most:.0f})" for name, t in self.latencies.items())
-        counts = f"{self.received} in, {self.used} used, {self.dropped} dropped,{rate}"
-        return " | ".join((counts.rstrip(","), "ms: " + ", ".join(stages)) if self.latencies else (counts.rstrip(","),))
+        parts = [f"{self.received} in, {self.used} used, {self.dropped} dropped"]
+        if self.fps is not None:
+            parts.append(f"{self.fps:.1f} fps")
+        if self.latencies:
+            parts.append(f"ms: {', '.join(stages)}")
+        return " | ".join(parts)
 
     def table(self) -> str:
         """Counts, and a row a stage."""
