@@ -1,4 +1,4 @@
-"""The `logvggt` command: convert weights, reconstruct sequences, render a room, check data, look at results."""
+"""The `logvggt` command: convert weights, reconstruct sequences, follow cameras, check data, look at results."""
 
 # Commands import what they need when they run: JAX takes seconds to load, `--help` should not.
 
@@ -166,6 +166,54 @@ def _reconstruct(options: argparse.Namespace) -> int:
             print("logvggt: note: not exported, since it is incomplete; see logvggt export --help", file=sys.stderr)
         return INTERRUPTED
     return _exports(result, options.export)
+
+
+def _live(options: argparse.Namespace) -> int:
+    from logvggt_jax.compile import check_devices, enable_compilation_cache
+    from logvggt_jax.model.parameters import in_compute_type
+    from logvggt_jax.reconstruction.live import LiveSession, OnlineSettings, Recording, online_stream
+    from logvggt_jax.reconstruction.live.follow import follow
+    from logvggt_jax.reconstruction.reconstruct import LONGER_EDGE
+    from logvggt_jax.reconstruction.request import check_request
+    from logvggt_jax.reconstruction.sources import open_source
+    from logvggt_jax.streaming import expectation
+    from logvggt_jax.weights import resolve
+    from logvggt_jax.weights.checkpoints import from_pretrained, read_provenance
+
+    thinned = {name: getattr(options, name) for name in ("stride", "fps")}
+    source = open_source(options.camera, most_broken=1.0, **thinned)
+    if source.address is not None and not options.realtime:
+        raise InputError(f"{source.name} is no camera: add --realtime to play it as one, or use `logvggt reconstruct`")
+    recording = None
+    if options.output is not None:
+        check_request(source, options.output, longer_edge=options.longer_edge, overwrite=options.overwrite)
+        recording = Recording(options.output, overwrite=options.overwrite)
+    online = OnlineSettings(options.period, options.context, options.max_registers)
+    checkpoint = resolve(options.checkpoint)
+    provenance = read_provenance(checkpoint)
+    if doubt := expectation(provenance.trained_for, "windows"):
+        warnings.warn(doubt, stacklevel=1)
+    check_devices()
+    enable_compilation_cache(options.compilation_cache)
+    model, variables = from_pretrained(checkpoint, dtype=options.dtype)
+    variables = in_compute_type(variables, model.config)
+    session = LiveSession(
+        lambda: online_stream(model, variables, online),
+        longer_edge=options.longer_edge or provenance.longer_edge or LONGER_EDGE,
+        capacity=model.config.windows.stride if options.queue is None else options.queue,
+        recording=recording,
+    )
+    print(f"logvggt: {session.rule}", file=sys.stderr)
+    print(f"logvggt: {online.text(model)}", file=sys.stderr)
+    lost = follow(source, session, realtime=source.address is not None, reconnect=options.reconnect)
+    report = session.report()
+    print(json.dumps(report.as_json(), indent=1) if options.json else report.table())
+    if session.reconstruction is not None:
+        print(session.reconstruction.summary(), file=sys.stderr if options.json else sys.stdout)
+    if lost is None:
+        return 0
+    print(f"logvggt: error: {one_line(InputError(lost))}", file=sys.stderr)
+    return BAD_INPUT
 
 
 def _exports(result: Reconstruction, formats: Sequence[str]) -> int:
@@ -566,6 +614,66 @@ def _parser() -> argparse.ArgumentParser:
         help="where compiled programs are kept between runs, 'none' for nowhere (default: $JAX_COMPILATION_CACHE_DIR "
         "or the user's cache folder)",
     )
+
+    sub = command(
+        "live",
+        _live,
+        "depth and poses while a camera or a network stream is looked through",
+        "logvggt live 0 --checkpoint models/log-vggt --output runs/now",
+        details=" Frames that come faster than they are used wait in a short queue; when it is full, the one that has "
+        "waited longest is dropped, and counted. Time a frame and memory do not grow. How it keeps up, and how long "
+        "every stage takes (median, and 95 % in brackets), is said on standard error while it runs and as a table at "
+        "the end. Ctrl-C ends the sequence; where the camera is lost, what is final stays.",
+    )
+    sub.add_argument(
+        "camera", help="number of a camera (0), address of a stream (rtsp://…, http://…), or a video, with --realtime"
+    )
+    sub.add_argument("--checkpoint", required=True, metavar="PATH_OR_REPO", help="model, as for `logvggt reconstruct`")
+    sub.add_argument(
+        "--output", type=Path, default=None, metavar="DIR", help="folder to make, as `logvggt reconstruct` makes it"
+    )
+    sub.add_argument("--overwrite", action="store_true", help="replace an earlier reconstruction")
+    sub.add_argument(
+        "--longer-edge",
+        type=int,
+        default=None,
+        metavar="PIXELS",
+        help="resize frames so that their longer edge has this size, a multiple of 14 (default: the size that the "
+        "model was trained with)",
+    )
+    sub.add_argument(
+        "--queue",
+        type=int,
+        default=None,
+        metavar="N",
+        help="frames that may wait (default: the windows' stride, what a window takes at once)",
+    )
+    sub.add_argument("--stride", type=int, default=1, metavar="N", help="look at every N-th frame alone")
+    sub.add_argument("--fps", type=float, default=None, metavar="N", help="look at N frames a second at most")
+    sub.add_argument("--realtime", action="store_true", help="play a video at its own pace, as if it were a camera")
+    sub.add_argument(
+        "--reconnect",
+        type=float,
+        default=None,
+        metavar="SECONDS",
+        help="try for so long to reach a camera or stream again that was lost",
+    )
+    sub.add_argument(
+        "--period",
+        type=int,
+        default=None,
+        metavar="N",
+        help="new frames after which poses are final (default: the windows' stride)",
+    )
+    sub.add_argument("--context", type=int, default=32, metavar="N", help="newest frames that the camera head sees")
+    sub.add_argument(
+        "--max-registers", type=int, default=1024, metavar="N", help="register tokens that GCCR reads, four a frame"
+    )
+    sub.add_argument(
+        "--dtype", choices=("float32", "bfloat16"), default=None, help="compute type instead of the checkpoint's own"
+    )
+    sub.add_argument("--json", action="store_true", help="print the numbers at the end as JSON, in seconds")
+    sub.add_argument("--compilation-cache", default=None, metavar="DIR", help="as for `logvggt reconstruct`")
 
     sub = command(
         "export",

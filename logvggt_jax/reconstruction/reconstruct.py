@@ -6,14 +6,12 @@ import dataclasses
 import hashlib
 import importlib.metadata
 import json
-import shutil
 import time
 import warnings
 from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -32,19 +30,11 @@ from logvggt_jax.interruption import StopRequest
 from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.reconstruction.calibration import Calibration
 from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE
-from logvggt_jax.reconstruction.exporters.ply import write_cloud
-from logvggt_jax.reconstruction.exporters.tum import export_tum
+from logvggt_jax.reconstruction.finishing import finish
 from logvggt_jax.reconstruction.frame_pool import FramePool
 from logvggt_jax.reconstruction.point_cloud import PointFilter, PointSelection
-from logvggt_jax.reconstruction.previews import write_previews
 from logvggt_jax.reconstruction.request import check_request
-from logvggt_jax.reconstruction.result import (
-    EXPORT_FOLDER,
-    POINTS_FILE,
-    PREVIEW_FOLDER,
-    TRAJECTORY_FILE,
-    Reconstruction,
-)
+from logvggt_jax.reconstruction.result import Reconstruction
 from logvggt_jax.reconstruction.run import Run
 from logvggt_jax.reconstruction.sources import Source, open_source
 from logvggt_jax.reconstruction.work_folder import WorkFolder
@@ -149,14 +139,8 @@ def reconstruct(
         seconds = time.monotonic() - started
         run.write_cameras(calibration, complete=complete)
         result = Reconstruction.with_cameras_of(work.path)
-        for name in (PREVIEW_FOLDER, EXPORT_FOLDER):  # of an incomplete result
-            shutil.rmtree(work.path / name, ignore_errors=True)
-        chosen = np.unique(np.linspace(0, result.num_frames - 1, num_previews).round().astype(int)).tolist()
-        write_previews(result, chosen, pool)
-        export_tum(result, work.path / TRAJECTORY_FILE)
         bars.reset(task, description="Points", total=result.num_frames)
-        write_cloud(result, work.path / POINTS_FILE, run.selection, pool, advance=lambda: bars.advance(task))
-        pool.finish()
+        finish(result, run.selection, pool, num_previews=num_previews, advance=lambda: bars.advance(task))
         work.commit(complete=complete)
     if source.skipped:
         warnings.warn(

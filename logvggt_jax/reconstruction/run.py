@@ -6,39 +6,24 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from logvggt_jax.data.feeding.transforms import ResizeTransform, resize
 from logvggt_jax.errors import InputError
-from logvggt_jax.geometry import decode_poses
 from logvggt_jax.interruption import Interrupted, StopRequest
 from logvggt_jax.reconstruction.calibration import Calibration
-from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE, write_cameras
-from logvggt_jax.reconstruction.depth_files import write_depth, write_picture
 from logvggt_jax.reconstruction.frame_pool import FramePool
+from logvggt_jax.reconstruction.frame_writer import FrameWriter, Picture
 from logvggt_jax.reconstruction.point_cloud import PointSelection
-from logvggt_jax.reconstruction.result import DEPTH_FOLDER, IMAGE_FOLDER, depth_file, image_file
 from logvggt_jax.reconstruction.sources import SkippedFrame, Source, SourceFrame
 from logvggt_jax.reconstruction.sources.record import record_source
 from logvggt_jax.reconstruction.work_folder import WorkFolder
 from logvggt_jax.streaming import FrameResult, Predictor, Progress
 from logvggt_jax.streaming.state_file import State
 
-_NARROWEST_FIELD_OF_VIEW = 0.01  # radians
 # Saving takes at most this share of the time.
 _SAVING = 0.05
-
-
-class _Picture(NamedTuple):
-    """A frame at the model's size, uint8 [h, w, 3]."""
-
-    name: str
-    timestamp: float
-    image: np.ndarray
-    transform: ResizeTransform
-    focal_length: float | None
 
 
 class Run:
@@ -72,17 +57,10 @@ class Run:
         self.selection, self._longer_edge = selection, longer_edge
         self._save_seconds = save_seconds
         self._last_save, self._saving = time.monotonic(), 0.0
-        self._names: list[str] = []
-        self._timestamps: list[float] = []
-        self._transform: ResizeTransform | None = None
-        self._focal_length: float | None = None
-        # Frames whose depth is not final yet.
-        self._images: dict[int, np.ndarray] = {}
+        self._frames = FrameWriter(work.path, pool, selection)
         # Written since the last save.
         self._files: list[Path] = []
         self.num_taken = 0
-        for name in (DEPTH_FOLDER, IMAGE_FOLDER):
-            (work.path / name).mkdir(exist_ok=True)
         if (saved := work.saved()) is not None:
             self._restore(saved)
 
@@ -103,17 +81,14 @@ class Run:
         for picture in self._pictures():
             self.num_taken += 1
             if picture is not None:
-                self._images[len(self._names)] = picture.image
-                self._names.append(picture.name)
-                self._timestamps.append(picture.timestamp)
-                self._transform, self._focal_length = picture.transform, picture.focal_length or self._focal_length
+                self._frames.add(picture)
                 self._hand_on(self._predictor.push(picture.image))
             advance()
             if stop.reason:
                 break
             if time.monotonic() - self._last_save > max(self._save_seconds, self._saving / _SAVING):
                 self._save()
-        if stop.reason and not self._names:
+        if stop.reason and not self._frames.names:
             raise Interrupted(stop.reason, "no frame had been read yet")
         if stop.reason:
             self._save()
@@ -122,43 +97,21 @@ class Run:
             raise Interrupted(stop.reason, f"{kept}; the same command goes on from there")
         self._hand_on(self._predictor.close(refined))
         self._pool.finish()
-        if not self._names:
+        if not self._frames.names:
             raise InputError(f"{self._source.path} gave no frame")
         return stop.reason is None
 
     def write_cameras(self, calibration: Calibration, *, complete: bool) -> None:
         """Writes the cameras of all frames, as far as they are known by the calibration; all numbers are finite."""
-        cameras, transform = self._predictor.cameras(), self._transform
-        assert transform is not None  # there are frames
-        encodings = cameras.pose_encoding.copy()
-        narrow = encodings[:, 7:] < _NARROWEST_FIELD_OF_VIEW
-        if narrow.any():
-            # An infinite focal length has no place in files, nor do points that it would put on one line.
-            warnings.warn(
-                f"{int(narrow.any(1).sum())} of {len(encodings)} frames have no field of view worth the name; "
-                f"{_NARROWEST_FIELD_OF_VIEW} rad is written instead. Is the model trained?",
-                stacklevel=2,
-            )
-            encodings[:, 7:] = np.maximum(encodings[:, 7:], _NARROWEST_FIELD_OF_VIEW)
-        intrinsics = calibration.apply(decode_poses(encodings, transform.size)[1], transform)
-        write_cameras(
-            self._work.path / CAMERAS_FILE,
-            names=self._names,
-            timestamps=self._timestamps,
-            extrinsics=cameras.extrinsics,
-            intrinsics=transform.intrinsics_to_original(intrinsics),
-            image_size=transform.original_size,
-            model_intrinsics=intrinsics,
-            model_size=transform.size,
+        self._frames.write_cameras(
+            self._predictor.cameras(),
+            calibration,
             complete=complete,
             skipped=self._source.skipped,
-            noted_focal_length=self._focal_length,
             source=record_source(self._source, self.num_taken),
-            depth_scale=cameras.depth_scale,
-            loops=cameras.loops,
         )
 
-    def _pictures(self) -> Iterator[_Picture | None]:
+    def _pictures(self) -> Iterator[Picture | None]:
         """The rest of the source, read ahead; where it breaks off, what is done is saved."""
         try:
             yield from self._pool.map(self._prepare, self._source.loaders(self.num_taken))
@@ -172,24 +125,15 @@ class Run:
                 )
             raise
 
-    def _prepare(self, load: Callable[[], SourceFrame | None]) -> _Picture | None:
+    def _prepare(self, load: Callable[[], SourceFrame | None]) -> Picture | None:
         frame = load()
         if frame is None:
             return None
         image, transform = resize(frame.image, longer_edge=self._longer_edge)
-        return _Picture(frame.name, frame.timestamp, image, transform, frame.focal_length)
+        return Picture(frame.name, frame.timestamp, image, transform, frame.focal_length)
 
     def _hand_on(self, results: list[FrameResult]) -> None:
-        for result in results:
-            name = self._names[result.index]
-            depth, image = depth_file(self._work.path, name), image_file(self._work.path, name)
-            self._files += [depth, image]
-            self._pool.submit(self._write, depth, image, self._images.pop(result.index), result)
-
-    def _write(self, depth: Path, image: Path, pixels: np.ndarray, result: FrameResult) -> None:
-        write_picture(image, pixels)
-        stored = write_depth(depth, result.depth, result.confidence)
-        self.selection.see(result.index, *stored, pixels)
+        self._files += self._frames.write(results)
 
     def _save(self) -> None:
         started = time.monotonic()
@@ -198,16 +142,16 @@ class Run:
         self._pool.finish()
         arrays = {f"predictor/{name}": array for name, array in predictor.items()}
         arrays |= {f"points/{name}": array for name, array in self.selection.arrays().items()}
-        arrays |= {f"images/{index}": image for index, image in self._images.items()}
+        arrays |= {f"images/{index}": image for index, image in self._frames.images.items()}
         facts = {
             "source": self._source.fingerprint(self.num_taken),
             "num_taken": self.num_taken,
-            "names": self._names,
-            "timestamps": self._timestamps,
+            "names": self._frames.names,
+            "timestamps": self._frames.timestamps,
             "skipped": self._source.skipped,
-            "focal_length": self._focal_length,
-            "size": None if self._transform is None else self._transform.original_size,
-            "model_size": None if self._transform is None else self._transform.size,
+            "focal_length": self._frames.focal_length,
+            "size": None if self._frames.transform is None else self._frames.transform.original_size,
+            "model_size": None if self._frames.transform is None else self._frames.transform.size,
         }
         self._work.save(State(arrays, facts), self._files)
         self._files = []
@@ -222,11 +166,11 @@ class Run:
                 f"{self._source.path} has changed since {self._work.path} was left unfinished: frames that were read "
                 "are other ones, or are taken otherwise; pass --overwrite to start anew"
             )
-        self._focal_length = facts["focal_length"]
-        self._names, self._timestamps = facts["names"], facts["timestamps"]
+        self._frames.focal_length = facts["focal_length"]
+        self._frames.names, self._frames.timestamps = facts["names"], facts["timestamps"]
         self._source.skipped[:] = [SkippedFrame(*each) for each in facts["skipped"]]
         if facts["size"]:
-            self._transform = ResizeTransform(tuple(facts["size"]), tuple(facts["model_size"]))
+            self._frames.transform = ResizeTransform(tuple(facts["size"]), tuple(facts["model_size"]))
 
         def part(prefix: str) -> dict[str, np.ndarray]:
             found = {name: array for name, array in saved.arrays.items() if name.startswith(prefix)}
@@ -234,4 +178,4 @@ class Run:
 
         self._predictor.restore(part("predictor/"))
         self.selection.restore(part("points/"))
-        self._images = {int(index): image for index, image in part("images/").items()}
+        self._frames.images = {int(index): image for index, image in part("images/").items()}

@@ -17,6 +17,7 @@ from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.data.feeding.transforms import preprocess, resize
 from logvggt_jax.errors import DiskError
 from logvggt_jax.geometry import decode_poses, unproject
+from logvggt_jax.reconstruction import frame_writer
 from logvggt_jax.reconstruction import run as run_module
 from logvggt_jax.reconstruction.cameras_file import read_cameras
 from logvggt_jax.reconstruction.depth_files import read_depth
@@ -250,14 +251,14 @@ def test_a_full_disk_stops_the_run_with_its_own_error(
     walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, written: str
 ) -> None:
     """What a worker cannot write is raised where frames are fed, long before the end, and nothing is left."""
-    original = getattr(run_module, written)
+    original = getattr(frame_writer, written)
 
     def failing(path: Path, *arrays: np.ndarray) -> object:
         if path.stem == "003":
             raise DiskError(f"{path}: No space left on device")
         return original(path, *arrays)
 
-    monkeypatch.setattr(run_module, written, failing)
+    monkeypatch.setattr(frame_writer, written, failing)
     predictor = Recorder()
     with pytest.raises(DiskError, match=r"003\.\w+: No space left"):
         reconstruct_recorded(predictor, walk, tmp_path / "out", progress=False, workers=1)

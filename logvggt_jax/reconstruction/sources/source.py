@@ -89,6 +89,7 @@ class Source(abc.ABC):
 
     Attributes:
       path: folder or file.
+      name: what messages call it; without the password that an address may hold.
       address: what opens it again, a path or a glob; None for a camera or a network stream, whose frames are gone.
       options: which frames are taken.
       notes: what the user should know before the work begins, one line each: what is left out, and why.
@@ -97,6 +98,7 @@ class Source(abc.ABC):
 
     def __init__(self, path: Path, options: SourceOptions) -> None:
         self.path, self.options = path, options
+        self.name = str(path)
         self.address: Path | None = path
         self.notes: list[str] = []
         self.skipped: list[SkippedFrame] = []

@@ -61,21 +61,21 @@ class VideoSource(Source):
     def __init__(self, path: str | Path, options: SourceOptions) -> None:
         super().__init__(Path(path), options)
         self._live = is_live(path)
-        self._name = re.sub(r"(?<=://)[^/@]*:[^/@]*@", "", _address(path))
+        self.name = re.sub(r"(?<=://)[^/@]*:[^/@]*@", "", _address(path))
         self._header: VideoHeader | None = None
         if not self._live:
             _check_file(self.path)
-            self._decoder = _decoder(self.path, self._name)
+            self._decoder = _decoder(self.path, self.name)
             self._header = self._decoder.header()
             self._check_range(self._header)
             self.notes += self._header.notes
             return
         self.address = None
         if str(path).isdecimal():
-            self._name = f"camera {path}"
-            self._decoder = OpenCVDecoder(int(str(path)), self._name)
+            self.name = f"camera {path}"
+            self._decoder = OpenCVDecoder(int(str(path)), self.name)
         else:
-            self._decoder = _decoder(_address(path), self._name, _TIMEOUT)
+            self._decoder = _decoder(_address(path), self.name, _TIMEOUT)
 
     @property
     def expected_frames(self) -> int | None:
@@ -134,10 +134,10 @@ class VideoSource(Source):
         else:
             self._check_end(position + 1, seconds)
         if guessed:
-            self._add_note(f"{self._name}: frames with damaged parts, which the decoder filled by guesses: {guessed}")
+            self._add_note(f"{self.name}: frames with damaged parts, which the decoder filled by guesses: {guessed}")
         if not taken:
             raise InputError(
-                f"{self._name} gave no frame between {self.options.start or 0:g} s and "
+                f"{self.name} gave no frame between {self.options.start or 0:g} s and "
                 f"{'its end' if self.options.end is None else f'{self.options.end:g} s'}"
             )
 
@@ -145,7 +145,7 @@ class VideoSource(Source):
         image = picture.convert()
         if image.dtype != np.uint8 or image.shape != (*picture.size, 3):
             raise InputError(
-                f"{self._name}: {name} is {image.dtype} {image.shape} after decoding, expected 8 bits and three "
+                f"{self.name}: {name} is {image.dtype} {image.shape} after decoding, expected 8 bits and three "
                 "colours; re-encode the video"
             )
         return SourceFrame(name, seconds, image)
@@ -154,17 +154,17 @@ class VideoSource(Source):
         self.skipped.append(SkippedFrame(name, reason))
         count = len(self.skipped)
         if self.options.strict:
-            raise InputError(f"{self._name}: {name} cannot be decoded ({reason}); re-encode the video")
+            raise InputError(f"{self.name}: {name} cannot be decoded ({reason}); re-encode the video")
         total = self.expected_frames or taken + count
         if self.options.too_many_broken(count, total):
             raise InputError(
-                f"{self._name}: {count} of {total} frames cannot be decoded, up to {name} ({reason}), more than "
+                f"{self.name}: {count} of {total} frames cannot be decoded, up to {name} ({reason}), more than "
                 f"{self.options.most_broken:.0%}; copy the video anew or re-encode it"
             )
 
     def _refuse_size(self, position: int, size: tuple[int, int], first: tuple[int, int]) -> None:
         raise InputError(
-            f"{self._name}: frame {position} is {size[1]} x {size[0]} pixels but the video begins with {first[1]} x "
+            f"{self.name}: frame {position} is {size[1]} x {size[0]} pixels but the video begins with {first[1]} x "
             f"{first[0]}: all frames need one size; cut it there, or scale all of it with ffmpeg -i INPUT -vf "
             f"scale={first[1]}:{first[0]} OUTPUT.mp4"
         )
@@ -172,7 +172,7 @@ class VideoSource(Source):
     def _check_range(self, header: VideoHeader) -> None:
         start = self.options.start or 0.0
         if header.seconds is not None and start >= header.seconds:
-            raise InputError(f"{self._name} lasts {header.seconds:.3g} s, but start is {start:g} s: choose less")
+            raise InputError(f"{self.name} lasts {header.seconds:.3g} s, but start is {start:g} s: choose less")
 
     def _check_end(self, frames: int, seconds: float) -> None:
         """Warns of a file that ends before its header says. Headers are often off by a frame or two."""
@@ -189,7 +189,7 @@ class VideoSource(Source):
             short = frames < 0.99 * header.announced - 2 and (lacks_time or header.seconds is None)
             told = f"{frames} frames decoded, its header announces {header.announced}"
         if short:
-            warnings.warn(f"{self._name} ends early: {told}", stacklevel=3)
+            warnings.warn(f"{self.name} ends early: {told}", stacklevel=3)
 
     def _add_note(self, note: str) -> None:
         if note not in self.notes:

@@ -1,0 +1,124 @@
+"""Frames that became final on their way to a result folder: images and depth as they come, all cameras at the end."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from logvggt_jax.data.feeding.transforms import ResizeTransform
+from logvggt_jax.geometry import decode_poses
+from logvggt_jax.reconstruction.calibration import Calibration
+from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE, write_cameras
+from logvggt_jax.reconstruction.depth_files import write_depth, write_picture
+from logvggt_jax.reconstruction.frame_pool import FramePool
+from logvggt_jax.reconstruction.point_cloud import PointSelection
+from logvggt_jax.reconstruction.result import DEPTH_FOLDER, IMAGE_FOLDER, depth_file, image_file
+from logvggt_jax.reconstruction.sources.record import SourceRecord
+from logvggt_jax.streaming import Cameras, FrameResult
+
+_NARROWEST_FIELD_OF_VIEW = 0.01  # radians
+
+
+class Picture(NamedTuple):
+    """A frame at the model's size, uint8 [h, w, 3]."""
+
+    name: str
+    timestamp: float
+    image: np.ndarray
+    transform: ResizeTransform
+    focal_length: float | None = None
+
+
+class FrameWriter:
+    """Writes the frames of one sequence.
+
+    Args:
+      folder: to fill.
+      pool: whose workers write.
+      selection: sees every frame that is written.
+
+    Attributes:
+      names, timestamps: of the frames that were added.
+      transform: from the original images to the model's; None before the first frame.
+      focal_length: pixels of the original images, as the camera noted it; None where it did not.
+      images: of the frames whose depth is not final yet, by position in the sequence.
+    """
+
+    def __init__(self, folder: Path, pool: FramePool, selection: PointSelection) -> None:
+        self._folder, self._pool, self._selection = folder, pool, selection
+        self.names: list[str] = []
+        self.timestamps: list[float] = []
+        self.transform: ResizeTransform | None = None
+        self.focal_length: float | None = None
+        self.images: dict[int, np.ndarray] = {}
+        for name in (DEPTH_FOLDER, IMAGE_FOLDER):
+            (folder / name).mkdir(exist_ok=True)
+
+    def add(self, picture: Picture) -> None:
+        """The sequence's next frame, which goes to the method now."""
+        self.images[len(self.names)] = picture.image
+        self.names.append(picture.name)
+        self.timestamps.append(picture.timestamp)
+        self.transform, self.focal_length = picture.transform, picture.focal_length or self.focal_length
+
+    def write(self, results: Sequence[FrameResult]) -> list[Path]:
+        """Has the pool write frames whose depth is final; the files it will have written when the pool has finished."""
+        files: list[Path] = []
+        for result in results:
+            name = self.names[result.index]
+            depth, image = depth_file(self._folder, name), image_file(self._folder, name)
+            files += [depth, image]
+            self._pool.submit(self._write, depth, image, self.images.pop(result.index), result)
+        return files
+
+    def write_cameras(
+        self,
+        cameras: Cameras,
+        calibration: Calibration,
+        *,
+        complete: bool,
+        skipped: Sequence[tuple[str, str]] = (),
+        source: SourceRecord | None = None,
+    ) -> None:
+        """Writes the cameras of all frames, as far as they are known by the calibration; all numbers are finite.
+
+        The other arguments are those of `cameras_file.write_cameras`.
+        """
+        transform = self.transform
+        assert transform is not None  # there are frames
+        encodings = cameras.pose_encoding.copy()
+        narrow = encodings[:, 7:] < _NARROWEST_FIELD_OF_VIEW
+        if narrow.any():
+            # An infinite focal length has no place in files, nor do points that it would put on one line.
+            warnings.warn(
+                f"{int(narrow.any(1).sum())} of {len(encodings)} frames have no field of view worth the name; "
+                f"{_NARROWEST_FIELD_OF_VIEW} rad is written instead. Is the model trained?",
+                stacklevel=2,
+            )
+            encodings[:, 7:] = np.maximum(encodings[:, 7:], _NARROWEST_FIELD_OF_VIEW)
+        intrinsics = calibration.apply(decode_poses(encodings, transform.size)[1], transform)
+        write_cameras(
+            self._folder / CAMERAS_FILE,
+            names=self.names,
+            timestamps=self.timestamps,
+            extrinsics=cameras.extrinsics,
+            intrinsics=transform.intrinsics_to_original(intrinsics),
+            image_size=transform.original_size,
+            model_intrinsics=intrinsics,
+            model_size=transform.size,
+            complete=complete,
+            skipped=skipped,
+            noted_focal_length=self.focal_length,
+            source=source,
+            depth_scale=cameras.depth_scale,
+            loops=cameras.loops,
+        )
+
+    def _write(self, depth: Path, image: Path, pixels: np.ndarray, result: FrameResult) -> None:
+        write_picture(image, pixels)
+        stored = write_depth(depth, result.depth, result.confidence)
+        self._selection.see(result.index, *stored, pixels)

@@ -1,0 +1,94 @@
+"""A live session's result folder, the same as `reconstruct` makes."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+
+from logvggt_jax.errors import InputError
+from logvggt_jax.reconstruction.calibration import Calibration
+from logvggt_jax.reconstruction.finishing import finish
+from logvggt_jax.reconstruction.frame_pool import FramePool
+from logvggt_jax.reconstruction.frame_writer import FrameWriter, Picture
+from logvggt_jax.reconstruction.point_cloud import PointFilter, PointSelection
+from logvggt_jax.reconstruction.result import Reconstruction
+from logvggt_jax.reconstruction.work_folder import WorkFolder
+from logvggt_jax.streaming import Cameras, FrameResult
+
+
+class Recording:
+    """Where a live session's frames go to the disk as they become final.
+
+    The work lies in `<output>.partial` until the session ends. What a camera has shown cannot be read again: a
+    recording is never taken up, and one that ends by an error is gone. A `LiveSession` enters and leaves it.
+
+    Args:
+      output: folder to make.
+      point_filter: which pixels become points.
+      calibration: intrinsics that are known; None takes those that the model predicts, frame by frame.
+      num_previews: pictures of frames beside their depth, evenly over the sequence.
+      overwrite: replace an earlier result.
+      workers: threads that write; None for one a core, at most eight.
+    """
+
+    def __init__(
+        self,
+        output: str | Path,
+        *,
+        point_filter: PointFilter | None = None,
+        calibration: Calibration | None = None,
+        num_previews: int = 8,
+        overwrite: bool = False,
+        workers: int | None = None,
+    ) -> None:
+        if num_previews < 0:
+            raise InputError(f"num_previews must not be negative, got {num_previews}")
+        self._target = Path(output).expanduser().resolve()
+        self._filter, self._calibration = point_filter or PointFilter(), calibration or Calibration()
+        self._num_previews, self._overwrite, self._workers = num_previews, overwrite, workers
+        self._stack = contextlib.ExitStack()
+
+    def __enter__(self) -> Recording:
+        """Makes the folder. Raises OutputExists, or InputError where another run is at work there."""
+        self._work = WorkFolder(self._target, {"source": "live"}, overwrite=self._overwrite)
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(self._work)
+            self._pool = stack.enter_context(FramePool(self._workers))
+            self._selection = PointSelection(self._filter, None)
+            self._frames = FrameWriter(self._work.path, self._pool, self._selection)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Lets go of the folder; without `finish` nothing of it is left."""
+        self._stack.__exit__(kind, error, trace)
+
+    def add(self, picture: Picture) -> None:
+        """The next frame, which goes to the method now."""
+        self._frames.add(picture)
+
+    def write(self, results: Sequence[FrameResult]) -> None:
+        """Has frames written whose depth is final; waits while too many are."""
+        self._frames.write(results)
+
+    def finish(self, cameras: Cameras, *, complete: bool) -> Reconstruction | None:
+        """Puts the result in its place, once all frames were written; None where there was no frame.
+
+        Args:
+          cameras: of all frames.
+          complete: whether the session ended because somebody wanted it to.
+        """
+        if not self._frames.names:
+            return None
+        self._pool.finish()
+        self._frames.write_cameras(cameras, self._calibration, complete=complete)
+        result = Reconstruction.with_cameras_of(self._work.path)
+        finish(result, self._selection, self._pool, num_previews=self._num_previews, advance=lambda: None)
+        # Whatever ended it: nothing can go on from there.
+        self._work.commit(complete=True)
+        return dataclasses.replace(result, folder=self._target)

@@ -1,0 +1,268 @@
+"""A live session uses the newest frames, counts the others, times every stage, and ends with a valid result."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from recorder import LONGER_EDGE, Recorder
+
+from logvggt_jax import LogVGGT, ModelConfig, StreamSession
+from logvggt_jax.cli import main
+from logvggt_jax.errors import InputError
+from logvggt_jax.interruption import Interrupted
+from logvggt_jax.reconstruction import Reconstruction, Source, SourceFrame, SourceOptions
+from logvggt_jax.reconstruction.live import (
+    LiveResult,
+    LiveSession,
+    OnlineSettings,
+    Recording,
+    capture,
+    online_stream,
+)
+from logvggt_jax.reconstruction.live.follow import follow
+from logvggt_jax.reconstruction.live.newest import FrameCounts, NewestFrames
+
+PICTURES = np.random.default_rng(0).integers(0, 256, (12, 28, 42, 3), np.uint8)
+
+
+class FakeCamera(Source):
+    """Gives pictures, a connection after the other; before each one it calls `on_frame` with its number in all."""
+
+    def __init__(
+        self, *connections: int, on_frame: Callable[[int], object] = lambda _: None, step: float = 0.0
+    ) -> None:
+        super().__init__(Path("camera"), SourceOptions())
+        self.address, self._connections = None, list(connections)
+        self._on_frame, self._step, self._given = on_frame, step, 0
+
+    @property
+    def expected_frames(self) -> None:
+        return None
+
+    @property
+    def image_size(self) -> None:
+        return None
+
+    def fingerprint(self, count: int) -> str:
+        return ""
+
+    def loaders(self, first: int = 0) -> Iterator[Callable[[], SourceFrame | None]]:
+        if not self._connections:
+            raise InputError("camera cannot be opened: is it connected?")
+        for index in range(self._connections.pop(0)):
+            self._on_frame(self._given)
+            picture, self._given = PICTURES[self._given], self._given + 1
+            yield lambda index=index, picture=picture: SourceFrame(f"{index}", index * self._step, picture)
+
+
+@pytest.fixture(autouse=True)
+def signals_reach_this_process() -> Iterator[None]:
+    """A shell starts what it runs in the background deaf to Ctrl-C."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def session(predictor: Recorder | None = None, **options: Any) -> LiveSession:
+    """Of the stand-in, which is not warmed up; nothing is dropped unless the options say so."""
+    predictor = predictor or Recorder()
+    return LiveSession(lambda: predictor, **{"longer_edge": LONGER_EDGE, "warm_up": 0, "capacity": 12, **options})
+
+
+def test_of_waiting_frames_the_oldest_goes_and_every_frame_is_counted() -> None:
+    queue: NewestFrames[int] = NewestFrames(2)
+    for frame in range(5):
+        queue.put(frame)
+    assert queue.counts == FrameCounts(received=5, taken=0, dropped=3, waiting=2)
+    assert queue.take() == 3
+    queue.put(5)
+    queue.close()
+    assert [queue.take(), queue.take(), queue.take()] == [4, 5, None]
+    assert queue.counts == FrameCounts(received=6, taken=3, dropped=3, waiting=0)
+
+
+def test_frames_that_come_while_the_device_works_are_dropped_but_for_the_newest() -> None:
+    entered, release, results = threading.Event(), threading.Event(), list[LiveResult]()
+
+    def on_push(_: int) -> None:
+        entered.set()
+        assert release.wait(10)
+
+    with session(Recorder(on_push), capacity=2, on_result=results.append) as live:
+        live.push(PICTURES[0], 0.0)
+        assert entered.wait(10)
+        for index in range(1, 10):
+            live.push(PICTURES[index], index / 30)
+        assert (live.report().received, live.report().dropped, live.report().waiting) == (10, 7, 2)
+        release.set()
+    report = live.report()
+    assert (report.received, report.used, report.dropped, report.waiting, report.finished) == (10, 3, 7, 0, 3)
+    assert [each.name for each in results] == ["frame-000000", "frame-000008", "frame-000009"]
+    assert [each.timestamp for each in results] == [0.0, 8 / 30, 9 / 30]
+    assert [each.result.index for each in results] == [0, 1, 2]
+    for each, index in zip(results, (0, 8, 9), strict=True):
+        np.testing.assert_array_equal(each.image, PICTURES[index])
+    with pytest.raises(ValueError, match="has ended"):
+        live.push(PICTURES[0])
+
+
+def test_a_session_whose_first_frame_is_old_when_it_is_warm_begins_with_neighbours() -> None:
+    warm, results = threading.Event(), list[LiveResult]()
+    predictors = iter((Recorder(lambda _: warm.wait(10)), Recorder()))
+    options = {"longer_edge": LONGER_EDGE, "warm_up": 3, "capacity": 2, "on_result": results.append}
+    with LiveSession(lambda: next(predictors), **options) as live:
+        for picture in PICTURES[:6]:
+            live.push(picture)
+            while live.report().used == 0:  # the first is on its way
+                time.sleep(0.001)
+        warm.set()
+    assert [each.name for each in results] == ["frame-000004", "frame-000005"]
+    assert (live.report().used, live.report().dropped) == (2, 4)
+
+
+def test_every_stage_is_timed_and_told() -> None:
+    def slow(_: object) -> None:
+        time.sleep(0.02)
+
+    camera = FakeCamera(6, on_frame=slow)
+    live = session(Recorder(slow), on_result=slow)
+    follow(camera, live)
+    report = live.report()
+    assert list(report.latencies) == ["capture", "wait", "resize", "device", "result", "final"]
+    assert [times.measured for times in report.latencies.values()] == [6, 6, 6, 3, 3, 6]
+    for name, least in {"capture": 0.02, "device": 0.02, "result": 0.04, "final": 0.04}.items():
+        assert least <= report.latencies[name].median <= report.latencies[name].most, name
+    assert report.fps is not None and report.fps < 50
+    assert json.loads(json.dumps(report.as_json()))["latencies"]["device"]["measured"] == 3
+    assert "6 in, 6 used, 0 dropped" in report.line()
+    assert report.table().startswith("6 frames in: 6 used, 0 dropped; ")
+    assert all(f"\n{name} " in report.table() for name in report.latencies)
+
+
+def test_the_numbers_are_those_of_a_stream_of_the_frames_that_were_used(
+    small_config: ModelConfig, small_variables: dict
+) -> None:
+    model, settings = LogVGGT(small_config), OnlineSettings(context=3, max_registers=16)
+    results: list[LiveResult] = []
+    options = {"longer_edge": LONGER_EDGE, "capacity": 12, "on_result": results.append}
+    with LiveSession(lambda: online_stream(model, small_variables, settings), **options) as live:
+        for picture in PICTURES[:9]:
+            live.push(picture)
+    refinement = dataclasses.replace(small_config.refinement, period=2, context=3, max_registers=16)
+    plain = StreamSession(LogVGGT(dataclasses.replace(small_config, refinement=refinement)), small_variables, ahead=0)
+    expected = [result for picture in PICTURES[:9] for result in plain.push(picture)] + plain.close()
+    assert [each.result.index for each in results] == list(range(9))
+    for each, wanted in zip(results, expected, strict=True):
+        np.testing.assert_array_equal(each.result.depth, wanted.depth)
+        np.testing.assert_array_equal(each.result.pose_encoding, wanted.pose_encoding)
+        assert each.result.pose_is_final
+    cameras = live.cameras()
+    assert cameras is not None
+    np.testing.assert_array_equal(cameras.extrinsics, plain.cameras().extrinsics)
+
+
+def test_an_unplugged_camera_leaves_what_is_final_and_one_line(tmp_path: Path) -> None:
+    live = session(recording=Recording(tmp_path / "out", workers=1))
+    lost = follow(FakeCamera(5), live)
+    assert lost == "camera is lost: no more frames come; is it still connected?"
+    result = Reconstruction.open(tmp_path / "out")
+    assert result.names == tuple(f"frame-{index:06d}" for index in range(5)) and not result.complete
+    assert result.num_points > 0 and (result.folder / "trajectory.txt").is_file()
+    assert [entry.name for entry in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_camera_that_gives_nothing_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"camera is lost: camera cannot be opened"):
+        follow(FakeCamera(), session(recording=Recording(tmp_path / "out")))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_ctrl_c_ends_with_a_whole_result(tmp_path: Path) -> None:
+    silent = threading.Event()
+
+    def on_frame(number: int) -> None:
+        if number == 5:
+            os.kill(os.getpid(), signal.SIGINT)
+            silent.wait(10)  # as a camera may be, for ever
+
+    live = session(recording=Recording(tmp_path / "out", workers=1))
+    began = time.monotonic()
+    assert follow(FakeCamera(9, on_frame=on_frame), live) is None
+    assert time.monotonic() - began < 9
+    silent.set()
+    result = Reconstruction.open(tmp_path / "out")
+    assert result.num_frames == 5 and result.complete
+    assert live.reconstruction is not None and live.reconstruction.folder == result.folder
+    np.testing.assert_allclose(result.extrinsics[:, 0, 3], np.arange(5))
+
+
+def test_ctrl_c_before_the_first_frame_is_told_as_such() -> None:
+    def on_frame(_: int) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.2)
+
+    with pytest.raises(Interrupted, match="no frame had come yet"):
+        follow(FakeCamera(1, on_frame=on_frame), session())
+
+
+def test_a_stream_that_comes_back_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(capture, "_PAUSE", 0.01)
+    results: list[LiveResult] = []
+    live = session(on_result=results.append)
+    lost = follow(FakeCamera(3, 0, 2, step=0.001), live, reconnect=0.05)
+    assert lost == "camera is lost: camera cannot be opened: is it connected?"
+    assert [each.name for each in results] == [f"frame-{index:06d}" for index in range(5)]
+    times = [each.timestamp for each in results]
+    np.testing.assert_allclose(np.diff(times)[[0, 1, 3]], 0.001)
+    assert times[3] - times[2] > 0.01
+
+
+def test_a_video_is_played_at_its_own_pace_and_its_end_is_no_loss(tmp_path: Path) -> None:
+    live = session(recording=Recording(tmp_path / "out", workers=1))
+    began = time.monotonic()
+    assert follow(FakeCamera(4, step=0.1), live, realtime=True) is None
+    assert time.monotonic() - began >= 0.3
+    assert Reconstruction.open(tmp_path / "out").complete
+
+
+def test_an_error_in_the_session_reaches_the_caller_and_leaves_no_folder(tmp_path: Path) -> None:
+    def broken(_: LiveResult) -> None:
+        raise RuntimeError("the robot fell over")
+
+    with pytest.raises(RuntimeError, match="fell over"):
+        follow(FakeCamera(8), session(on_result=broken, recording=Recording(tmp_path / "out")))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_frames_of_another_kind_are_refused() -> None:
+    with session() as live:
+        live.push(PICTURES[0])
+        with pytest.raises(InputError, match=r"were 42 x 28 pixels large and now are 28 x 28"):
+            live.push(PICTURES[0][:, :28])
+        with pytest.raises(InputError, match=r"uint8 \[H, W, 3\], got float32"):
+            live.push(PICTURES[0].astype(np.float32))
+    for options, complaint in (({"capacity": 0}, "capacity"), ({"longer_edge": 43}, "14")):
+        with pytest.raises(InputError, match=complaint):
+            session(**options)
+    with pytest.raises(InputError, match="max_registers"):
+        OnlineSettings(max_registers=0)
+
+
+def test_a_video_without_realtime_is_refused_before_a_model_is_looked_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    (tmp_path / "walk").mkdir()
+    Image.fromarray(PICTURES[0]).save(tmp_path / "walk" / "0.png")
+    assert main(["live", str(tmp_path / "walk"), "--checkpoint", "nowhere"]) == 2
+    assert "is no camera: add --realtime" in capsys.readouterr().err
