@@ -316,6 +316,7 @@ def test_a_cap_below_a_frame(small_config: ModelConfig, small_variables: dict) -
 @pytest.mark.parametrize(
     ("method", "settings"),
     [
+        ("causal", CausalSettings()),
         ("rolling", RollingSettings(budget=2 * LAYERS * (5 + 1 * 2))),
         ("pruned", PrunedSettings(cap=16)),
     ],
