@@ -156,6 +156,7 @@ def reconstruct(
         for index in set(np.linspace(0, result.num_frames - 1, num_previews).round().astype(int).tolist()):
             pool.submit(_write_preview, result, index)
         export_tum(result, work.path / TRAJECTORY_FILE)
+        run.write_health(result)
         bars.reset(task, description="Points", total=result.num_frames)
         write_cloud(result, work.path / POINTS_FILE, run.selection, pool, advance=lambda: bars.advance(task))
         pool.finish()

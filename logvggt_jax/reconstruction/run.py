@@ -18,8 +18,16 @@ from logvggt_jax.reconstruction.calibration import Calibration
 from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE, write_cameras
 from logvggt_jax.reconstruction.depth_files import write_depth, write_picture
 from logvggt_jax.reconstruction.frame_pool import FramePool
+from logvggt_jax.reconstruction.health.recorder import HealthRecorder
+from logvggt_jax.reconstruction.health.report import (
+    HEALTH_FILE,
+    HEALTH_PAGE,
+    examine,
+    without_harm,
+    write_health,
+)
 from logvggt_jax.reconstruction.point_cloud import PointSelection
-from logvggt_jax.reconstruction.result import DEPTH_FOLDER, IMAGE_FOLDER, depth_file, image_file
+from logvggt_jax.reconstruction.result import DEPTH_FOLDER, IMAGE_FOLDER, Reconstruction, depth_file, image_file
 from logvggt_jax.reconstruction.sources import SkippedFrame, Source, SourceFrame
 from logvggt_jax.reconstruction.sources.record import record_source
 from logvggt_jax.reconstruction.work_folder import WorkFolder
@@ -74,6 +82,7 @@ class Run:
         self._last_save, self._saving = time.monotonic(), 0.0
         self._names: list[str] = []
         self._timestamps: list[float] = []
+        self._health = HealthRecorder()
         self._transform: ResizeTransform | None = None
         self._focal_length: float | None = None
         # Frames whose depth is not final yet.
@@ -158,6 +167,22 @@ class Run:
             loops=cameras.loops,
         )
 
+    def write_health(self, result: Reconstruction) -> None:
+        """Writes what is to be said of the quality of `result`, whose cameras are written; never raises."""
+        with without_harm():
+            for name in (HEALTH_FILE, HEALTH_PAGE):  # of an incomplete result
+                (result.folder / name).unlink(missing_ok=True)
+            measures = self._health.measures(
+                size=result.depth_size,
+                extrinsics=result.extrinsics,
+                intrinsics=result.depth_intrinsics,
+                depth_scale=result.depth_scale,
+                # What the model saw, whatever calibration was given.
+                field_of_view=self._predictor.cameras().pose_encoding[:, 8].astype(np.float64),
+                signals=self._predictor.signals(),
+            )
+            write_health(result.folder, examine(measures, result.names), result.names)
+
     def _pictures(self) -> Iterator[_Picture | None]:
         """The rest of the source, read ahead; where it breaks off, what is done is saved."""
         try:
@@ -190,6 +215,8 @@ class Run:
         write_picture(image, pixels)
         stored = write_depth(depth, result.depth, result.confidence)
         self.selection.see(result.index, *stored, pixels)
+        with without_harm():
+            self._health.see(result.index, *stored, pixels)
 
     def _save(self) -> None:
         started = time.monotonic()
@@ -198,6 +225,7 @@ class Run:
         self._pool.finish()
         arrays = {f"predictor/{name}": array for name, array in predictor.items()}
         arrays |= {f"points/{name}": array for name, array in self.selection.arrays().items()}
+        arrays |= {f"health/{name}": array for name, array in self._health.arrays().items()}
         arrays |= {f"images/{index}": image for index, image in self._images.items()}
         facts = {
             "source": self._source.fingerprint(self.num_taken),
@@ -234,4 +262,5 @@ class Run:
 
         self._predictor.restore(part("predictor/"))
         self.selection.restore(part("points/"))
+        self._health.restore(part("health/"))
         self._images = {int(index): image for index, image in part("images/").items()}

@@ -95,7 +95,7 @@ def expected(model: LogVGGT, variables: dict, room: Path) -> dict[str, np.ndarra
 
 def test_result_says_where_everything_lies(result: Reconstruction) -> None:
     assert sorted(path.name for path in result.folder.iterdir()) == sorted(
-        ["cameras.json", "trajectory.txt", "points.ply", "depth", "images", "previews"]
+        ["cameras.json", "trajectory.txt", "points.ply", "depth", "images", "previews", "health.json", "health.html"]
     )
     assert result.num_frames == COUNT
     assert result.depth_size == (28, 42)
