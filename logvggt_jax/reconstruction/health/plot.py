@@ -25,7 +25,7 @@ def svg_plot(values: np.ndarray, shaded: Sequence[tuple[int, int]], *, label: st
     low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
     low = min(low, 0.0) if low < 0.5 * high else low
     if high - low < 1e-9 * max(abs(high), 1e-9):
-        low, high = low - 0.5 * (abs(low) or 1.0), high + 0.5 * (abs(high) or 1.0)
+        low, high = min(low, 0.0), max(high, 0.0) or 1.0
     last = max(len(values) - 1, 1)
 
     def x(frame: float) -> float:
