@@ -25,7 +25,7 @@ from logvggt_jax import LogVGGT
 from logvggt_jax.geometry import encode_poses
 from logvggt_jax.reconstruction import reconstruct
 from logvggt_jax.streaming import METHODS, Method, WindowSettings
-from logvggt_jax.streaming.results import Cameras, FrameResult, Progress, decoded_cameras
+from logvggt_jax.streaming.results import Cameras, FrameResult, Progress, Signals, decoded_cameras
 from logvggt_jax.streaming.windows import window_program
 
 SIZE = (392, 518)
@@ -81,6 +81,10 @@ class ClockPredictor:
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Nothing is ever saved."""
+
+    def signals(self) -> Signals:
+        """Nothing is known."""
+        return Signals.unknown(self._handed_out)
 
     def cameras(self) -> Cameras:
         """A walk along x."""

@@ -16,8 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
+from logvggt_jax import page
 from logvggt_jax.errors import InputError, MissingInput, disk_errors, one_line, printable
-from logvggt_jax.evaluation.report import figures, page
+from logvggt_jax.evaluation.report import figures
+from logvggt_jax.evaluation.report.page import table as table_part
 from logvggt_jax.evaluation.report.tables import MARK, Table, benchmark_tables
 from logvggt_jax.files import write_text
 from logvggt_jax.frames import Frames
@@ -92,7 +94,7 @@ def _room_pictures(room: Frames, result: Reconstruction, folder: Path) -> list[s
             folder / "trajectory.png", "The camera's path beside the true one, in the plane of its largest extent."
         ),
         page.paragraph(sentence),
-        page.table(table),
+        table_part(table),
     ]
 
 
@@ -184,7 +186,7 @@ def _evaluation(folder: Path) -> list[str]:
             "same weights without windows and refinement. A camera that stands still cannot be laid over the truth: "
             f"its ATE, marked {MARK}, is the size of the path. What every column means is in evaluation/report.html."
         ),
-        *(page.table(table) for table in benchmark_tables(results)),
+        *(table_part(table) for table in benchmark_tables(results)),
     ]
 
 

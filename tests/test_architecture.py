@@ -18,6 +18,7 @@ GROUND_FLOOR = {
     "operations",
     "interruption",
     "terminal",
+    "page",
 }
 # What each part may import besides itself and the ground floor.
 ALLOWED: dict[str, set[str]] = {

@@ -15,10 +15,12 @@ from logvggt_jax.reconstruction.calibration import Calibration
 from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE, write_cameras
 from logvggt_jax.reconstruction.depth_files import write_depth, write_picture
 from logvggt_jax.reconstruction.frame_pool import FramePool
+from logvggt_jax.reconstruction.health.recorder import HealthRecorder
+from logvggt_jax.reconstruction.health.report import HEALTH_FILE, HEALTH_PAGE, examine, without_harm, write_health
 from logvggt_jax.reconstruction.point_cloud import PointSelection
-from logvggt_jax.reconstruction.result import DEPTH_FOLDER, IMAGE_FOLDER, depth_file, image_file
+from logvggt_jax.reconstruction.result import DEPTH_FOLDER, IMAGE_FOLDER, Reconstruction, depth_file, image_file
 from logvggt_jax.reconstruction.sources.record import SourceRecord
-from logvggt_jax.streaming import Cameras, FrameResult
+from logvggt_jax.streaming import Cameras, FrameResult, Predictor
 
 _NARROWEST_FIELD_OF_VIEW = 0.01  # radians
 
@@ -46,6 +48,7 @@ class FrameWriter:
       transform: from the original images to the model's; None before the first frame.
       focal_length: pixels of the original images, as the camera noted it; None where it did not.
       images: of the frames whose depth is not final yet, by position in the sequence.
+      health: measures of the frames that are written.
     """
 
     def __init__(self, folder: Path, pool: FramePool, selection: PointSelection) -> None:
@@ -55,6 +58,7 @@ class FrameWriter:
         self.transform: ResizeTransform | None = None
         self.focal_length: float | None = None
         self.images: dict[int, np.ndarray] = {}
+        self.health = HealthRecorder()
         for name in (DEPTH_FOLDER, IMAGE_FOLDER):
             (folder / name).mkdir(exist_ok=True)
 
@@ -118,7 +122,25 @@ class FrameWriter:
             loops=cameras.loops,
         )
 
+    def write_health(self, result: Reconstruction, predictor: Predictor) -> None:
+        """Writes what is to be said of the quality of `result`, whose cameras are written; never raises."""
+        with without_harm():
+            for name in (HEALTH_FILE, HEALTH_PAGE):  # of an incomplete result
+                (result.folder / name).unlink(missing_ok=True)
+            measures = self.health.measures(
+                size=result.depth_size,
+                extrinsics=result.extrinsics,
+                intrinsics=result.depth_intrinsics,
+                depth_scale=result.depth_scale,
+                # What the model saw, whatever calibration was given.
+                field_of_view=predictor.cameras().pose_encoding[:, 8].astype(np.float64),
+                signals=predictor.signals(),
+            )
+            write_health(result.folder, examine(measures, result.names), result.names)
+
     def _write(self, depth: Path, image: Path, pixels: np.ndarray, result: FrameResult) -> None:
         write_picture(image, pixels)
         stored = write_depth(depth, result.depth, result.confidence)
         self._selection.see(result.index, *stored, pixels)
+        with without_harm():
+            self.health.see(result.index, *stored, pixels)

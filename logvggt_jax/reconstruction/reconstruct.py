@@ -139,6 +139,7 @@ def reconstruct(
         seconds = time.monotonic() - started
         run.write_cameras(calibration, complete=complete)
         result = Reconstruction.with_cameras_of(work.path)
+        run.write_health(result)
         bars.reset(task, description="Points", total=result.num_frames)
         finish(result, run.selection, pool, num_previews=num_previews, advance=lambda: bars.advance(task))
         work.commit(complete=complete)

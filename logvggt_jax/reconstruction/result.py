@@ -10,6 +10,7 @@ import numpy as np
 from logvggt_jax.errors import InputError, disk_errors, printable
 from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE, read_cameras
 from logvggt_jax.reconstruction.depth_files import read_depth, read_picture
+from logvggt_jax.reconstruction.health.report import HEALTH_FILE, HEALTH_PAGE, Health, read_health
 from logvggt_jax.reconstruction.point_cloud import Cloud, count_points, read_cloud, read_points
 from logvggt_jax.reconstruction.sources.record import SourceRecord
 
@@ -156,6 +157,15 @@ class Reconstruction:
             )
         return cloud
 
+    @property
+    def health(self) -> Health | None:
+        """Which frames are doubtful and why; None for results of earlier versions, and those made from another.
+
+        Raises:
+          InputError: `health.json` is damaged.
+        """
+        return read_health(self.folder)
+
     def summary(self) -> str:
         """One line a result, with its place; for people, so that a name's control characters are shown as escapes."""
         height, width = self.depth_size
@@ -182,6 +192,14 @@ class Reconstruction:
             notes.append(
                 f"focal length: {focal:.0f} pixels predicted, {self.noted_focal_length:.0f} by the camera's EXIF"
             )
+        try:
+            health = self.health
+        except InputError as error:
+            notes.append(printable(str(error)))
+        else:
+            if health is not None:
+                notes.append(f"health: {health.in_short}")
+                lines.append((HEALTH_PAGE, f"the word on that, with plots; its numbers are in {HEALTH_FILE}"))
         folder = printable(str(self.folder))
         return "\n".join(
             [f"{self.num_frames} frames{took}", *notes, *(f"  {folder}/{name}: {what}" for name, what in lines)]

@@ -16,6 +16,7 @@ from logvggt_jax.reconstruction.calibration import Calibration
 from logvggt_jax.reconstruction.frame_pool import FramePool
 from logvggt_jax.reconstruction.frame_writer import FrameWriter, Picture
 from logvggt_jax.reconstruction.point_cloud import PointSelection
+from logvggt_jax.reconstruction.result import Reconstruction
 from logvggt_jax.reconstruction.sources import SkippedFrame, Source, SourceFrame
 from logvggt_jax.reconstruction.sources.record import record_source
 from logvggt_jax.reconstruction.work_folder import WorkFolder
@@ -111,6 +112,10 @@ class Run:
             source=record_source(self._source, self.num_taken),
         )
 
+    def write_health(self, result: Reconstruction) -> None:
+        """Writes what is to be said of the quality of `result`, whose cameras are written; never raises."""
+        self._frames.write_health(result, self._predictor)
+
     def _pictures(self) -> Iterator[Picture | None]:
         """The rest of the source, read ahead; where it breaks off, what is done is saved."""
         try:
@@ -142,6 +147,7 @@ class Run:
         self._pool.finish()
         arrays = {f"predictor/{name}": array for name, array in predictor.items()}
         arrays |= {f"points/{name}": array for name, array in self.selection.arrays().items()}
+        arrays |= {f"health/{name}": array for name, array in self._frames.health.arrays().items()}
         arrays |= {f"images/{index}": image for index, image in self._frames.images.items()}
         facts = {
             "source": self._source.fingerprint(self.num_taken),
@@ -178,4 +184,5 @@ class Run:
 
         self._predictor.restore(part("predictor/"))
         self.selection.restore(part("points/"))
+        self._frames.health.restore(part("health/"))
         self._frames.images = {int(index): image for index, image in part("images/").items()}

@@ -25,9 +25,7 @@ def align(source: PlainPrediction, target: PlainPrediction) -> Similarity:
       ValueError: fewer than three pixels are valid in both, or their points lie on a line.
     """
     valid = confident(source, target)
-    chosen = np.flatnonzero(valid)
-    if len(chosen) > _MOST_POINTS:
-        chosen = chosen[np.linspace(0, len(chosen) - 1, _MOST_POINTS).round().astype(int)]
+    chosen = _some(valid)
     if len(chosen) < 3:
         raise ValueError(f"{len(chosen)} of {valid.size} pixels have a valid depth and confidence in both")
     weights = np.sqrt(source.depth_confidence.reshape(-1)[chosen].astype(np.float64))
@@ -35,6 +33,17 @@ def align(source: PlainPrediction, target: PlainPrediction) -> Similarity:
     threshold = _HUBER_THRESHOLD * float(np.median(target.depth.reshape(-1)[chosen]))
     clouds = [unproject_pixels(each.depth, each.intrinsics, each.extrinsics, chosen) for each in (source, target)]
     return robust_similarity(clouds[0], clouds[1], weights, threshold=threshold)
+
+
+def residual(source: PlainPrediction, target: PlainPrediction) -> float:
+    """How far two predictions of the same frames in one world are apart: the median distance between both points of a
+    pixel where both are confident, as a fraction of the median depth; NaN where there is no such pixel."""
+    chosen = _some(confident(source, target))
+    if not len(chosen):
+        return float("nan")
+    clouds = [unproject_pixels(each.depth, each.intrinsics, each.extrinsics, chosen) for each in (source, target)]
+    distance = np.median(np.linalg.norm(clouds[0] - clouds[1], axis=1))
+    return float(distance / np.median(target.depth.reshape(-1)[chosen]))
 
 
 def move(prediction: PlainPrediction, similarity: Similarity) -> PlainPrediction:
@@ -56,3 +65,11 @@ def confident(source: PlainPrediction, target: PlainPrediction) -> np.ndarray:
         least = _LEAST_CONFIDENCE * min(float(np.median(p.depth_confidence[valid])) for p in (source, target))
         valid &= (source.depth_confidence > least) & (target.depth_confidence > least)
     return valid
+
+
+def _some(valid: np.ndarray) -> np.ndarray:
+    """Flat places of `valid`, at most `_MOST_POINTS`, evenly spread."""
+    chosen = np.flatnonzero(valid)
+    if len(chosen) > _MOST_POINTS:
+        chosen = chosen[np.linspace(0, len(chosen) - 1, _MOST_POINTS).round().astype(int)]
+    return chosen

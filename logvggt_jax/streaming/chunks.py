@@ -20,11 +20,19 @@ from logvggt_jax.config import require_counts
 from logvggt_jax.errors import InputError
 from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.model.parameters import in_compute_type
-from logvggt_jax.streaming.alignment import align, move
+from logvggt_jax.streaming.alignment import align, move, residual
 from logvggt_jax.streaming.loops import LoopCloser, LoopSettings, frame_describer, loop_settings
 from logvggt_jax.streaming.offline import FinalFrames, PlainPrediction, plain_program, predict_plain
 from logvggt_jax.streaming.program import Program
-from logvggt_jax.streaming.results import Cameras, FrameResult, PredictionError, Progress, checked_frames, device_memory
+from logvggt_jax.streaming.results import (
+    Cameras,
+    FrameResult,
+    PredictionError,
+    Progress,
+    Signals,
+    checked_frames,
+    device_memory,
+)
 
 PredictChunk = Callable[[np.ndarray], PlainPrediction]
 
@@ -71,6 +79,8 @@ class ChunkChain:
         self._images: list[np.ndarray] = []
         self._shared: PlainPrediction | None = None
         self._first = 0
+        # Of every chunk but the first: the first frame that it adds, its scale and its residual, see `Signals`.
+        self.joints: list[tuple[int, float, float]] = []
 
     def push(self, image: np.ndarray) -> PlainPrediction | None:
         """Takes the next image [H, W, 3]; the frames that became final with it, oldest first, if any.
@@ -106,6 +116,8 @@ class ChunkChain:
     def arrays(self) -> dict[str, np.ndarray]:
         """The images held and the last chunk's prediction of those it shares, for `restore`."""
         arrays = {"images": np.stack(self._images), "first": np.array([self._first])} if self._images else {}
+        if self.joints:
+            arrays["joints"] = np.array(self.joints, np.float64)
         shared = {} if self._shared is None else self._shared._asdict()
         return arrays | {f"shared/{name}": value for name, value in shared.items() if value is not None}
 
@@ -113,6 +125,8 @@ class ChunkChain:
         """Takes up what `arrays` gave."""
         if "images" in arrays:
             self._images, self._first = list(arrays["images"]), int(arrays["first"][0])
+        if "joints" in arrays:
+            self.joints = [(int(first), scale, apart) for first, scale, apart in arrays["joints"].tolist()]
         if "shared/depth" in arrays:
             found = {name: arrays.get(f"shared/{name}") for name in PlainPrediction._fields}
             self._shared = PlainPrediction(**found)  # type: ignore[arg-type]
@@ -129,7 +143,10 @@ class ChunkChain:
                 f"the chunk from frame {self._first} to {self._first + len(self._images) - 1} cannot be aligned with "
                 f"the one before on the {shared} frames they share ({error}); take larger chunks with more overlap"
             ) from error
-        return move(chunk, similarity)
+        moved = move(chunk, similarity)
+        apart = residual(jax.tree.map(lambda x: x[:shared], moved), self._shared)
+        self.joints.append((self._first + shared, similarity.scale, apart))
+        return moved
 
 
 def chunk_program(model: LogVGGT, image_size: tuple[int, int], plan: ChunkPlan, num_frames: int | None) -> Program:
@@ -222,6 +239,14 @@ class ChunkSession:
             return self._cameras
         cameras = self._final.cameras()
         return cameras if self._loops is None else cameras._replace(is_final=np.zeros(len(self._final), bool))
+
+    def signals(self) -> Signals:
+        """See `Predictor.signals`: how the chunks handed out fit one another."""
+        signals = Signals.unknown(len(self._final))
+        for first, scale, apart in self._chain.joints:
+            if first < len(self._final):
+                signals.chunk_scale[first], signals.chunk_residual[first] = scale, apart
+        return signals
 
     def _handed_out(self, prediction: PlainPrediction | None) -> list[FrameResult]:
         results = self._final.add(prediction)

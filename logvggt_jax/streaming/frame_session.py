@@ -19,7 +19,15 @@ from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.model.memory import Memory, RoundMemory
 from logvggt_jax.model.parameters import in_compute_type
 from logvggt_jax.streaming.program import Program, abstract_variables, flops_of
-from logvggt_jax.streaming.results import Cameras, FrameResult, Progress, checked_frames, decoded_cameras, device_memory
+from logvggt_jax.streaming.results import (
+    Cameras,
+    FrameResult,
+    Progress,
+    Signals,
+    checked_frames,
+    decoded_cameras,
+    device_memory,
+)
 from logvggt_jax.types import WindowOutput
 
 Memories = TypeVar("Memories")
@@ -166,6 +174,10 @@ class FrameSession:
     def cameras(self) -> Cameras:
         """Cameras of the frames handed out so far; all are final."""
         return decoded_cameras(self._encodings, self._image_size, final=len(self._encodings))
+
+    def signals(self) -> Signals:
+        """See `Predictor.signals`: none."""
+        return Signals.unknown(len(self._encodings))
 
     def _device_memory(self) -> AbstractContextManager[None]:
         height, width = self._image_size

@@ -15,7 +15,15 @@ from logvggt_jax.geometry import encode_poses
 from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.model.parameters import in_compute_type
 from logvggt_jax.streaming.program import Program, abstract_variables, flops_of
-from logvggt_jax.streaming.results import Cameras, FrameResult, PredictionError, Progress, checked_frames, device_memory
+from logvggt_jax.streaming.results import (
+    Cameras,
+    FrameResult,
+    PredictionError,
+    Progress,
+    Signals,
+    checked_frames,
+    device_memory,
+)
 
 
 class PlainPrediction(NamedTuple):
@@ -210,6 +218,10 @@ class OfflineSession:
     def cameras(self) -> Cameras:
         """Cameras of the frames handed out so far."""
         return self._final.cameras()
+
+    def signals(self) -> Signals:
+        """See `Predictor.signals`: none."""
+        return Signals.unknown(len(self._final))
 
 
 def offline_program(

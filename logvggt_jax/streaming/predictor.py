@@ -25,7 +25,7 @@ from logvggt_jax.streaming.merged import MergedSession, MergedSettings, merged_p
 from logvggt_jax.streaming.offline import OfflineSession, OfflineSettings, offline_program
 from logvggt_jax.streaming.program import Program
 from logvggt_jax.streaming.pruned import PrunedSettings, open_pruned, pruned_program
-from logvggt_jax.streaming.results import Cameras, FrameResult, Progress
+from logvggt_jax.streaming.results import Cameras, FrameResult, Progress, Signals
 from logvggt_jax.streaming.rolling import RollingSettings, open_rolling, rolling_program
 from logvggt_jax.streaming.windows import StreamSession, WindowSettings, window_program
 
@@ -80,6 +80,10 @@ class Predictor(Protocol):
 
     def cameras(self) -> Cameras:
         """Cameras of the frames whose pose is final."""
+        ...
+
+    def signals(self) -> Signals:
+        """What the method tells of its own quality, of the frames handed out; most methods tell nothing."""
         ...
 
 

@@ -59,10 +59,20 @@ class Signals(NamedTuple):
     Attributes:
       overlap_change: [N] float32, see `FrameResult`.
       correction: [N] float32, how far GCCR moved the camera token, as a fraction of its norm.
+      chunk_scale: [N] float32, the size of a chunk's unit in the first one's, at the first frame that the chunk adds.
+      chunk_residual: [N] float32, at the same frames: the median distance between both predictions of the points that
+        the chunk shares with the one before, once it is aligned, as a fraction of their median depth.
     """
 
     overlap_change: np.ndarray
     correction: np.ndarray
+    chunk_scale: np.ndarray
+    chunk_residual: np.ndarray
+
+    @classmethod
+    def unknown(cls, count: int) -> Signals:
+        """Of `count` frames of which nothing is known but their depth and pose."""
+        return cls(*(np.full(count, np.nan, np.float32) for _ in cls._fields))
 
 
 class Cameras(NamedTuple):

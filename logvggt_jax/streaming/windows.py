@@ -269,7 +269,7 @@ class StreamSession:
         """How well the windows agree, frame by frame of those handed out."""
         overlap, corrections = self._overlap.array, np.full(self._handed_out, np.nan, np.float32)
         corrections[: len(self._final)] = self._final.array[: self._handed_out, 9]
-        return Signals(overlap.copy(), corrections)
+        return Signals.unknown(len(overlap))._replace(overlap_change=overlap.copy(), correction=corrections)
 
     def snapshot(self) -> tuple[list[FrameResult], dict[str, np.ndarray]]:
         """See `Predictor.snapshot`: cache, held and compact tokens, poses, and frames not yet in a window."""

@@ -12,7 +12,7 @@ import pytest
 
 from logvggt_jax import LogVGGT
 from logvggt_jax.reconstruction import Reconstruction, Source, reconstruct
-from logvggt_jax.streaming import METHODS, Cameras, FrameResult, Method, Progress, WindowSettings
+from logvggt_jax.streaming import METHODS, Cameras, FrameResult, Method, Predictor, Progress, Signals, WindowSettings
 from logvggt_jax.streaming.results import decoded_cameras
 from logvggt_jax.streaming.windows import window_program
 
@@ -59,12 +59,20 @@ class Recorder:
         encodings[:, 0] = np.arange(self.num_frames)
         return decoded_cameras(encodings, (28, 42), final=self.num_frames)
 
+    def signals(self) -> Signals:
+        return Signals.unknown(self.num_frames)
 
-def reconstruct_recorded(predictor: Recorder, source: Source | Path, output: Path, **options: Any) -> Reconstruction:
+
+def reconstruct_recorded(predictor: Predictor, source: Source | Path, output: Path, **options: Any) -> Reconstruction:
     """A reconstruction by a method whose predictor this is."""
     with pytest.MonkeyPatch.context() as patch:
         method = Method("recorder", lambda *_: predictor, WindowSettings, "windows", "records", window_program)
         patch.setitem(METHODS, "recorder", method)
         return reconstruct(
-            source, output, model=LogVGGT(), variables={}, method="recorder", longer_edge=LONGER_EDGE, **options
+            source,
+            output,
+            model=LogVGGT(),
+            variables={},
+            method="recorder",
+            **{"longer_edge": LONGER_EDGE, **options},
         )

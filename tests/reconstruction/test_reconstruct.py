@@ -96,7 +96,7 @@ def expected(model: LogVGGT, variables: dict, room: Path) -> dict[str, np.ndarra
 
 def test_result_says_where_everything_lies(result: Reconstruction) -> None:
     assert sorted(path.name for path in result.folder.iterdir()) == sorted(
-        ["cameras.json", "trajectory.txt", "points.ply", "depth", "images", "previews"]
+        ["cameras.json", "trajectory.txt", "points.ply", "depth", "images", "previews", "health.json", "health.html"]
     )
     assert result.num_frames == COUNT
     assert result.depth_size == (28, 42)
@@ -104,7 +104,7 @@ def test_result_says_where_everything_lies(result: Reconstruction) -> None:
         assert str(result.folder / name) in result.summary()
     assert len(list((result.folder / "previews").glob("*.png"))) == 3
     picture = cv2.imread(str(result.folder / "previews" / "frame-000003.png"))
-    assert picture.shape == (28, 84, 3)
+    assert picture.shape[1] >= 2 * 512, "image and depth, at a size one can see"
 
 
 def test_depth_files_hold_the_models_depth(result: Reconstruction, expected: dict) -> None:

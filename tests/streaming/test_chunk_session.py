@@ -65,3 +65,19 @@ def test_misuse_is_named(session: ChunkSession) -> None:
     assert session.close() == []
     with pytest.raises(ValueError, match="closed"):
         session.push(IMAGES[0])
+
+
+def test_signals_say_how_chunks_fit_and_survive_a_snapshot(session: ChunkSession, small_config: ModelConfig) -> None:
+    session.push(IMAGES[:7])
+    other = ChunkSession(LogVGGT(small_config), {"params": {}}, ChunkPlan(4, 2))
+    other.restore(session.snapshot()[1])
+    for each in (session, other):
+        each.push(IMAGES[7:])
+        each.close()
+    signals = session.signals()
+    # Chunks of four that share two begin to add frames at 4, 6 and 8; their predictions differ by nothing but a turn.
+    assert np.flatnonzero(np.isfinite(signals.chunk_scale)).tolist() == [4, 6, 8]
+    np.testing.assert_allclose(signals.chunk_scale[4::2], 1, atol=1e-4)
+    assert signals.chunk_residual[4::2].max() < 1e-4 and np.isnan(signals.overlap_change).all()
+    for found, expected in zip(other.signals(), signals, strict=True):
+        np.testing.assert_array_equal(found, expected)

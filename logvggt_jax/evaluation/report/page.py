@@ -1,27 +1,12 @@
-"""Self-contained HTML pages of text, tables and pictures, which open in a browser without a server."""
+"""A report as one HTML page: tables, notes and pictures."""
 
-import base64
 import html
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from logvggt_jax.errors import printable
 from logvggt_jax.evaluation.report.tables import Table
-
-_STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 1200px; padding: 0 1rem; color: #222; }
-h1 { font-size: 1.6rem; } h2 { font-size: 1.1rem; margin-top: 2rem; }
-.scroll { overflow-x: auto; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; white-space: nowrap; }
-th, td { padding: 0.2rem 0.7rem; text-align: right; border-bottom: 1px solid #ddd; }
-th:first-child, td:first-child { text-align: left; }
-td:first-child, th:first-child { position: sticky; left: 0; background: #fff; }
-tr.own, tr.own td:first-child { background: #e3eefb; } tr.own td:first-child { font-weight: 600; }
-p.note, li { color: #555; font-size: 0.9rem; }
-pre { background: #f5f5f5; padding: 0.6rem 0.8rem; overflow-x: auto; }
-figure { margin: 1.5rem 0; } img { max-width: 100%; } figcaption { color: #555; font-size: 0.85rem; }
-"""
+from logvggt_jax.page import document, figure, heading
 
 
 def html_page(
@@ -48,32 +33,6 @@ def html_page(
     return document(title, parts)
 
 
-def document(title: str, parts: Sequence[str]) -> str:
-    """A whole page; its parts are HTML, as the functions below make it of plain text."""
-    head = (
-        "<!doctype html>",
-        f'<html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title>',
-        f"<style>{_STYLE}</style></head><body>",
-        f"<h1>{html.escape(title)}</h1>",
-    )
-    return "\n".join([*head, *parts, "</body></html>"]) + "\n"
-
-
-def heading(text: str) -> str:
-    """The title of a section."""
-    return f"<h2>{html.escape(text)}</h2>"
-
-
-def paragraph(text: str) -> str:
-    """Running text."""
-    return f"<p>{html.escape(text)}</p>"
-
-
-def command(text: str) -> str:
-    """What to type in a terminal."""
-    return f"<pre><code>{html.escape(text)}</code></pre>"
-
-
 def table(content: Table, own: str = "") -> str:
     """A table under its title, its notes below; rows that begin with `own` are marked."""
     head = "".join(f"<th>{html.escape(cell)}</th>" for cell in content.header)
@@ -83,13 +42,6 @@ def table(content: Table, own: str = "") -> str:
         f'{heading(content.title)}\n<div class="scroll"><table><thead><tr>{head}</tr></thead>\n'
         f"<tbody>\n{rows}\n</tbody></table></div>{notes}"
     )
-
-
-def figure(path: Path, caption: str) -> str:
-    """A picture (a PNG file), embedded, so that the page can be sent and kept as one file."""
-    data = base64.b64encode(path.read_bytes()).decode()
-    text = html.escape(printable(caption))
-    return f'<figure><img alt="{text}" src="data:image/png;base64,{data}"><figcaption>{text}</figcaption></figure>'
 
 
 def _row(row: Sequence[str], own: str) -> str:

@@ -16,7 +16,7 @@ from logvggt_jax.reconstruction.frame_writer import FrameWriter, Picture
 from logvggt_jax.reconstruction.point_cloud import PointFilter, PointSelection
 from logvggt_jax.reconstruction.result import Reconstruction
 from logvggt_jax.reconstruction.work_folder import WorkFolder
-from logvggt_jax.streaming import Cameras, FrameResult
+from logvggt_jax.streaming import FrameResult, Predictor
 
 
 class Recording:
@@ -76,18 +76,19 @@ class Recording:
         """Has frames written whose depth is final; waits while too many are."""
         self._frames.write(results)
 
-    def finish(self, cameras: Cameras, *, complete: bool) -> Reconstruction | None:
+    def finish(self, stream: Predictor, *, complete: bool) -> Reconstruction | None:
         """Puts the result in its place, once all frames were written; None where there was no frame.
 
         Args:
-          cameras: of all frames.
+          stream: that the frames went through, closed.
           complete: whether the session ended because somebody wanted it to.
         """
         if not self._frames.names:
             return None
         self._pool.finish()
-        self._frames.write_cameras(cameras, self._calibration, complete=complete)
+        self._frames.write_cameras(stream.cameras(), self._calibration, complete=complete)
         result = Reconstruction.with_cameras_of(self._work.path)
+        self._frames.write_health(result, stream)
         finish(result, self._selection, self._pool, num_previews=self._num_previews, advance=lambda: None)
         # Whatever ended it: nothing can go on from there.
         self._work.commit(complete=True)

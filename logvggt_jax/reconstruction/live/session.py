@@ -131,7 +131,7 @@ class LiveSession:
             if self._failure is not None:
                 raise self._failure
             if self._recording is not None and self._stream is not None:
-                self.reconstruction = self._recording.finish(self._stream.cameras(), complete=self.complete)
+                self.reconstruction = self._recording.finish(self._stream, complete=self.complete)
 
     @property
     def failed(self) -> bool:

@@ -1,0 +1,220 @@
+"""Every fault put into the footage is named where it is, and a walk without one gets none; numbers survive a resume."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from html.parser import HTMLParser
+from pathlib import Path
+
+import faulty_rooms as rooms
+import numpy as np
+import pytest
+from PIL import Image
+from recorder import reconstruct_recorded
+from result_folder import write_result
+
+from logvggt_jax.errors import InputError
+from logvggt_jax.frames import Frames
+from logvggt_jax.reconstruction import Reconstruction
+from logvggt_jax.reconstruction.health import report
+from logvggt_jax.reconstruction.health.measures import Measures
+from logvggt_jax.reconstruction.health.plot import svg_plot
+from logvggt_jax.reconstruction.health.recorder import HealthRecorder
+from logvggt_jax.reconstruction.health.rules import stretches
+from logvggt_jax.reconstruction.health.words import in_short, paragraph
+from logvggt_jax.streaming import Signals
+
+# Frames by which a stretch may begin or end beside the fault: zoom and movement are seen over a few frames.
+AROUND = 4
+
+
+def measured(frames: Frames, signals: Signals) -> Measures:
+    count, recorder = len(frames.images), HealthRecorder()
+    for index in reversed(range(count)):  # the order is that of the worker threads
+        recorder.see(index, frames.depth[index], np.full(rooms.SIZE, 5.0, np.float32), frames.images[index])
+    return recorder.measures(
+        size=rooms.SIZE,
+        extrinsics=frames.extrinsics[:, :3],
+        intrinsics=frames.intrinsics,
+        depth_scale=np.ones(count),
+        field_of_view=2 * np.arctan(rooms.SIZE[1] / 2 / frames.intrinsics[:, 0, 0]),
+        signals=signals,
+    )
+
+
+@pytest.mark.parametrize("cause", rooms.FAULTY)
+def test_every_fault_is_named_where_it_is(cause: str) -> None:
+    make, where = rooms.FAULTY[cause]
+    measures = measured(make(), rooms.signals(rooms.COUNT, where))
+    found = stretches(measures)
+    assert {stretch.cause for stretch in found} == {cause}
+    assert len(found) == (2 if cause == "exposure" else 1)
+    assert abs(found[0].first - where[0]) <= AROUND and abs(found[-1].last - where[-1]) <= AROUND
+    assert all({"overlap_change", "correction"} <= set(stretch.signs) for stretch in found)
+    text = paragraph(found, measures, [f"{index}.png" for index in range(rooms.COUNT)])
+    assert "most likely" in text and f"({found[0].first}.png" in text
+    assert f"{cause} (" in in_short(found, rooms.COUNT)
+
+
+@pytest.mark.parametrize("number", [1, 3, 4])
+def test_a_walk_without_fault_has_no_doubtful_frame(number: int) -> None:
+    measures = measured(rooms.clean(number), rooms.signals(rooms.COUNT, ()))
+    assert stretches(measures) == ()
+    assert "None of the 40 frames is doubtful" in paragraph((), measures, [])
+
+
+def test_a_cut_is_seen_though_the_predicted_cameras_do_not_tell() -> None:
+    frames, signals = rooms.clean(), rooms.signals(rooms.COUNT, (20,))
+    images = np.concatenate([frames.images[:20], rooms.clean(3).images[20:]])
+    (found,) = stretches(measured(frames._replace(images=images), signals))
+    assert (found.cause, found.first, found.last) == ("no overlap", 20, 20)
+
+
+def test_a_moving_subject_is_told_from_the_cameras_own_movement() -> None:
+    walking = measured(rooms.moving_subject(standing=False), rooms.signals(rooms.COUNT, rooms.FAULT))
+    assert {stretch.cause for stretch in stretches(walking)} == {"moving"}
+    standing = measured(rooms.moving_subject(), rooms.signals(rooms.COUNT, ()))
+    said = [paragraph(stretches(each), each, ["x"] * rooms.COUNT) for each in (walking, standing)]
+    assert ["the camera stands still" in text for text in said] == [False, True]
+
+
+def test_trouble_that_the_footage_does_not_explain_is_said_to_be_so() -> None:
+    measures = measured(rooms.clean(), rooms.signals(rooms.COUNT, range(30, 33)))
+    (found,) = stretches(measures)
+    assert found.cause is None and found.first >= 30 and found.last <= 32
+    assert "nothing that is measured of the footage says why" in paragraph((found,), measures, ["x"] * rooms.COUNT)
+
+
+def test_chunks_whose_scale_jumps_are_doubtful() -> None:
+    signals = Signals.unknown(rooms.COUNT)
+    for frame, scale, apart in ((10, 0.9, 0.01), (20, 1.6, 0.02), (30, 1.5, 0.3)):
+        signals.chunk_scale[frame], signals.chunk_residual[frame] = scale, apart
+    assert [tuple(each) for each in stretches(measured(rooms.clean(), signals))] == [
+        (None, 20, 20, ("chunks",)),
+        (None, 30, 30, ("chunks",)),
+    ]
+
+
+def test_geometry_of_neighbours_is_exact_for_exact_frames() -> None:
+    frames = rooms.clean()
+    measures = measured(frames, Signals.unknown(rooms.COUNT))
+    assert np.nanmax(measures.disagreement) < 2e-3 and np.nanmax(measures.conflicts) == 0
+    assert np.nanmin(measures.overlap) > 0.9 and np.nanmax(measures.overlap) < 1
+    assert np.isnan(measures.overlap[0]) and np.isnan(measures.step[0])
+    # Of a wrong scale of every other depth map nearly all is told.
+    depth = frames.depth * np.where(np.arange(rooms.COUNT) % 2, 1.2, 1.0)[:, None, None].astype(np.float32)
+    wrong = measured(frames._replace(depth=depth), Signals.unknown(rooms.COUNT))
+    np.testing.assert_allclose(wrong.disagreement[1:], np.log(1.2), atol=0.03)
+
+
+@pytest.fixture(scope="module")
+def dark_walk(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Frames]:
+    folder, frames = tmp_path_factory.mktemp("dark"), rooms.dark()
+    for index, picture in enumerate(frames.images):
+        Image.fromarray(picture).save(folder / f"{index:03d}.png")
+    return folder, frames
+
+
+Reconstruct = Callable[..., Reconstruction]
+
+
+@pytest.fixture
+def reconstruct_dark(dark_walk: tuple[Path, Frames], monkeypatch: pytest.MonkeyPatch) -> Reconstruct:
+    """Reconstructs the walk by the truth; a state is saved after every frame."""
+    monkeypatch.setattr("logvggt_jax.reconstruction.run._SAVING", 1e9)
+    folder, frames = dark_walk
+
+    def run(output: Path, on_push: Callable[[int], object] = lambda _: None, **options: object) -> Reconstruction:
+        truth = rooms.Truth(frames, rooms.signals(rooms.COUNT, rooms.FAULT), on_push)
+        options = {"longer_edge": max(rooms.SIZE), "progress": False, "num_previews": 0, **options}
+        return reconstruct_recorded(truth, folder, output, **options)
+
+    return run
+
+
+class Words(HTMLParser):
+    """The text of a page, and how many plots it has."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.text, self.plots = "", 0
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: object) -> None:
+        self.plots += tag == "svg"
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def test_every_result_says_how_it_is(tmp_path: Path, reconstruct_dark: Reconstruct) -> None:
+    result = Reconstruction.open(reconstruct_dark(tmp_path / "out").folder)
+    health = result.health
+    assert health is not None and [each.cause for each in health.stretches] == ["dark"]
+    assert np.flatnonzero(health.doubtful).tolist() == list(rooms.FAULT)
+    np.testing.assert_allclose(health.measures.overlap_change[1:], rooms.signals(rooms.COUNT, rooms.FAULT)[0][1:], 1e-5)
+    summary = result.summary()
+    assert "health: 8 of 40 frames doubtful: dark (16 to 23)" in summary
+    assert f"{result.folder}/health.html: " in summary
+    page = Words((result.folder / "health.html").read_text())
+    assert health.text in page.text and "it is too dark" in page.text and page.plots == 15
+
+
+def test_a_run_that_died_says_the_same_in_the_end(tmp_path: Path, reconstruct_dark: Reconstruct) -> None:
+    def die(count: int) -> None:
+        if count == 21:
+            raise KeyboardInterrupt
+
+    expected = reconstruct_dark(tmp_path / "straight").folder
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct_dark(tmp_path / "out", die, save_seconds=0.0)
+    found = reconstruct_dark(tmp_path / "out").folder
+    for name in ("health.json", "health.html"):
+        assert (found / name).read_bytes() == (expected / name).read_bytes()
+
+
+@pytest.mark.parametrize("broken", ["health.recorder.look", "health.recorder.picture_changes", "health.report._page"])
+def test_a_report_that_fails_leaves_the_result_whole(
+    broken: str, tmp_path: Path, reconstruct_dark: Reconstruct, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise ArithmeticError("what nobody thought of")
+
+    monkeypatch.setattr(f"logvggt_jax.reconstruction.{broken}", fail)
+    with pytest.warns(UserWarning, match="no health report: ArithmeticError"):
+        folder = reconstruct_dark(tmp_path / "out").folder
+    result = Reconstruction.open(folder)
+    assert result.num_frames == rooms.COUNT and result.num_points > 0
+    assert not (folder / "health.html").exists() or result.health is not None
+
+
+def test_results_without_a_report_open_and_a_damaged_one_is_named(tmp_path: Path) -> None:
+    write_result(tmp_path)
+    result = Reconstruction.open(tmp_path)
+    assert result.health is None and "health" not in result.summary()
+    unknown = Measures.of({}, 3)
+    report.write_health(tmp_path, report.examine(unknown, result.names), result.names)
+    assert result.health is not None and not result.health.doubtful.any()
+    sound = json.loads((tmp_path / "health.json").read_text())
+    for change in (
+        {"format": "other"},
+        {"measures": {}},
+        {"names": ["0"]},
+        {"text": 7},
+        {"stretches": [{"cause": "ghosts", "first": 0, "last": 1, "signs": []}]},
+        {"stretches": [{"cause": "dark", "first": 0, "last": 3, "signs": []}]},
+    ):
+        (tmp_path / "health.json").write_text(json.dumps({**sound, **change}))
+        with pytest.raises(InputError, match=r"health\.json is not a health report"):
+            _ = Reconstruction.open(tmp_path).health
+        assert "health.json is not a health report" in Reconstruction.open(tmp_path).summary()
+
+
+def test_a_plot_of_a_long_sequence_stays_small_and_keeps_its_peaks() -> None:
+    values = np.sin(np.arange(50_000) / 500)
+    values[31_234], values[1000:2000] = 9.0, np.nan
+    plot = svg_plot(values, [(31_000, 31_500)], label="waves & <peaks>")
+    assert len(plot) < 20_000 and plot.count("<polyline") == 2 and plot.count("<rect") == 1
+    assert ">9</text>" in plot and "waves &amp; &lt;peaks&gt;" in plot
+    assert "polyline" not in svg_plot(np.full(5, np.nan), [], label="nothing")
