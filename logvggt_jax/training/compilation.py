@@ -35,19 +35,25 @@ class CompiledStep(NamedTuple):
 
 
 def compiled_steps(
-    program: Program, state: TrainState, stage: StageConfig, sizes: Sequence[tuple[int, int]]
+    program: Program,
+    state: TrainState,
+    stage: StageConfig,
+    sizes: Sequence[tuple[int, int]],
+    *,
+    taught: bool = False,
 ) -> Iterator[CompiledStep]:
     """The stage's step for every one of `sizes`, in the order in which they are ready.
 
-    They are compiled in threads, as many at a time as there are cores, four at most; JAX keeps them on the disk where
-    its cache is on. Nothing is allocated: `state` gives shapes and places alone.
+    Clips that are `taught` have a teacher's confidence. The steps are compiled in threads, as many at a time as there
+    are cores, four at most; JAX keeps them on the disk where its cache is on. Nothing is allocated: `state` gives
+    shapes and places alone.
     """
     sharding = split(program.layout.mesh)
     shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding), state)
     started = time.perf_counter()
 
     def compiled(size: tuple[int, int]) -> CompiledStep:
-        clips = abstract_clips(stage.batch_size, stage.clip_length, size)
+        clips = abstract_clips(stage.batch_size, stage.clip_length, size, taught=taught)
         placed = {name: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding) for name, x in clips.items()}
         run = program.step.lower(shapes, placed).compile()
         return CompiledStep(clips["images"].shape, run, time.perf_counter() - started)

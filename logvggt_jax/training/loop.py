@@ -290,7 +290,8 @@ class _Run:
         if not new:  # an earlier stage had the same
             return
         with self.times.other("compilation"), self.watchdog.other("the compilation"):
-            for number, step in enumerate(compiled_steps(self.program, self.state, stage, new), 1):
+            taught = self.config.teacher is not None
+            for number, step in enumerate(compiled_steps(self.program, self.state, stage, new, taught=taught), 1):
                 self.programs[step.clips] = step.run
                 if self.peak is not None:
                     self.operations[step.clips] = step_flops(self.config.model, step.clips[:4])

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 
+from logvggt_jax.errors import InputError
 from logvggt_jax.training import losses, vggt_losses
 from logvggt_jax.training.config import LossConfig
 from logvggt_jax.training.losses import Mean
@@ -15,7 +16,7 @@ def loss_terms(
 ) -> dict[str, Mean]:
     """Every term of the objective over the clips at hand; names begin with `camera` or `depth`.
 
-    A distillation needs the `confidence` [B, T, H, W] of the teacher whose targets these are.
+    A distillation needs the `confidence` [B, T, H, W] of the teacher whose targets these are: InputError without it.
     """
     dense = (predictions.depth, predictions.depth_confidence, targets.depth, targets.depth_valid)
     if config.name in ("log_vggt", "distillation"):
@@ -30,7 +31,8 @@ def loss_terms(
         )
         if config.name == "log_vggt":
             return {"camera": camera, **losses.depth_losses(*dense, alpha=config.alpha)}
-        assert confidence is not None
+        if confidence is None:
+            raise InputError("loss.name='distillation' learns from a teacher's confidence, which these clips lack")
         return {"camera": camera, **losses.distilled_depth_losses(*dense, confidence, alpha=config.alpha)}
     return {
         **vggt_losses.camera_losses(

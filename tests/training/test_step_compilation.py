@@ -9,10 +9,11 @@ from typing import Any
 import jax
 import pytest
 
+from logvggt_jax.errors import InputError
 from logvggt_jax.training import compilation, loop
 from logvggt_jax.training.batches import open_sources, stage_batches
 from logvggt_jax.training.compilation import compiled_steps
-from logvggt_jax.training.config import TrainConfig
+from logvggt_jax.training.config import TeacherConfig, TrainConfig
 from logvggt_jax.training.loop import train
 from logvggt_jax.training.program import make_program
 from logvggt_jax.training.sharding import data_mesh, put_batch
@@ -35,6 +36,23 @@ def test_each_size_has_a_step_that_takes_its_clips(
     batch = put_batch({name: value for name, value in clips.items() if name != "frame_mask"}, data_mesh(2))
     state, metrics, _ = steps[batch["images"].shape].run(state, batch)
     assert int(state.step) == 1 and float(metrics["loss/total"]) > 0
+
+
+def test_the_step_of_a_distillation_takes_clips_with_the_teachers_confidence(
+    run_config: TrainConfig, pixel_model: Any, pixel_params: Any, tmp_path: Path
+) -> None:
+    config = dataclasses.replace(
+        run_config,
+        loss=dataclasses.replace(run_config.loss, name="distillation"),
+        data=dataclasses.replace(run_config.data, cache_dir=str(tmp_path)),
+        teacher=TeacherConfig("anything", clip_length=4),
+    )
+    taught = make_program(pixel_model, config, jax.eval_shape(lambda: pixel_params), data_mesh(1))
+    state = taught.abstract_state(pixel_params)
+    (step,) = compiled_steps(taught, state, config.stages[0], SIZES[:1], taught=True)
+    assert step.run.in_avals[0][1]["confidence"].shape == step.clips[:4]
+    with pytest.raises(InputError, match="a teacher's confidence, which these clips lack"):
+        next(compiled_steps(taught, state, config.stages[0], SIZES[:1]))
 
 
 def test_sizes_are_compiled_at_the_same_time(
