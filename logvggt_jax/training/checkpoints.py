@@ -245,7 +245,8 @@ class RunCheckpoints:
     def _check_configuration(self, stored: StoredCheckpoint) -> None:
         ours, written = self.config.to_dict(), stored.config
         with contextlib.suppress(InputError):  # with what an earlier version had no field for
-            written = TrainConfig.from_dict(written).to_dict()
+            # Validation may change, and is not to keep the rest from being read where its fields did.
+            written = TrainConfig.from_dict({**written, "validation": None}).to_dict()
         for part in ("model", "stages", "data", "loss", "optimizer", "seed", "average"):
             theirs = written.get(part)
             if part == "data" and theirs is not None:

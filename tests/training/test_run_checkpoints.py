@@ -126,6 +126,21 @@ def test_a_checkpoint_from_before_the_digest_is_restored(
     assert _restore(saved, run_config, state)[1] == POSITION
 
 
+def test_a_checkpoint_with_settings_of_an_earlier_form_is_restored(
+    run_config: TrainConfig, state: TrainState, saved: Path
+) -> None:
+    def as_before(meta: dict[str, Any]) -> None:
+        meta.pop("digest")
+        meta["config"]["optimizer"].pop("frozen")
+        meta["config"]["validation"] = {"source": {"name": "rooms", "root": None, "split": "val"}, "every": 3}
+
+    _edit(saved / "checkpoints" / "0" / "meta" / "metadata", as_before)
+    assert _restore(saved, run_config, state)[1] == POSITION
+    other = dataclasses.replace(run_config, seed=1)
+    with pytest.raises(InputError, match="was written with seed=0, the configuration says 1"):
+        _restore(saved, other, state)
+
+
 def test_the_model_folder_says_how_it_was_trained(
     run_config: TrainConfig, state: TrainState, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
