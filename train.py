@@ -42,7 +42,7 @@ _SOURCES = flags.DEFINE_multi_string(
     "source", [], "Data to train on instead of the configuration's: NAME=FOLDER,split=…,frames=FIRST:STOP; repeatable."
 )
 _VALIDATION_SOURCE = flags.DEFINE_string(
-    "validation_source", None, "Data to validate on instead of the configuration's, in the same form."
+    "validation_source", None, "Data to validate on instead of the configuration's, in the same form; `none` for none."
 )
 _WORKDIR = flags.DEFINE_string("workdir", None, "Folder for checkpoints, the model and logs.")
 _RESUME_STEP = flags.DEFINE_integer(

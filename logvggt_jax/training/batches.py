@@ -34,9 +34,14 @@ def _frames_of(source: SourceConfig, dataset: Dataset) -> Dataset:
 def open_sources(config: DataConfig, validation: Sequence[SourceConfig] = ()) -> dict[str, Dataset]:
     """The mixture's data sets by name, in the form in which training reads them; what has to be made is made here.
 
-    Raises InputError: folders of data sets do not exist and `config.allow_missing` is off, or none exists; a data set
-    would train on sequences that `config.hold_out` or a source of `validation` keeps.
+    Raises InputError: folders of data sets do not exist and `config.allow_missing` is off, or none exists; a source of
+    `validation` has no folder; a data set would train on sequences that `config.hold_out` or one of those keeps.
     """
+    if missing := _without_folder(validation):
+        raise InputError(
+            f"data sets to validate on without their folder: {_named(missing)}; give --validation_source=NAME=FOLDER "
+            "(or none), or set validation.sources.NAME.root"
+        )
     rules = dict(config.hold_out)
     if unknown := sorted(rules.keys() - set(DATASETS)):
         raise InputError(
@@ -68,10 +73,10 @@ def _split_sequences(source: SourceConfig, split: str) -> Sequence[str]:
 
 def _present(config: DataConfig) -> list[SourceConfig]:
     """The sources whose folders exist."""
-    missing = [source for source in config.sources if source.root is not None and not Path(source.root).is_dir()]
+    missing = _without_folder(config.sources)
     if not missing:
         return list(config.sources)
-    named = ", ".join(f"{source.name} ({source.root})" for source in missing)
+    named = _named(missing)
     if not config.allow_missing:
         raise InputError(
             f"data sets without their folder: {named}; set data.sources.NAME.root, remove them from the mixture, or "
@@ -84,6 +89,14 @@ def _present(config: DataConfig) -> list[SourceConfig]:
     shares = ", ".join(f"{source.name} {source.weight / total:.1%}" for source in present)
     logging.warning("data sets without their folder are left out: %s; clips come from %s", named, shares)
     return present
+
+
+def _without_folder(sources: Sequence[SourceConfig]) -> list[SourceConfig]:
+    return [source for source in sources if source.root is not None and not Path(source.root).is_dir()]
+
+
+def _named(sources: Sequence[SourceConfig]) -> str:
+    return ", ".join(f"{source.name} ({source.root})" for source in sources)
 
 
 def stage_batches(

@@ -7,14 +7,15 @@ from typing import Any
 from logvggt_jax.errors import InputError
 
 _FORM = "NAME=FOLDER, then any of ,split=SPLIT ,frames=FIRST:STOP ,stride=LEAST:MOST ,weight=NUMBER"
+_NOTHING = "none"
 _FIELDS = re.compile(r"(.*?)((?:,(?:split|frames|stride|weight)=[^,]*)*)", re.DOTALL)
 
 
 def with_sources(settings: Mapping[str, Any], trained: Sequence[str], validated: str | None) -> dict[str, Any]:
     """The settings of a run with other sources, as `parse_source` reads them, to train and to validate on.
 
-    No texts, or None, leave what is there. Raises InputError as `parse_source`, for a data set that is named twice, and
-    for a run without validation.
+    No texts, or None, leave what is there; with `none` in the place of the latter the run has no validation. Raises
+    InputError as `parse_source`, for a data set that is named twice, and for a run without validation.
     """
     changed = dict(settings)
     if trained:
@@ -24,7 +25,9 @@ def with_sources(settings: Mapping[str, Any], trained: Sequence[str], validated:
             if names.count(name) > 1:
                 raise InputError(f"--source: {name} is named twice; one folder of it may hold several sequences")
         changed["data"] = {**settings["data"], "sources": sources}
-    if validated is not None:
+    if validated == _NOTHING:
+        changed["validation"] = None
+    elif validated is not None:
         if settings["validation"] is None:
             raise InputError("--validation_source: this configuration validates nothing")
         changed["validation"] = {**settings["validation"], "sources": [parse_source(validated)]}

@@ -84,6 +84,12 @@ def test_missing_data_sets_are_an_error_unless_allowed(
         open_sources(data(sources=(absent,), allow_missing=True))
 
 
+def test_a_data_set_to_validate_on_without_its_folder_is_named_with_the_flag(tmp_path: Path) -> None:
+    absent = SourceConfig(name="tum_recording", root=str(tmp_path / "none"), split="all")
+    with pytest.raises(InputError, match=r"validate on without .*: tum_recording \(.*none\); give --validation_source="):
+        open_sources(data(), (rooms("val"), absent))
+
+
 def test_a_damaged_data_set_is_not_a_missing_one(tmp_path: Path) -> None:
     present = SourceConfig(name="seven_scenes", root=str(tmp_path), split="all")
     with pytest.raises(FileNotFoundError, match="no sequences of 7-Scenes"):

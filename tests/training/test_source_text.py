@@ -31,7 +31,7 @@ def test_another_form_is_refused_with_the_right_one(text: str) -> None:
 def test_sources_take_the_place_of_the_configurations(run_config: TrainConfig) -> None:
     settings: dict[str, Any] = run_config.to_dict()
     settings["validation"] = {
-        "source": {"name": "rooms", "root": None, "split": "val"},
+        "sources": [{"name": "rooms", "root": None, "split": "val"}],
         "every": 1,
         "num_clips": 1,
         "clip_length": 2,
@@ -45,6 +45,7 @@ def test_sources_take_the_place_of_the_configurations(run_config: TrainConfig) -
     )
     assert changed.validation is not None and changed.validation.sources == (SourceConfig("tum", "/c", "all"),)
     assert with_sources(settings, [], None) == settings
+    assert TrainConfig.from_dict(with_sources(settings, ["colmap=/b"], "none")).validation is None
     with pytest.raises(InputError, match="colmap is named twice"):
         with_sources(settings, ["colmap=/a", "colmap=/b"], None)
     with pytest.raises(InputError, match="validates nothing"):
