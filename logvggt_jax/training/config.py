@@ -242,7 +242,8 @@ class TrainConfig:
     `accumulate` times as many devices. With `shard_parameters` a device holds its part of parameters, gradients and
     moments, and puts the parameters together layer by layer. `average`, such as 0.999, is the decay in a step of a
     moving average of the parameters, which validation and the model folder then have; None keeps none. The first two
-    may change when a run goes on. A `teacher` labels the data, for the objective `distillation`.
+    may change when a run goes on. A `teacher` labels the data, for the objective `distillation`; all stages then have
+    the same `sizes`.
     """
 
     model: ModelConfig
@@ -275,6 +276,12 @@ class TrainConfig:
                 raise InputError(
                     f"stages {', '.join(longest)}: clips are longer than the teacher's, "
                     f"teacher.clip_length={self.teacher.clip_length}: raise it or shorten them"
+                )
+            # Each clip is labelled once, at the one size of the run's that is nearest to its own.
+            if other := [s.name for s in self.stages if set(s.sizes) != set(self.stages[0].sizes)]:
+                raise InputError(
+                    f"stages {', '.join(other)}: sizes differ from those of {self.stages[0].name}; a teacher labels "
+                    "every clip at one size: give all stages the same sizes"
                 )
         require_counts(self, "log_every", "save_every", "keep_checkpoints", "max_skipped_in_a_row", "accumulate")
         require_within(self, "[0, 1)", "average")
