@@ -2,13 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 
 from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.training.batches import open_source, open_sources
 from logvggt_jax.training.config import TeacherConfig, TrainConfig
-from logvggt_jax.training.processes import any_process
 from logvggt_jax.training.taught import taught
 from logvggt_jax.training.teacher import PlainVGGT, Teacher
 
@@ -29,15 +29,20 @@ def open_data(config: TrainConfig) -> tuple[Mapping[str, Dataset], Sequence[Data
 
 
 def label(
-    config: TrainConfig, settings: TeacherConfig, teacher: Teacher, datasets: Mapping[str, Dataset]
+    config: TrainConfig,
+    settings: TeacherConfig,
+    teacher: Teacher,
+    datasets: Mapping[str, Dataset],
+    *,
+    most: int | None = None,
 ) -> tuple[Mapping[str, Dataset], Sequence[Dataset]]:
     """`datasets`, and the validation sources where the student is to be compared with its teacher, as it labels them.
 
-    Of several processes each labels its share; all have to call this.
+    Of several processes each labels its share; all have to call this. At `most` so many clips of a set are labelled,
+    None labels all.
     """
     assert config.data.cache_dir is not None  # as the configuration checks
-    process, count = jax.process_index(), jax.process_count()
-    shared = {"process_index": process, "process_count": count, "progress": process == 0}
+    shared: dict[str, Any] = {"progress": jax.process_index() == 0, "most": most}
     cache, sizes = Path(config.data.cache_dir), list(dict.fromkeys(s for stage in config.stages for s in stage.sizes))
     found: dict[str, Dataset] = {
         name: taught(name, dataset, teacher, settings, sizes, cache, **shared) for name, dataset in datasets.items()
@@ -47,5 +52,4 @@ def label(
         size = [config.validation.size]
         for source in config.validation.sources:
             validated.append(taught(source.name, open_source(source), teacher, settings, size, cache, **shared))
-    any_process(False)  # where others label, this one waits until all are done
     return found, validated

@@ -19,16 +19,18 @@ from logvggt_jax.compile import device_bytes
 from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.data.feeding.batches import training_batches
 from logvggt_jax.errors import InputError, one_line, printable
+from logvggt_jax.files import check_writable
 from logvggt_jax.model.logvggt import LogVGGT
-from logvggt_jax.training.batches import stage_batches
+from logvggt_jax.training.batches import open_sources, stage_batches
 from logvggt_jax.training.checkpoint_files import Position
 from logvggt_jax.training.checkpoints import RunCheckpoints
-from logvggt_jax.training.config import SourceConfig, StageConfig, TrainConfig
-from logvggt_jax.training.distillation import open_data
+from logvggt_jax.training.config import SourceConfig, StageConfig, TeacherConfig, TrainConfig
+from logvggt_jax.training.distillation import label
 from logvggt_jax.training.dry_run import step_costs
 from logvggt_jax.training.processes import any_process, check_shared
 from logvggt_jax.training.program import abstract_parameters, make_program
 from logvggt_jax.training.sharding import DATA_AXIS, check_batch_size, split
+from logvggt_jax.training.teacher import PlainVGGT, Teacher
 
 CLIPS = 20
 _EXCHANGED_BYTES = 2**26
@@ -36,7 +38,8 @@ _GIB = 2**30
 
 
 def preflight(config: TrainConfig, workdir: Path, mesh: Mesh, say: Callable[[str], None] = print) -> None:
-    """Tries what a run does later: an all-reduce, clips of every source, a checkpoint, the steps' compilation.
+    """Tries what a run does later: an all-reduce, clips of every source (of those of a teacher one a process), a
+    checkpoint, the steps' compilation.
 
     All processes do it together; process 0 says a line for each. Nothing is left in `workdir`. Raises InputError at
     the end where something failed on a process, and at once where the folder is not shared.
@@ -64,12 +67,31 @@ def preflight(config: TrainConfig, workdir: Path, mesh: Mesh, say: Callable[[str
     datasets: dict[str, Dataset] = {}
 
     def find_data() -> str:
-        datasets.update(open_data(config)[0])
+        datasets.update(open_sources(config.data, () if config.validation is None else config.validation.sources))
+        return f"{', '.join(datasets)} found" if config.teacher is not None else with_clips()
+
+    def with_clips() -> str:
         for stage in config.stages:
             stage_batches(datasets, config.data, stage, seed=config.seed).close()
         return f"{', '.join(datasets)}, with clips for every stage"
 
     attempt("data sets", find_data)
+    if config.teacher is not None:
+        settings, teachers = config.teacher, list[Teacher]()
+        attempt("teacher", lambda: _teacher(config, settings, teachers))
+
+        def one_clip_each() -> str:
+            # All of a run's clips take hours.
+            datasets.update(label(config, settings, teachers[0], datasets, most=jax.process_count())[0])
+            return f"{settings.clip_length} frames a clip, one clip a process labelled; {with_clips()}"
+
+        if failed:
+            datasets.clear()  # without labels they have no clips
+        else:
+            attempt("labels", one_clip_each)
+        # Their memory is the step's.
+        teachers.clear()
+        jax.clear_caches()
     for source in config.data.sources:
         if source.name in datasets:
             attempt(source.name, functools.partial(_read_clips, datasets[source.name], source, config))
@@ -99,6 +121,13 @@ def _all_reduce(mesh: Mesh) -> str:
     if not bool(jnp.all(total == expected)):
         raise InputError(f"the sum over {mesh.size} devices is {float(total[0])}, expected {expected}")
     return f"{_EXCHANGED_BYTES / 2**20:.0f} MiB over {mesh.size} devices in {seconds * 1e3:.1f} ms"
+
+
+def _teacher(config: TrainConfig, settings: TeacherConfig, teachers: list[Teacher]) -> str:
+    assert config.data.cache_dir is not None  # as the configuration checks
+    check_writable(Path(config.data.cache_dir).expanduser().absolute() / "teacher")
+    teachers.append(PlainVGGT(settings))
+    return f"{settings.weights}, labels go to {config.data.cache_dir}"
 
 
 def _read_clips(dataset: Dataset, source: SourceConfig, config: TrainConfig) -> str:

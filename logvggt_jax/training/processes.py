@@ -138,9 +138,14 @@ def check_processes() -> None:
 
 def any_process(wants: bool) -> bool:
     """Whether this is true of at least one process; all processes have to ask at the same point."""
+    return bool(np.any(from_all(np.array(wants))))
+
+
+def from_all(values: np.ndarray) -> np.ndarray:
+    """The `values` of every process, [processes, …], of one shape; all processes have to ask at the same point."""
     if jax.process_count() == 1:
-        return wants
-    return bool(np.any(multihost_utils.process_allgather(np.array(wants))))
+        return values[None]
+    return np.asarray(multihost_utils.process_allgather(values))
 
 
 class Vote:

@@ -7,11 +7,13 @@ labelled again, by whatever run, and never taken for something else.
 """
 
 import hashlib
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 from absl import logging
 from rich.console import Console
@@ -24,9 +26,11 @@ from logvggt_jax.errors import InputError, OutputExists
 from logvggt_jax.files import atomic_folder
 from logvggt_jax.frames import Frames
 from logvggt_jax.training.config import TeacherConfig
+from logvggt_jax.training.processes import any_process, check_agreement, from_all
 from logvggt_jax.training.teacher import Labels, Teacher
 
 Size = tuple[int, int]
+_DIGEST_BYTES = 16
 
 
 @dataclass(frozen=True)
@@ -108,39 +112,55 @@ def taught(
     sizes: Sequence[Size],
     cache: Path,
     *,
-    process_index: int = 0,
-    process_count: int = 1,
     progress: bool = False,
+    most: int | None = None,
 ) -> TaughtDataset:
-    """The data set as its teacher sees it; labels this process's share of the clips that `cache` does not hold yet.
+    """The data set as its teacher sees it; labels the clips that `cache` does not hold yet, at `most` so many of all.
 
     Every sequence is cut into clips of `config.clip_length` frames, `config.stride` apart, the last one ending where
-    the sequence ends; of several `sizes` (H, W) they have the one nearest to the pictures' aspect. The caller lets
-    processes wait for each other before it is read. A clip whose pictures cannot be read is left out, with a warning
-    that names it.
+    the sequence ends; of several `sizes` (H, W) they have the one nearest to the pictures' aspect. Of several processes
+    each reads and labels its share and tells the others, so that all have the same clips; all have to call this. A
+    clip whose pictures cannot be read is left out, with a warning that names it.
 
-    Raises InputError where no clip is left, and for a data set that is drawn on the device.
+    Raises InputError where no clip is left, for a data set that is drawn on the device, and on every process where one
+    of them fails or sees other sequences.
     """
     if isinstance(dataset, DrawnOnDevice):
         raise InputError(
             f"{name} is drawn on the device (renderer='device'), where a teacher does not see it: use 'host'"
         )
-    wanted = list(_cut(dataset, config))
-    clips: dict[str, TaughtClip] = {}
+    wanted = list(itertools.islice(_cut(dataset, config), most))
+    check_agreement(f"{name}: the sequences", [[sequence, *frames] for sequence, frames in wanted])
+    found = np.zeros((len(wanted), 1 + _DIGEST_BYTES), np.uint8)
+    failure: InputError | None = None
     console = Console(stderr=True, quiet=not progress)
-    with Progress(console=console, transient=True) as bar:
-        for place, (sequence, frames) in enumerate(bar.track(wanted, description=f"Labelling clips of {name}")):
-            where = f"{sequence}@{frames[0]}"
-            try:
-                size = nearest_size(dataset.image_size(sequence), sizes)
-                images = fit_each((dataset.read(sequence, [i]) for i in frames), len(frames), size).images
-            except Exception as error:  # whatever a decoder raises: one damaged picture is not to end a run of a week
-                logging.warning("%s, %s: left out, its pictures cannot be read: %s", name, where, describe(error))
-                continue
-            folder = cache / "teacher" / _digest(images, teacher)
-            clips[where] = TaughtClip(sequence, frames, size, folder)
-            if place % process_count == process_index and not _is_whole(folder, images.shape):
-                _write(folder, teacher.label(images))
+    try:
+        with Progress(console=console, transient=True) as bar:
+            share = range(jax.process_index(), len(wanted), jax.process_count())
+            for place in bar.track(share, description=f"Labelling clips of {name}"):
+                sequence, frames = wanted[place]
+                try:
+                    size = nearest_size(dataset.image_size(sequence), sizes)
+                    images = fit_each((dataset.read(sequence, [i]) for i in frames), len(frames), size).images
+                except Exception as error:  # of a decoder: one damaged picture is not to end a run of a week
+                    where = f"{name}, {sequence}@{frames[0]}"
+                    logging.warning("%s: left out, its pictures cannot be read: %s", where, describe(error))
+                    continue
+                digest = _digest(images, teacher)
+                folder = _folder(cache, digest)
+                if not _is_whole(folder, images.shape):
+                    _write(folder, teacher.label(images))
+                found[place] = [1 + list(sizes).index(size), *digest]
+    except InputError as error:
+        failure = error
+    # Whoever has failed: the others wait for its clips.
+    if any_process(failure is not None):
+        raise failure or InputError(f"{name}: another process cannot label its clips; its output says why")
+    clips = {
+        f"{sequence}@{frames[0]}": TaughtClip(sequence, frames, sizes[row[0] - 1], _folder(cache, row[1:].tobytes()))
+        for (sequence, frames), row in zip(wanted, from_all(found).max(0), strict=True)
+        if row[0]
+    }
     if not clips:
         raise InputError(f"{name}: no clip of two frames or more that can be read, nothing to be taught on")
     return TaughtDataset(dataset, clips, teacher.digest)
@@ -158,10 +178,14 @@ def _cut(dataset: Dataset, config: TeacherConfig) -> Iterator[tuple[str, tuple[i
                 yield sequence, frames
 
 
-def _digest(images: np.ndarray, teacher: Teacher) -> str:
+def _digest(images: np.ndarray, teacher: Teacher) -> bytes:
     found = hashlib.sha256(f"1 {teacher.digest} {images.shape}".encode())
     found.update(np.ascontiguousarray(images).data)
-    return found.hexdigest()[:32]
+    return found.digest()[:_DIGEST_BYTES]
+
+
+def _folder(cache: Path, digest: bytes) -> Path:
+    return cache / "teacher" / digest.hex()
 
 
 def _write(folder: Path, labels: Labels) -> None:

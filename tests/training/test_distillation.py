@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from absl import logging
+from pixel_teacher import PixelTeacher
 
 from logvggt_jax import ModelConfig
 from logvggt_jax.data import open_dataset
@@ -18,6 +19,7 @@ from logvggt_jax.data.feeding.batches import training_batches
 from logvggt_jax.errors import InputError
 from logvggt_jax.metrics.depth import depth_metrics
 from logvggt_jax.training import loop
+from logvggt_jax.training import taught as module
 from logvggt_jax.training.config import (
     LossConfig,
     OptimizerConfig,
@@ -34,7 +36,7 @@ from logvggt_jax.training.sharding import data_mesh, parameter_layout, put_batch
 from logvggt_jax.training.state import initial_state
 from logvggt_jax.training.step import make_loss_terms, make_train_step
 from logvggt_jax.training.taught import TaughtDataset, taught
-from logvggt_jax.training.teacher import Labels, PlainVGGT
+from logvggt_jax.training.teacher import PlainVGGT
 from logvggt_jax.weights.checkpoints import save_model
 from logvggt_jax.weights.folder import write_description
 from logvggt_jax.weights.provenance import Provenance
@@ -42,22 +44,6 @@ from logvggt_jax.weights.provenance import Provenance
 SIZE = (28, 42)
 OPTIONS = {"height": 28, "width": 42, "num_frames": 10, "num_rooms": 2}
 TEACHER = TeacherConfig("anything", clip_length=4, stride=1)
-
-
-class PixelTeacher:
-    """A teacher whose depth is a function of colour, which the pixel model can learn."""
-
-    def __init__(self, digest: str = "first") -> None:
-        self.digest, self.calls = digest, 0
-
-    def label(self, images: np.ndarray) -> Labels:
-        self.calls += 1
-        grey = images.astype(np.float32).mean(-1) / 255
-        frames = len(images)
-        extrinsics = np.tile(np.eye(4, dtype=np.float32), (frames, 1, 1))
-        extrinsics[:, 0, 3] = 0.1 * np.arange(frames)
-        intrinsics = np.array([[30.0, 0.0, 21.0], [0.0, 30.0, 14.0], [0.0, 0.0, 1.0]], np.float32)
-        return Labels(np.exp(grey), 1 + grey, np.tile(intrinsics, (frames, 1, 1)), extrinsics)
 
 
 @pytest.fixture(scope="module")
@@ -129,6 +115,38 @@ def test_a_clip_that_cannot_be_read_is_left_out_and_named(
         labelled(rooms, tmp_path)
 
 
+def test_every_process_reads_its_share_and_all_leave_out_what_one_cannot_read(
+    rooms: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two processes one after the other: what they tell is noted first, and then handed to both."""
+    whole, told, read = rooms.read, {}, []
+
+    def noted(process: int) -> TaughtDataset:
+        def flaky(sequence: str, indices: Any) -> Any:
+            read.append((process, sequence))
+            if process == 1 and (sequence, *indices) == (rooms.sequences[0], 5):
+                raise OSError("stale file handle")
+            return whole(sequence, indices)
+
+        def from_all(found: np.ndarray) -> np.ndarray:
+            told[process] = found
+            return np.stack([told[each] for each in sorted(told)])
+
+        monkeypatch.setattr(jax, "process_index", lambda: process)
+        monkeypatch.setattr(module, "from_all", from_all)
+        monkeypatch.setattr(rooms, "read", flaky)
+        return labelled(rooms, tmp_path)
+
+    monkeypatch.setattr(jax, "process_count", lambda: 2)
+    monkeypatch.setattr(module, "check_agreement", lambda *_: None)
+    monkeypatch.setattr(module, "any_process", lambda wants: wants)
+    noted(0)
+    second, first = noted(1), noted(0)
+    assert first._clips == second._clips and len(first.sequences) == 5
+    assert f"{rooms.sequences[0]}@4" not in first.sequences
+    assert sum(process == 1 for process, _ in read) == 4 + 4 + 2
+
+
 def test_a_teacher_of_another_kind_is_refused(small_config: ModelConfig, tmp_path: Path) -> None:
     provenance = Provenance("windows", 42).to_dict()
     (tmp_path / "model").mkdir()
@@ -149,6 +167,10 @@ def test_objective_and_teacher_belong_together(run_config: TrainConfig, tmp_path
     data = dataclasses.replace(run_config.data, cache_dir=str(tmp_path))
     with pytest.raises(InputError, match=r"stages second: clips are longer than the teacher's"):
         dataclasses.replace(run_config, loss=loss, data=data, teacher=dataclasses.replace(TEACHER, clip_length=2))
+    larger = dataclasses.replace(run_config.stages[1], sizes=((28, 42), (42, 56)))
+    with pytest.raises(InputError, match=r"stages second: sizes differ from those of first; .*the same sizes"):
+        stages = (run_config.stages[0], larger)
+        dataclasses.replace(run_config, loss=loss, data=data, teacher=TEACHER, stages=stages)
     kept = dataclasses.replace(run_config, loss=loss, data=data, teacher=TEACHER)
     assert TrainConfig.from_dict(kept.to_dict()) == kept
 
@@ -216,11 +238,14 @@ def test_a_real_student_comes_nearer_to_a_real_teacher(
     small_config: ModelConfig, small_variables: dict[str, Any], run_config: TrainConfig, tmp_path: Path
 ) -> None:
     """`train` with LoG-VGGT as the student of plain VGGT, both small, on rooms of which it sees pictures alone."""
-    # From a pose of zeros random weights come to a field of view of zero, which is an infinite focal length.
+    # Random weights soon come to a field of view of zero, an infinite focal length: they begin and stay near one.
     head = dataclasses.replace(small_config.camera_head, initial_pose=(0.0,) * 6 + (1.0, 1.0, 1.0))
     encoder = dataclasses.replace(small_config.encoder, frozen=False)
     thawed = dataclasses.replace(small_config, encoder=encoder, camera_head=head)
-    save_model(tmp_path / "teacher", thawed, small_variables["params"], Provenance("vggt", 42))
+    params = small_variables["params"]
+    near = jax.tree.map(lambda x: 0.2 * x, params["camera_head"]["pose_branch"])
+    params = {**params, "camera_head": {**params["camera_head"], "pose_branch": near}}
+    save_model(tmp_path / "teacher", thawed, params, Provenance("vggt", 42))
     rooms = tuple(sorted({**OPTIONS, "num_rooms": 16}.items()))
     data = dataclasses.replace(
         run_config.data, sources=(SourceConfig("rooms", None, "train", options=rooms),), cache_dir=str(tmp_path)

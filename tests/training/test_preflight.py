@@ -5,12 +5,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from pixel_teacher import PixelTeacher
 
 from logvggt_jax.data.registry import open_dataset
 from logvggt_jax.errors import DiskError, InputError
 from logvggt_jax.training import preflight as module
 from logvggt_jax.training.checkpoints import RunCheckpoints
-from logvggt_jax.training.config import TrainConfig
+from logvggt_jax.training.config import TeacherConfig, TrainConfig
 from logvggt_jax.training.dry_run import StepCosts
 from logvggt_jax.training.preflight import preflight
 from logvggt_jax.training.sharding import data_mesh
@@ -42,6 +43,38 @@ def test_everything_is_tried_and_nothing_is_left(
     assert lines[-1] == "preflight: all is well"
     assert compiled == [(1, 2, (28, 42)), (1, 3, (28, 42))]
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("writable", [True, False])
+def test_of_a_teachers_clips_one_is_labelled(
+    run_config: TrainConfig,
+    compiled: list[tuple[Any, ...]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    writable: bool,
+) -> None:
+    cache, teacher = tmp_path / "cache", PixelTeacher()
+    if not writable:
+        cache.write_text("a file")
+    monkeypatch.setattr(module, "PlainVGGT", lambda _: teacher)
+    monkeypatch.setattr(module, "_checkpoint", lambda *_: "written")
+    config = dataclasses.replace(
+        run_config,
+        loss=dataclasses.replace(run_config.loss, name="distillation"),
+        data=dataclasses.replace(run_config.data, cache_dir=str(cache)),
+        teacher=TeacherConfig("anything", clip_length=4),
+    )
+    lines: list[str] = []
+    if not writable:
+        # Rooms are kept there too.
+        with pytest.raises(InputError, match="2 of the tries failed: data sets, teacher"):
+            preflight(config, tmp_path, data_mesh(1), lines.append)
+        return
+    preflight(config, tmp_path, data_mesh(1), lines.append)
+    assert [line.split(":")[0] for line in lines[1:5]] == ["data sets", "teacher", "labels", "rooms"]
+    assert "one clip a process labelled; rooms, with clips for every stage" in lines[3]
+    assert "20 clips of 2 frames" in lines[4] and "0 broken" in lines[4]
+    assert teacher.calls == len(list((cache / "teacher").iterdir())) == 1
 
 
 def test_all_that_fails_is_named_at_the_end(
