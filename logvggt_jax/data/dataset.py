@@ -110,6 +110,7 @@ class Reader(Dataset):
       splits: those of `train`, `val`, `test` and `all` that it has.
       about: where it comes from.
       needs_root: whether it lies in a folder, the constructor's argument `root`; the others are made when read.
+      own: whether it is a form of recordings of one's own: sequences have their folders' names, which others may have.
     """
 
     name: ClassVar[str]
@@ -119,6 +120,7 @@ class Reader(Dataset):
     splits: ClassVar[tuple[str, ...]]
     about: ClassVar[About]
     needs_root: ClassVar[bool] = True
+    own: ClassVar[bool] = False
     sequences: Sequence[str] = ()
 
     @property

@@ -13,7 +13,8 @@ from logvggt_jax.data.errors import EmptySplit
 from logvggt_jax.data.feeding.batches import BatchIterator, training_batches
 from logvggt_jax.data.feeding.holdouts import check_disjoint, check_held_out
 from logvggt_jax.data.frame_range import FrameRange
-from logvggt_jax.data.registry import DATASETS, open_dataset
+from logvggt_jax.data.packed.index import is_packed
+from logvggt_jax.data.registry import DATASETS, READERS, open_dataset
 from logvggt_jax.errors import InputError
 from logvggt_jax.training.config import DataConfig, SourceConfig, StageConfig
 
@@ -54,14 +55,24 @@ def open_sources(config: DataConfig, validation: Sequence[SourceConfig] = ()) ->
             check_held_out(
                 source.name, reader.sequences, rules[source.name], functools.partial(_split_sequences, source)
             )
-        # Names of sequences do not depend on where a copy of the set lies.
         for kept in validation:
-            if kept.name == source.name:
+            if kept.name == source.name and not _hold_others(source, kept):
                 check_disjoint(source.name, _frames_of(source, reader), open_source(kept))
         progress = jax.process_index() == 0
         made = reader.for_training(cache_dir=config.cache_dir, progress=progress)
         datasets[source.name] = _frames_of(source, made)
     return datasets
+
+
+def _hold_others(one: SourceConfig, other: SourceConfig) -> bool:
+    """Whether sequences of one name are not the same in two sources of one data set: recordings of one's own in folders
+    that lie apart. Names in published sets do not depend on where a copy lies, and packed ones may be of either folder.
+    """
+    roots = [Path(source.root) for source in (one, other) if source.root is not None]
+    if not READERS[one.name].own or len(roots) < 2 or any(map(is_packed, roots)):
+        return False
+    first, second = (root.resolve() for root in roots)
+    return not (first.is_relative_to(second) or second.is_relative_to(first))
 
 
 def _split_sequences(source: SourceConfig, split: str) -> Sequence[str]:

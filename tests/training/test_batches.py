@@ -3,8 +3,10 @@
 import dataclasses
 from pathlib import Path
 
+import numpy as np
 import pytest
 from absl import logging
+from PIL import Image
 
 from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.data.errors import EmptySplit
@@ -54,11 +56,25 @@ def test_validation_sequences_are_not_trained_on() -> None:
 
 def test_other_frames_of_a_sequence_may_be_validated_on() -> None:
     first, last = (dataclasses.replace(rooms("train"), frames=frames) for frames in ((None, 5), (-3, None)))
-    dataset = open_sources(data(sources=(first,)), last)["rooms"]
+    dataset = open_sources(data(sources=(first,)), (last,))["rooms"]
     assert {dataset.num_frames(name) for name in dataset.sequences} == {5}
     more = dataclasses.replace(first, frames=(None, 6))
     with pytest.raises(InputError, match="rooms: 8 sequences are trained on and validated on"):
-        open_sources(data(sources=(more,)), last)
+        open_sources(data(sources=(more,)), (last,))
+
+
+def test_recordings_of_one_name_in_other_folders_are_other_recordings(tmp_path: Path) -> None:
+    for day in ("monday", "tuesday"):
+        (tmp_path / day / "walk").mkdir(parents=True)
+        Image.fromarray(np.zeros((28, 42, 3), np.uint8)).save(tmp_path / day / "walk" / "0.png")
+    (tmp_path / "link").symlink_to(tmp_path / "monday")
+    monday, tuesday, link, walk = (
+        SourceConfig("images", str(tmp_path / folder), "all") for folder in ("monday", "tuesday", "link", "monday/walk")
+    )
+    assert list(open_sources(data(sources=(monday,)), (tuesday,))["images"].sequences) == ["walk"]
+    for same in (link, walk):
+        with pytest.raises(InputError, match=r"images: 1 sequences are trained on and validated on \(walk\)"):
+            open_sources(data(sources=(monday,)), (same,))
 
 
 def test_a_rule_for_a_data_set_that_does_not_exist_is_refused() -> None:
@@ -86,7 +102,7 @@ def test_missing_data_sets_are_an_error_unless_allowed(
 
 def test_a_data_set_to_validate_on_without_its_folder_is_named_with_the_flag(tmp_path: Path) -> None:
     absent = SourceConfig(name="tum_recording", root=str(tmp_path / "none"), split="all")
-    with pytest.raises(InputError, match=r"validate on without .*: tum_recording \(.*none\); give --validation_source="):
+    with pytest.raises(InputError, match=r"without their folder: tum_recording \(.*none\); give --validation_source="):
         open_sources(data(), (rooms("val"), absent))
 
 

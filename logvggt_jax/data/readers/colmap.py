@@ -44,6 +44,7 @@ class Colmap(FolderDataset):
     expects = "sparse/0 with cameras and images (.bin or .txt), and images; for depth stereo/depth_maps or depth"
     metric = False
     splits = ("all",)
+    own = True
     about = About(
         source="photograph it and run COLMAP; undistort with `colmap image_undistorter` and pass its output folder",
         licence="your own",

@@ -32,6 +32,7 @@ class Images(FolderDataset):
     expects = "pictures (png, jpg, …), or folders of pictures; `ffmpeg -i walk.mp4 walk/%06d.jpg` makes them of a video"
     metric = False
     splits = ("all",)
+    own = True
     about = About(source="film it", licence="your own", size="your own", roles=(TRAINING,))
 
     def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:

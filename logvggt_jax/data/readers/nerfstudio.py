@@ -47,6 +47,7 @@ class Nerfstudio(FolderDataset):
     expects = f"{_TRANSFORMS} with cameras and frames, and the pictures and depth that it names, or folders that do"
     metric = False
     splits = ("all",)
+    own = True
     about = About(
         source="`ns-process-data` and apps that export nerfstudio's form; pictures undistorted",
         licence="your own",

@@ -61,6 +61,7 @@ class TUMRecording(FolderDataset):
     )
     metric = True
     splits = ("all",)
+    own = True
     about = About(
         source="record it: rgb and depth with files named by their time, or rgb.txt and depth.txt that list them",
         licence="your own",
