@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import shutil
 from collections.abc import Mapping
@@ -22,7 +23,7 @@ from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.processes import any_process
 from logvggt_jax.training.state import TrainState
 from logvggt_jax.training.work_folder import remove_scratch
-from logvggt_jax.weights.checkpoints import check_destination, read_provenance, save_model
+from logvggt_jax.weights.checkpoints import check_destination, read_licence, read_provenance, save_model
 from logvggt_jax.weights.digests import whole_array
 from logvggt_jax.weights.folder import is_model_folder
 from logvggt_jax.weights.provenance import Provenance, TrainingRecord
@@ -89,7 +90,13 @@ class RunCheckpoints:
         self.wait()
         params, step = self._copied(state.averaged), int(state.step)
         if jax.process_index() == 0:
-            self._pending = self._writer.submit(self._write_model, self.best_folder, params, step)
+            self._pending = self._writer.submit(self._write_best, params, step)
+
+    @property
+    def best_step(self) -> int | None:
+        """The step of the model in `best`; None without one."""
+        record = read_provenance(self.best_folder).training if is_model_folder(self.best_folder) else None
+        return None if record is None else record.steps
 
     def check(self) -> None:
         """Raises on process 0 what kept a save from being written, as soon as that is known; waits for nothing."""
@@ -110,7 +117,8 @@ class RunCheckpoints:
         """The state at `step` (None: the latest that is not damaged), with the shapes and placement of `like`.
 
         A `step` is gone back to once: the same request of a command that is started again goes on from the latest.
-        Checkpoints of later steps, and damaged ones, are moved aside, and a warning says so.
+        Checkpoints of later steps, and damaged ones, are moved aside, with a `best` model of a later step, and a
+        warning says so.
 
         Raises InputError naming step, path and the other steps there are: no such checkpoint, one of another
         configuration, or DamagedCheckpoint where `step` is damaged or all are.
@@ -143,8 +151,14 @@ class RunCheckpoints:
                 break
         if jax.process_index() == 0:
             with disk_errors(self.folder):
-                for later in (other for other in steps if other > chosen):
-                    logging.warning("step %d goes on from %d; moved to %s", later, chosen, self._set_aside(later))
+                discarded = [other for other in steps if other > chosen]
+                for later in discarded:
+                    aside = _set_aside(self.folder / str(later))
+                    logging.warning("the run goes on from step %d; that of step %d moved to %s", chosen, later, aside)
+                best = self.best_step
+                if discarded and best is not None and best > chosen:
+                    aside = _set_aside(self.best_folder)
+                    logging.warning("the run goes on from step %d; best model, of %d, moved to %s", chosen, best, aside)
                 if step is not None:
                     write_text(self._honoured, json.dumps({"resume_step": step}))
         return state, position
@@ -183,9 +197,7 @@ class RunCheckpoints:
 
     def _write(self, state: TrainState, position: Position, in_place_of: int | None) -> None:
         step = int(state.step)
-        # Else the library that writes says the same in hundreds of lines.
-        needed = sum(leaf.nbytes for leaf in jax.tree.leaves((state, state.averaged)))
-        check_space(self.folder / str(step), needed, "make room, and the same command goes on from the last checkpoint")
+        _check_room(self.folder / str(step), (state, state.averaged))
         # First, so that a run that is killed in between goes on from an older checkpoint and writes both again.
         self._write_model(self.model_folder, state.averaged, step)
         write_checkpoint(self.folder / str(step), state, position, self.config)
@@ -196,17 +208,12 @@ class RunCheckpoints:
             (self.folder / str(old)).rename(leaving)
             shutil.rmtree(leaving, ignore_errors=True)
 
+    def _write_best(self, params: Any, step: int) -> None:
+        _check_room(self.best_folder, params)
+        self._write_model(self.best_folder, params, step)
+
     def _write_model(self, folder: Path, params: Any, step: int) -> None:
         save_model(folder, self.config.model, unstack_layers(params, self.config.model), self._provenance(step))
-
-    def _set_aside(self, step: int) -> Path:
-        """Gives a checkpoint a name that no other has, under which it is none."""
-        path, number = self.folder / f"{step}.aside", 1
-        while path.exists():
-            number += 1
-            path = self.folder / f"{step}.aside{number}"
-        (self.folder / str(step)).rename(path)
-        return path
 
     def _went_back_to(self) -> int | None:
         """The step that an earlier start of this run was told to go back to, and did."""
@@ -231,16 +238,33 @@ class RunCheckpoints:
     def _here(self) -> str:
         return f" in {self.folder.parent}"
 
+    @functools.cached_property
+    def _licence(self) -> str | None:
+        """Of the weights that the run started from and of its teacher's, which its own are made of, as far as known."""
+        teacher = self.config.teacher
+        found: list[str | None] = []
+        # Either may be gone, or its hub out of reach, when a run goes on.
+        for weights in (self.config.initial_weights, None if teacher is None else teacher.weights):
+            with contextlib.suppress(InputError):
+                found.append(None if weights is None else read_licence(weights))
+        if terms := " and ".join(dict.fromkeys(filter(None, found))):
+            return terms
+        earlier = read_provenance(self.model_folder) if is_model_folder(self.model_folder) else Provenance()
+        return earlier.licence if earlier.source == self._source else None
+
+    @property
+    def _source(self) -> str:
+        return f"trained from {self.config.initial_weights or 'random parameters'}{self._here()}"
+
     def _provenance(self, step: int) -> Provenance:
         longer_edge = max(max(size) for stage in self.config.stages for size in stage.sizes)
-        start = self.config.initial_weights or "random parameters"
         record = TrainingRecord(
             configuration=self.config.to_dict(),
             data=", ".join(f"{source.name} ({source.split})" for source in self.config.data.sources),
             steps=step,
             device=f"{jax.device_count()} x {jax.devices()[0].device_kind}",
         )
-        return Provenance("windows", longer_edge, source=f"trained from {start}{self._here()}", training=record)
+        return Provenance("windows", longer_edge, self._licence, self._source, record)
 
     def _check_configuration(self, stored: StoredCheckpoint) -> None:
         ours, written = self.config.to_dict(), stored.config
@@ -258,6 +282,22 @@ class RunCheckpoints:
                     f"{stored.where} was written with {name}={theirs!r}, the configuration says {mine!r}; "
                     "set it back or start a new --workdir"
                 )
+
+
+def _check_room(path: Path, tree: Any) -> None:
+    """Raises DiskError where these arrays do not fit; the library that writes would say so in hundreds of lines."""
+    needed = sum(leaf.nbytes for leaf in jax.tree.leaves(tree))
+    check_space(path, needed, "make room, and the same command goes on from the last checkpoint")
+
+
+def _set_aside(folder: Path) -> Path:
+    """Gives a checkpoint or a model a name that no other has, under which it is none."""
+    path, number = folder.with_name(f"{folder.name}.aside"), 1
+    while path.exists():
+        number += 1
+        path = folder.with_name(f"{folder.name}.aside{number}")
+    folder.rename(path)
+    return path
 
 
 def _what_decides_clips(data: Mapping[str, Any]) -> dict[str, Any]:

@@ -386,7 +386,9 @@ class _Run:
         if name is None:
             return ""
         # Process 0 has the earlier values and decides.
-        better = not log.silent and _is_best(read_metrics(log.path), step, f"validation/{name}", values)
+        better = not log.silent and _is_best(
+            read_metrics(log.path), step, f"validation/{name}", values, held=self.checkpoints.best_step
+        )
         if not any_process(better):
             return ""
         self.checkpoints.save_best(self.state)
@@ -403,11 +405,17 @@ class _Run:
         return (reason or "another process is to stop") if self.vote(reason is not None) else None
 
 
-def _is_best(before: Sequence[Mapping[str, Any]], step: int, name: str, values: Mapping[str, float]) -> bool:
-    """Whether the value of this step is better than that of every validation before; one that is no number is not."""
+def _is_best(
+    before: Sequence[Mapping[str, Any]], step: int, name: str, values: Mapping[str, float], held: int | None
+) -> bool:
+    """Whether the value of this step is better than that of the model that is `held`, of another step; None: of no one.
+
+    Where nothing is known of that step, it has to be better than every validation before. What is no number is not.
+    """
     sign = 1.0 if VALIDATION_METRICS[name.removeprefix("validation/")] else -1.0
-    known = [sign * line[name] for line in before if line["step"] < step and line.get(name) is not None]
-    return math.isfinite(values[name]) and sign * values[name] > max(known, default=-math.inf)
+    known = {line["step"]: sign * line[name] for line in before if line["step"] < step and line.get(name) is not None}
+    rivals = [] if held is None else [known[held]] if held in known else known.values()
+    return math.isfinite(values[name]) and sign * values[name] > max(rivals, default=-math.inf)
 
 
 def _is_validated(metrics: Path, step: int) -> bool:

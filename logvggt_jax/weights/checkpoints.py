@@ -160,6 +160,15 @@ def read_provenance(path_or_repo: str | Path) -> Provenance:
         return from_mapping(Provenance, description.get("provenance", {}), "provenance")
 
 
+def read_licence(path_or_repo: str | Path) -> str | None:
+    """The licence of weights that `from_pretrained` reads, None where it is not known; fetches nothing but its name.
+
+    Raises InputError as `read_provenance`, or where a hub has no such repository.
+    """
+    address = hub_address(path_or_repo)
+    return read_provenance(path_or_repo).licence if address is None else licence(address[0])
+
+
 def read_config(path: str | Path, *, dtype: str | None = None, point_head: bool = False) -> ModelConfig:
     """The sizes of the model that `from_pretrained` would give; reads no parameter. `path` is local, see `resolve`."""
     path = Path(path)

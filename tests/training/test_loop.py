@@ -374,6 +374,21 @@ def test_the_best_model_by_the_named_metric_is_kept(
     assert last is not None and last.steps == 6
 
 
+def test_the_best_model_is_compared_with_the_one_that_is_kept() -> None:
+    lines = [{"step": 0, "validation/abs_rel": 0.2}, {"step": 3, "validation/abs_rel": 0.4}]
+    name = "validation/abs_rel"
+    judged = {
+        held: [loop._is_best(lines, 6, name, {name: value}, held) for value in (0.1, 0.3, 0.5, float("nan"))]
+        for held in (None, 0, 3, 9)
+    }
+    assert judged == {
+        None: [True, True, True, False],  # of the model of step 0 nothing is left
+        0: [True, False, False, False],
+        3: [True, True, False, False],
+        9: [True, False, False, False],
+    }
+
+
 def test_a_run_that_is_killed_between_its_best_model_and_the_line_about_it_shows_both(
     run_config: TrainConfig, tmp_path: Path
 ) -> None:

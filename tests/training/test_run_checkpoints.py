@@ -24,10 +24,11 @@ from logvggt_jax.training import checkpoint_files
 from logvggt_jax.training import checkpoints as module
 from logvggt_jax.training.checkpoint_files import Position
 from logvggt_jax.training.checkpoints import RunCheckpoints
-from logvggt_jax.training.config import OptimizerConfig, TrainConfig
+from logvggt_jax.training.config import OptimizerConfig, TeacherConfig, TrainConfig
 from logvggt_jax.training.optimizer import make_optimizer
 from logvggt_jax.training.state import TrainState, initial_state
 from logvggt_jax.weights import Provenance, save_model
+from logvggt_jax.weights.folder import write_description
 
 POSITION = Position(1, {"next_index": 12, "sampler": {"seed": 5, "epoch": 2}})
 
@@ -156,6 +157,42 @@ def test_the_model_folder_says_how_it_was_trained(
     assert training.data == "rooms (train)"
 
 
+def test_a_model_has_the_licences_of_what_it_was_made_of(
+    run_config: TrainConfig, small_config: Any, tmp_path: Path
+) -> None:
+    start, teacher, run = (str(tmp_path / name) for name in ("start", "teacher", "run"))
+    for folder, terms in ((start, "vggt-1b"), (teacher, "cc-by-nc-4.0")):
+        (tmp_path / folder).mkdir()
+        provenance = Provenance("vggt", 518, terms).to_dict()
+        write_description(
+            tmp_path / folder, {"config": small_config.to_dict(), "digests": {}, "provenance": provenance}
+        )
+    tuned = dataclasses.replace(run_config, initial_weights=start)
+    distilled = dataclasses.replace(
+        tuned,
+        loss=dataclasses.replace(tuned.loss, name="distillation"),
+        data=dataclasses.replace(tuned.data, cache_dir=run),
+        teacher=TeacherConfig(teacher, clip_length=4),
+    )
+
+    def licence(config: TrainConfig) -> str | None:
+        with RunCheckpoints(Path(run), config) as checkpoints:
+            return checkpoints._provenance(0).licence
+
+    assert licence(run_config) is None
+    assert licence(tuned) == "vggt-1b"
+    assert licence(distilled) == "vggt-1b and cc-by-nc-4.0"
+    with RunCheckpoints(Path(run), tuned) as checkpoints:
+        provenance = checkpoints._provenance(0)
+    shutil.rmtree(start)
+    assert licence(tuned) is None
+    (tmp_path / run / "model").mkdir()
+    write_description(
+        tmp_path / run / "model", {"config": small_config.to_dict(), "digests": {}, "provenance": provenance.to_dict()}
+    )
+    assert licence(tuned) == "vggt-1b" and licence(run_config) is None
+
+
 def test_a_model_that_the_run_did_not_write_is_never_replaced(
     run_config: TrainConfig, small_config: Any, small_variables: dict[str, Any], tmp_path: Path
 ) -> None:
@@ -234,6 +271,37 @@ def test_a_step_is_gone_back_to_once_and_later_checkpoints_are_kept(
     (saved / "checkpoints" / "resumed.json").unlink()
     assert int(_restore(saved, run_config, state, step=0)[0].step) == 0
     assert (saved / "checkpoints" / "3.aside2").is_dir()
+
+
+def test_a_best_model_of_a_later_step_is_moved_aside_when_the_run_goes_back(
+    run_config: TrainConfig, state: TrainState, saved: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _save(saved, run_config, _at(state, 3))
+
+    def keep(folder: Path, config: Any, params: Any, provenance: Provenance) -> None:
+        folder.mkdir()
+        description = {"config": config.to_dict(), "digests": {}, "provenance": provenance.to_dict()}
+        write_description(folder, description)
+
+    monkeypatch.setattr(module, "save_model", keep)
+    with RunCheckpoints(saved, run_config) as checkpoints:
+        assert checkpoints.best_step is None
+        checkpoints.save_best(_at(state, 2))
+        checkpoints.wait()
+        assert checkpoints.best_step == 2
+    assert _restore(saved, run_config, state)[0].step == 3 and (saved / "best").is_dir()
+    _restore(saved, run_config, state, step=0)
+    assert (saved / "best.aside").is_dir() and not (saved / "best").exists()
+
+
+def test_a_best_model_without_room_is_one_line(
+    run_config: TrainConfig, state: TrainState, saved: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(47, 0, 47))
+    with RunCheckpoints(saved, run_config) as checkpoints:
+        checkpoints.save_best(state)
+        with pytest.raises(DiskError, match=r"best: needs about 0\.0 MB, .*make room, and the same"):
+            checkpoints.wait()
 
 
 def test_a_save_does_not_keep_the_next_step_waiting_nor_sees_what_it_does(
