@@ -239,7 +239,7 @@ def test_the_number_of_workers_changes_no_byte(walk: Path, tmp_path: Path) -> No
         )
         assert predictor.threads == {threading.get_ident()}
         files = sorted(path for path in result.folder.rglob("*") if path.is_file())
-        assert result.num_points == 5000 and len(files) == 40 + 40 + 8 + 3
+        assert result.num_points == 5000 and len(files) == 40 + 40 + 8 + 5
         written[workers] = {file.relative_to(result.folder): file for file in files}
     assert written[1].keys() == written[4].keys()
     for name, file in written[1].items():

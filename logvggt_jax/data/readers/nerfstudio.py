@@ -80,9 +80,11 @@ class Nerfstudio(FolderDataset):
             with expecting(path, f"in frames[{place}] a camera and a transform_matrix"):
                 intrinsics = _intrinsics(entries[place], where)
                 pose = np.array(entries[place]["transform_matrix"], np.float64).reshape(-1, 4)
-                if len(pose) not in (3, 4) or not np.isfinite(pose).all():
-                    raise ValueError(f"a finite matrix of 3 x 4 or 4 x 4, not of {len(pose)} x 4")
-            extrinsics = world_to_camera(pose @ OPENGL_AXES, where, stored="camera_to_world")
+                if len(pose) not in (3, 4):
+                    raise ValueError(f"a matrix of {len(pose)} x 4")
+            with np.errstate(invalid="ignore"):  # of a pose that is lost
+                pose = pose @ OPENGL_AXES
+            extrinsics = world_to_camera(pose, where, stored="camera_to_world")
             # A picture in depth's place stands for no depth.
             depth = folder / (depths[place] or names[place])
             yield frame(folder / names[place], depth, intrinsics, extrinsics, name=names[place], calibration=path)
