@@ -65,7 +65,7 @@ def assert_is_picture(picture: np.ndarray, expected: np.ndarray) -> None:
 
 @pytest.mark.parametrize("name", ["colmap", "colmap-text"])
 def test_colmap_reads_cameras_points_and_their_observations(result: Reconstruction, exports: Path, name: str) -> None:
-    pycolmap = pytest.importorskip("pycolmap")
+    pycolmap = pytest.importorskip("pycolmap", reason="extra `colmap` is not installed")
     model = pycolmap.Reconstruction(exports / name / "sparse" / "0")
     assert model.is_valid()
     assert model.num_reg_images() == COUNT and model.num_points3D() == 600
@@ -86,7 +86,7 @@ def test_colmap_reads_cameras_points_and_their_observations(result: Reconstructi
 
 
 def test_the_cloud_of_colmap_has_the_pictures_colours(result: Reconstruction, exports: Path) -> None:
-    pycolmap = pytest.importorskip("pycolmap")
+    pycolmap = pytest.importorskip("pycolmap", reason="extra `colmap` is not installed")
     model = pycolmap.Reconstruction(exports / "colmap" / "sparse" / "0")
     wrong = []
     for point in model.points3D.values():
@@ -99,7 +99,7 @@ def test_the_cloud_of_colmap_has_the_pictures_colours(result: Reconstruction, ex
 
 
 def test_points_are_observed_only_where_nothing_is_before_them(tmp_path: Path) -> None:
-    pytest.importorskip("pycolmap")
+    pytest.importorskip("pycolmap", reason="extra `colmap` is not installed")
     from logvggt_jax.reconstruction.depth_files import write_depth
     from logvggt_jax.reconstruction.exporters.tracks import find_tracks
     from logvggt_jax.reconstruction.result import depth_file
@@ -122,7 +122,7 @@ def test_our_own_reader_reads_what_colmap_was_given(result: Reconstruction, expo
 
 
 def test_frames_of_one_calibration_share_a_camera(tmp_path: Path) -> None:
-    pycolmap = pytest.importorskip("pycolmap")
+    pycolmap = pytest.importorskip("pycolmap", reason="extra `colmap` is not installed")
     result = write_room_result(tmp_path, count=3)
     document = json.loads((result.folder / "cameras.json").read_text())
     document["frames"][1]["intrinsics"][0][0] += 1.0
@@ -156,7 +156,7 @@ def test_transforms_json_has_the_cameras_in_opengls_axes(result: Reconstruction,
 
 
 def test_trimesh_reads_points_and_frusta_of_the_scene(result: Reconstruction, exports: Path) -> None:
-    trimesh = pytest.importorskip("trimesh")
+    trimesh = pytest.importorskip("trimesh", reason="extra `formats` is not installed")
     scene = trimesh.load(exports / "scene.glb")
     cloud, frusta = scene.geometry["points"], scene.geometry["cameras"]
     turned = [1, -1, -1]
@@ -171,7 +171,7 @@ def test_trimesh_reads_points_and_frusta_of_the_scene(result: Reconstruction, ex
 
 
 def test_the_camera_of_the_scene_flies_the_path(result: Reconstruction, exports: Path) -> None:
-    gltf = pytest.importorskip("pygltflib").GLTF2().load(exports / "scene.glb")
+    gltf = pytest.importorskip("pygltflib", reason="extra `dev` is not installed").GLTF2().load(exports / "scene.glb")
     (animation,) = gltf.animations
 
     def values(accessor: int) -> np.ndarray:
@@ -202,7 +202,7 @@ def test_the_camera_of_the_scene_flies_the_path(result: Reconstruction, exports:
 
 @pytest.mark.parametrize("name", ["tum", "kitti", "euroc"])
 def test_evo_reads_the_camera_paths(result: Reconstruction, exports: Path, name: str) -> None:
-    file_interface = pytest.importorskip("evo.tools.file_interface")
+    file_interface = pytest.importorskip("evo.tools.file_interface", reason="extra `eval` is not installed")
     read = {
         "tum": file_interface.read_tum_trajectory_file,
         "kitti": file_interface.read_kitti_poses_file,
@@ -224,7 +224,7 @@ def read_png(folder: Path, file: str, document: dict[str, Any]) -> np.ndarray:
 
 
 def read_exr(folder: Path, file: str, document: dict[str, Any]) -> np.ndarray:
-    openexr = pytest.importorskip("OpenEXR")
+    openexr = pytest.importorskip("OpenEXR", reason="extra `formats` is not installed")
     with openexr.File(str(folder / file)) as picture:
         return picture.channels()["Z"].pixels
 
@@ -289,7 +289,7 @@ def test_depth_without_a_unit_keeps_its_precision_whatever_lies_far_away(tmp_pat
 
 
 def test_rosbags_reads_pictures_depth_cameras_and_poses(result: Reconstruction, exports: Path) -> None:
-    pytest.importorskip("rosbags")
+    pytest.importorskip("rosbags", reason="extra `formats` is not installed")
     from rosbags.highlevel import AnyReader
 
     messages: dict[str, list] = {}
@@ -407,7 +407,7 @@ def test_a_result_of_one_frame_has_every_export(tmp_path: Path, no_warning: None
     result = write_room_result(tmp_path, count=1)
     written = export(result, list(EXPORTERS), tmp_path / "out", point_filter=FEW_POINTS, progress=False)
     assert all(path.exists() for path in written)
-    trimesh = pytest.importorskip("trimesh")
+    trimesh = pytest.importorskip("trimesh", reason="extra `formats` is not installed")
     assert len(trimesh.load(tmp_path / "out" / "scene.glb").geometry["points"].vertices) == 600
 
 

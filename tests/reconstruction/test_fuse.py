@@ -60,12 +60,12 @@ def shaken(extrinsics: np.ndarray, metres: float) -> np.ndarray:
 
 
 def with_colmap(truth: Reconstruction, folder: Path) -> Path:
-    pytest.importorskip("pycolmap")
+    pytest.importorskip("pycolmap", reason="extra `colmap` is not installed")
     return export(truth, ["colmap"], folder, point_filter=PointFilter(max_points=50), progress=False)[0]
 
 
 def with_colmap_text(truth: Reconstruction, folder: Path) -> Path:
-    pytest.importorskip("pycolmap")
+    pytest.importorskip("pycolmap", reason="extra `colmap` is not installed")
     (made,) = export(truth, ["colmap-text"], folder, point_filter=PointFilter(max_points=50), progress=False)
     return made / "sparse" / "0"
 
@@ -136,7 +136,7 @@ def test_frames_without_a_pose_and_poses_without_a_frame_are_said(
 
 
 def test_bundle_adjustment_brings_cameras_nearer_to_the_truth(truth: Reconstruction, tmp_path: Path) -> None:
-    pytest.importorskip("pycolmap")
+    pytest.importorskip("pycolmap", reason="extra `colmap` is not installed")
     start = changed(truth, tmp_path / "start", shaken(truth.extrinsics, 0.015), np.ones(COUNT))
 
     def errors(result: Reconstruction) -> tuple[float, float]:
@@ -155,7 +155,7 @@ def test_bundle_adjustment_brings_cameras_nearer_to_the_truth(truth: Reconstruct
 
 
 def test_images_that_show_nothing_move_no_camera(truth: Reconstruction, tmp_path: Path) -> None:
-    pytest.importorskip("pycolmap")
+    pytest.importorskip("pycolmap", reason="extra `colmap` is not installed")
     from logvggt_jax.reconstruction.depth_files import write_picture
 
     blank = changed(truth, tmp_path / "blank", truth.extrinsics, np.ones(COUNT))
