@@ -314,7 +314,9 @@ def test_a_step_that_does_not_fit_says_what_it_needs_and_what_lowers_it(
         __call__ = staticmethod(refuse)
 
     monkeypatch.setattr(
-        loop, "compiled_steps", lambda *given: [step._replace(run=Refusing(step.run)) for step in compiled(*given)]
+        loop,
+        "compiled_steps",
+        lambda *given, **named: [step._replace(run=Refusing(step.run)) for step in compiled(*given, **named)],
     )
     monkeypatch.setattr(loop, "device_bytes", lambda device: 3 * 2**30)
     if reason.startswith("INTERNAL"):
