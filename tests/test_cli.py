@@ -15,7 +15,8 @@ import pytest
 from result_folder import write_result
 
 from logvggt_jax import LogVGGT, ModelConfig
-from logvggt_jax.cli import FORMATS, MODES, main
+from logvggt_jax.cli import main
+from logvggt_jax.cli.choices import FORMATS, METHOD_NAMES
 from logvggt_jax.compile import default_cache_folder, enable_compilation_cache
 from logvggt_jax.data import DATASETS
 from logvggt_jax.errors import DiskError
@@ -78,7 +79,7 @@ def test_help_names_every_command_and_each_shows_an_example(capsys: pytest.Captu
 
 
 def test_every_method_is_a_mode_and_every_exporter_a_format() -> None:
-    assert set(MODES) == set(METHODS)
+    assert set(METHOD_NAMES) == set(METHODS)
     assert tuple(EXPORTERS) == FORMATS
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from ml_collections import config_dict
 
-from logvggt_jax.cli import _parser
+from logvggt_jax.cli.program import command_parser
 
 ROOT = Path(__file__).parents[1]
 
@@ -50,7 +50,7 @@ def test_the_demo_calls_the_command_line_as_it_is(commands: list[list[str]]) -> 
     for words in commands:
         for position, word in enumerate(words):
             if word.endswith("/logvggt"):
-                _parser().parse_args(words[position + 1 :])
+                command_parser().parse_args(words[position + 1 :])
                 called.append(words[position + 1])
     assert called == ["render-room", "reconstruct"]
 

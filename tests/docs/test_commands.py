@@ -14,7 +14,7 @@ from absl.testing import flagsaver
 from shell_lines import PAGES, ROOT, Command, commands, shell_lines
 
 from logvggt_jax import ModelConfig
-from logvggt_jax.cli import _parser, _with_dashes
+from logvggt_jax.cli.program import command_parser, with_dashes
 from logvggt_jax.weights.checkpoints import save_model
 from logvggt_jax.weights.provenance import Provenance
 
@@ -74,12 +74,12 @@ def parse_flags(
 
 @chosen("logvggt", whole=True)
 def test_logvggt_takes_the_command(command: Command) -> None:
-    _parser().parse_args(_with_dashes(command.arguments))
+    command_parser().parse_args(with_dashes(command.arguments))
 
 
 @chosen("logvggt", whole=False)
 def test_logvggt_has_the_command_and_options_that_a_sentence_names(command: Command) -> None:
-    parser = _parser()
+    parser = command_parser()
     for word in command.arguments:
         groups = [each for each in parser._actions if isinstance(each, argparse._SubParsersAction)]
         if word.startswith("--"):

@@ -20,7 +20,8 @@ import numpy as np
 import pytest
 
 from logvggt_jax import LogVGGT, ModelConfig, Predictions
-from logvggt_jax.cli import MODES, main
+from logvggt_jax.cli import main
+from logvggt_jax.cli.choices import METHOD_NAMES
 from logvggt_jax.doctor import environment, examination, methods, parity, training
 from logvggt_jax.doctor.finding import Finding
 from logvggt_jax.doctor.subject import Subject, tiny_config
@@ -104,8 +105,8 @@ def test_every_method_has_a_part_and_time_of_its_own(monkeypatch: pytest.MonkeyP
         examination, "_in_own_process", lambda part, limit, **_: asked.update({part: limit}) or iter(())
     )
     assert main(["doctor", "--methods"]) == 0
-    assert list(asked) == list(MODES) and set(METHODS) == set(MODES)
-    shares = [examination.METHOD_SHARE[1] * (i + 1) for i in range(len(MODES))]
+    assert list(asked) == list(METHOD_NAMES) and set(METHODS) == set(METHOD_NAMES)
+    shares = [examination.METHOD_SHARE[1] * (i + 1) for i in range(len(METHOD_NAMES))]
     assert list(asked.values()) == pytest.approx(shares, abs=1), "what the ones before left is theirs"
 
 

@@ -1,0 +1,8 @@
+"""The `logvggt` command: convert weights, reconstruct sequences, follow cameras, check data, look at results.
+
+Commands import what they need when they run: JAX takes seconds to load, `--help` should not.
+"""
+
+from logvggt_jax.cli.program import main
+
+__all__ = ["main"]

@@ -1,0 +1,87 @@
+"""How a command is added to the command line, and the options that several commands share."""
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+
+def add_command(
+    commands: Any,
+    name: str,
+    run: Callable[[argparse.Namespace], int | None],
+    summary: str,
+    example: str,
+    *,
+    details: str = "",
+) -> argparse.ArgumentParser:
+    """Adds a command to a group of them.
+
+    Args:
+      commands: what `ArgumentParser.add_subparsers` returned.
+      name: of the command.
+      run: takes the options and returns the exit code, None for 0.
+      summary: what it does, in a few words that begin with a verb.
+      example: a whole command line, shown by its help.
+      details: sentences for its help, after a space.
+
+    Returns:
+      The command's parser, which its options are to be added to.
+    """
+    added = commands.add_parser(
+        name,
+        help=summary,
+        description=f"{summary[0].upper()}{summary[1:]}.{details}",
+        epilog=f"example:\n  {example}",
+        formatter_class=_Formatter,
+    )
+    added.set_defaults(run=run)
+    added.add_argument("--traceback", action="store_true", help="show where in the code an error arose")
+    return added
+
+
+def output_option(parser: argparse.ArgumentParser) -> None:
+    """Adds the folder that a command makes."""
+    parser.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder to make")
+
+
+def overwrite_option(parser: argparse.ArgumentParser, what: str) -> None:
+    """Adds the leave to replace what is there, for example "an earlier model folder"."""
+    parser.add_argument("--overwrite", action="store_true", help=f"replace {what}")
+
+
+def longer_edge_option(parser: argparse.ArgumentParser) -> None:
+    """Adds the size of the images that the network sees."""
+    parser.add_argument(
+        "--longer-edge",
+        type=int,
+        default=None,
+        metavar="PIXELS",
+        help="resize frames so that their longer edge has this size, a multiple of 14 (default: the size that the "
+        "model was trained with)",
+    )
+
+
+def execution_options(parser: argparse.ArgumentParser) -> None:
+    """Adds how a network is computed, and where its compiled programs stay."""
+    parser.add_argument(
+        "--dtype", choices=("float32", "bfloat16"), default=None, help="compute type instead of the checkpoint's own"
+    )
+    parser.add_argument(
+        "--compilation-cache",
+        default=None,
+        metavar="DIR",
+        help="where compiled programs are kept between runs, 'none' for nowhere (default: $JAX_COMPILATION_CACHE_DIR "
+        "or the user's cache folder)",
+    )
+
+
+class _Formatter(argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescriptionHelpFormatter):
+    """Keeps the example's line and shows defaults that say something."""
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        if action.default in (None, False):
+            return action.help
+        if isinstance(action.default, tuple):
+            return f"{action.help} (default: {'x'.join(map(str, action.default))})"
+        return super()._get_help_string(action)

@@ -1,0 +1,89 @@
+"""The program: reads the command line, runs a command, and turns what ended it into an exit code."""
+
+import argparse
+import signal
+import sys
+import traceback
+import warnings
+from collections.abc import Sequence
+
+from logvggt_jax.cli import data, doctor, live, models, reconstruct, results
+from logvggt_jax.cli.exit_codes import BAD_INPUT, INTERRUPTED, OUTPUT_LOST
+from logvggt_jax.errors import InputError, one_line, printable
+from logvggt_jax.interruption import Interrupted
+from logvggt_jax.terminal import forgiving_streams
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs the command line and returns the exit code.
+
+    0; 2 for bad input; 128 and its number where a signal ended the run; 1 where `data check` or `doctor` found
+    problems, or standard output could not be written. A reader of standard output that goes away is no error. Any
+    exception but InputError is a fault of this package and passes through with its traceback.
+
+    Args:
+      arguments: without the program's name; default `sys.argv[1:]`.
+    """
+    with forgiving_streams() as output:
+        code = _run(sys.argv[1:] if arguments is None else arguments)
+    if output.failure is not None and not isinstance(output.failure, BrokenPipeError):
+        print(f"logvggt: error: standard output cannot be written: {one_line(output.failure)}", file=sys.stderr)
+        return code or OUTPUT_LOST
+    return code
+
+
+def _run(arguments: Sequence[str]) -> int:
+    options = command_parser().parse_args(with_dashes(arguments))
+    try:
+        with warnings.catch_warnings():
+            warnings.showwarning = _show_warning
+            return options.run(options) or 0
+    except KeyboardInterrupt:
+        print("logvggt: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except Interrupted as interruption:
+        print(f"logvggt: ended by {interruption.signal}: {interruption}", file=sys.stderr)
+        return 128 + signal.Signals[interruption.signal]
+    except InputError as error:
+        if options.traceback:
+            traceback.print_exc()
+        print(f"logvggt: error: {one_line(error)}", file=sys.stderr)
+        return BAD_INPUT
+
+
+def command_parser() -> argparse.ArgumentParser:
+    """The parser of the whole command line; the function that runs a command is the value of `run`."""
+    parser = argparse.ArgumentParser(
+        prog="logvggt",
+        description="LoG-VGGT in JAX: camera poses, depth and point clouds from image sequences of any length.",
+        epilog="`logvggt COMMAND --help` shows a command's options and an example.",
+    )
+    parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
+    parser.set_defaults(traceback=False)
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    for module in (models, reconstruct, live, results, data, doctor):
+        module.add_to(commands)
+    return parser
+
+
+class _Version(argparse.Action):
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        from importlib.metadata import version
+
+        print(f"logvggt {version('logvggt-jax')}")
+        parser.exit()
+
+
+def with_dashes(arguments: Sequence[str]) -> list[str]:
+    """Option names with underscores, as train.py and eval.py spell theirs, in the spelling with dashes."""
+    result = []
+    for argument in arguments:
+        if argument.startswith("--"):
+            name, equals, value = argument.partition("=")
+            argument = name.replace("_", "-") + equals + value
+        result.append(argument)
+    return result
+
+
+def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
+    print(f"logvggt: warning: {printable(str(message))}", file=sys.stderr)
