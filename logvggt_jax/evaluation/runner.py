@@ -300,14 +300,24 @@ def _collected(
             scores = [(each["sequence"], ClipScore(each["metrics"], each["failures"])) for each in done]
             if done:
                 score = benchmark_score(protocol, method, scores, planned)
-                summary.append(
-                    {"benchmark": protocol.name, "frames": protocol.frames.wanted, "method": method.name, **score}
-                )
+                spread = {"spread": _spread(benchmark, method, scores)} if protocol.sets > 1 else {}
+                asked_of = {"benchmark": protocol.name, "frames": protocol.frames.wanted, "method": method.name}
+                summary.append({**asked_of, **score, **spread})
             for record in done:
                 where = {key: record[key] for key in ("benchmark", "sequence", "frames", "method")}
                 failures += [{**where, "metric": group, "reason": why} for group, why in record["failures"].items()]
                 figures += record["figures"] or []
     return {"benchmarks": described, "summary": summary, "failures": failures, "figures": figures}
+
+
+def _spread(benchmark: Benchmark, method: Method, scores: Sequence[tuple[str, ClipScore]]) -> dict[str, float]:
+    """Standard deviation over the protocol's sets of sequences, of each mean that two sets or more have."""
+    number = {name: position % benchmark.protocol.sets for position, name in enumerate(_sequences(benchmark))}
+    sets = [[each for each in scores if number[each[0]] == chosen] for chosen in range(benchmark.protocol.sets)]
+    means = [benchmark_score(benchmark.protocol, method, part, len(part)) for part in sets if part]
+    keys = dict.fromkeys(key for mean in means for key in mean)
+    values = {key: [mean[key] for mean in means if key in mean] for key in keys}
+    return {key: float(np.std(found, ddof=1)) for key, found in values.items() if len(found) > 1}
 
 
 def _all_failed(records: ClipRecords, keys: Iterable[str]) -> str:

@@ -173,3 +173,22 @@ def test_a_bug_in_a_method_is_not_called_unmeasurable(rooms: Rooms, tmp_path: Pa
     method, _ = failing("shapes do not match", at_call=1, error=ValueError)
     with pytest.raises(ValueError, match="shapes do not match"):
         run(rooms, [method], tmp_path)
+
+
+def test_sets_of_sequences_give_a_spread(rooms: Rooms, tmp_path: Path) -> None:
+    """Two rooms in two sets: beside a mean stands what the two values of two rooms say of it."""
+    settings = ClipSettings(image_size=SIZE, clip_lengths=(4,), sets=2, max_points=500, figures=0)
+    results = run(rooms, [static_camera()], tmp_path, settings)
+    (entry,) = results["summary"]
+    lines = [json.loads(line) for line in (tmp_path / "clips.jsonl").read_text().splitlines()]
+    single = [line["metrics"]["ate"] for line in lines if "metrics" in line]
+    assert len(single) == 2 and entry["ate"] == pytest.approx(np.mean(single))
+    assert entry["spread"]["ate"] == pytest.approx(np.std(single, ddof=1)) and entry["spread"]["ate"] > 0
+    pose = next(table for table in tables(results) if table.title.startswith("Pose"))
+    assert f"{entry['ate']:.4f} ± {entry['spread']['ate']:.4f}" in pose.rows[0][1]
+
+
+def test_without_sets_a_mean_stands_alone(rooms: Rooms, tmp_path: Path) -> None:
+    results = run(rooms, [static_camera()], tmp_path)
+    assert all("spread" not in entry for entry in results["summary"])
+    assert not any("±" in cell for table in tables(results) for row in table.rows for cell in row)

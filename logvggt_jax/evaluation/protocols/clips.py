@@ -20,6 +20,7 @@ class ClipSettings:
     stride: int = 1  # frames of the sequence from one frame of a clip to the next
     clips_per_sequence: int = 1  # clips with evenly spaced starts in each sequence
     max_sequences: int | None = None  # only that many first sequences; None takes all
+    sets: int = 1  # of sequences, dealt round; from two on, tables show the standard deviation of the sets' means
     # Points compared in each clip, drawn at random, the same for prediction and truth; None takes all.
     max_points: int | None = 20_000
     icp_threshold: float | None = 0.1  # metres, of the ICP before the point metrics; None leaves it out
@@ -33,12 +34,13 @@ class ClipSettings:
             raise InputError(
                 f"ClipSettings.clip_lengths must be at least one number of 2 or more frames, got {self.clip_lengths}"
             )
-        require_counts(self, "stride", "clips_per_sequence", "max_sequences", "max_points")
+        require_counts(self, "stride", "clips_per_sequence", "sets", "max_sequences", "max_points")
         require_within(self, "(0, inf)", "icp_threshold")
 
 
 def clip_protocols(dataset: str, split: str, settings: ClipSettings, image_size: tuple[int, int]) -> list[Protocol]:
     """One benchmark for each clip length of the settings, on images of `image_size` (H, W)."""
+    spread = f"± is the standard deviation of the means of {settings.sets} sets, into which sequences are dealt round."
     return [
         Protocol(
             name=f"{dataset}-clips-{length}",
@@ -51,6 +53,8 @@ def clip_protocols(dataset: str, split: str, settings: ClipSettings, image_size:
             points=PointsMeasure(None, settings.max_points, settings.icp_threshold, settings.seed),
             poses=True,
             trajectory=True,
+            sets=settings.sets,
+            decisions=(spread,) if settings.sets > 1 else (),
         )
         for length in settings.clip_lengths
     ]

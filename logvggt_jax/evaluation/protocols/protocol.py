@@ -50,6 +50,8 @@ class Protocol:
     # Pairs of poses are pooled over the sequences of a category (the name's first part), and the mean is over
     # categories; otherwise it is over sequences.
     pooled: bool = False
+    # Its sequences are dealt round into so many sets; what is printed beside a mean is how far the sets' own differ.
+    sets: int = 1
     decisions: tuple[str, ...] = ()  # what the paper leaves open, as decided here; printed with the results
 
     def __post_init__(self) -> None:

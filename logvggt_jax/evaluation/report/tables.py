@@ -159,6 +159,8 @@ def _cell(entry: Mapping[str, Any], column: Column, best: float | None) -> str:
     if value is None:
         return "-"
     text = f"{value:.{column.decimals}f}"
+    if column.key in entry.get("spread", ()):
+        text += f" ± {entry['spread'][column.key]:.{column.decimals}f}"
     return f"**{text}**" if value == best else text
 
 
