@@ -15,9 +15,10 @@ import pytest
 from absl import flags
 
 # Before any computation: sharded code is tested on sixteen devices, and as most of a test's time is compilation,
-# the code generator optimises little. Older releases also have simpler emitters, which halve that time.
+# the code generator optimises little, in one piece. Older releases also have simpler emitters, which halve that time.
 SIMPLE = " --xla_cpu_use_fusion_emitters=false" if jax.__version_info__ < (0, 11) else ""
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0" + SIMPLE)
+QUICK = "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1"
+os.environ.setdefault("XLA_FLAGS", QUICK + SIMPLE)
 jax.config.update("jax_platforms", "cpu")
 jax.config.update("jax_num_cpu_devices", 16)
 

@@ -14,7 +14,7 @@ from logvggt_jax.config import ModelConfig
 from logvggt_jax.model.initializers import normal
 from logvggt_jax.model.layers import Block
 from logvggt_jax.model.memory import LayerMemory, Memory
-from logvggt_jax.model.parameters import run
+from logvggt_jax.model.parameters import given, run
 from logvggt_jax.model.rope import rope_table
 from logvggt_jax.model.shape_check import ShapeCheck
 
@@ -108,7 +108,7 @@ class Aggregator(ShapeCheck, nn.Module):
             return frame_out.reshape(shape), x.reshape(shape), left
 
         def by_parameters(
-            params: tuple[Any, Any], x: jax.Array, read: LayerMemory | None = None
+            params: tuple[Any, ...], x: jax.Array, read: LayerMemory | None = None
         ) -> tuple[jax.Array, jax.Array, LayerMemory | None]:
             frame_block, global_block = (functools.partial(run, block(parent=None), each) for each in params)
             return one_layer(frame_block, global_block, x, read)
@@ -124,7 +124,10 @@ class Aggregator(ShapeCheck, nn.Module):
         ) -> tuple[jax.Array, jax.Array, LayerMemory | None]:
             if stacks is not None:
                 return by_parameters(jax.tree.map(lambda stack: stack[layer], stacks), x, read)
-            return one_layer(block(name=f"frame_block_{layer}"), block(name=f"global_block_{layer}"), x, read)
+            names = f"frame_block_{layer}", f"global_block_{layer}"
+            if given(self, names[0]):
+                return by_parameters(tuple(self.get_variable("params", name) for name in names), x, read)
+            return one_layer(block(name=names[0]), block(name=names[1]), x, read)
 
         def plain(first: int, stop: int, x: jax.Array) -> jax.Array:
             """Layers first … stop − 1, which read no memory and hand nothing out."""

@@ -12,7 +12,7 @@ import numpy as np
 from logvggt_jax.config import EncoderConfig
 from logvggt_jax.model.initializers import constant, fan_in_normal, normal
 from logvggt_jax.model.layers import Block, layer_norm
-from logvggt_jax.model.parameters import run
+from logvggt_jax.model.parameters import given, run
 from logvggt_jax.model.precision import product_precision
 from logvggt_jax.model.shape_check import ShapeCheck
 
@@ -83,17 +83,19 @@ class DinoV2(ShapeCheck, nn.Module):
                 **options,
             )
 
+        detached = block(parent=None)
+
+        def layer(x: jax.Array, params: Any) -> tuple[jax.Array, None]:
+            return run(detached, params, x)[0], None
+
         if self.has_variable("params", "blocks"):
-            detached = block(parent=None)
-
-            def layer(x: jax.Array, params: Any) -> tuple[jax.Array, None]:
-                return run(detached, params, x)[0], None
-
             body = jax.checkpoint(layer, prevent_cse=False) if self.remat else layer
             x, _ = jax.lax.scan(body, x, self.get_variable("params", "blocks"))
         else:
             for i in range(config.depth):
-                x, _ = block(name=f"block_{i}")(x)
+                name = f"block_{i}"
+                own = self.get_variable("params", name) if given(self, name) else None
+                x, _ = block(name=name)(x) if own is None else layer(x, own)
         return layer_norm(1e-6, "norm", self.dtype)(x[:, 1 + config.num_registers :])
 
 

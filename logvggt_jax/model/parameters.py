@@ -7,6 +7,7 @@ of each on every device.
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Callable
 from typing import Any
@@ -45,13 +46,21 @@ class Part:
         return jax.lax.all_gather(self.value, self.mesh_axis, axis=self.value.ndim + self.axis, tiled=True)
 
 
+@functools.partial(jax.jit, static_argnums=0, static_argnames=("grid", "image_size", "method"))
 def run(module: nn.Module, params: Any, *inputs: Any, **options: Any) -> Any:
-    """A linen module as a pure function of its own parameters.
+    """A linen module as a pure function of its own parameters, traced once for all inputs of one form.
 
-    Those that come in parts are put together here, where they are used; stacks stay in parts for the loop over them,
-    whose body runs one layer with this function.
+    A deep stack is so traced and lowered as one layer that is called many times; the compiler puts it back in all its
+    places. Parameters that come in parts are put together here, where they are used; stacks stay in parts for the loop
+    over them, whose body runs one layer with this function.
     """
     return module.apply({"params": whole(params)}, *inputs, **options)
+
+
+def given(module: nn.Module, name: str) -> bool:
+    """Whether the parameters of a module's part are there to `run` it; False too where its intermediates are asked for
+    (`capture_intermediates`), which parts give that the module calls itself."""
+    return module.has_variable("params", name) and not module.is_mutable_collection("intermediates")
 
 
 def whole(params: Any) -> Any:

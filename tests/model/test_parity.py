@@ -104,7 +104,10 @@ def layers(modules, converted):
             return call(*args, **kwargs)
 
         with nn.intercept_methods(record):
-            jax.eval_shape(lambda p, m=module, a=arguments, o=options: m.apply({"params": p}, *a, **o), params[part])
+            jax.eval_shape(
+                lambda p, m=module, a=arguments, o=options: m.apply({"params": p}, *a, mutable=["intermediates"], **o),
+                params[part],
+            )
     return found
 
 
