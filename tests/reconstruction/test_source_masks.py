@@ -16,6 +16,7 @@ from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.errors import InputError, MissingInput, OutputExists
 from logvggt_jax.model.dinov2 import IMAGE_MEAN
 from logvggt_jax.reconstruction import PointFilter, Reconstruction, open_source, reconstruct
+from logvggt_jax.reconstruction.exporters.colmap import export_colmap
 from logvggt_jax.reconstruction.exporters.original_depth import original_depth
 from logvggt_jax.reconstruction.exporters.tracks import find_tracks
 from logvggt_jax.reconstruction.masking import FILL, mask_at
@@ -239,6 +240,8 @@ def test_what_is_masked_is_nowhere_in_a_result(
     assert first.keys() == second.keys()
     assert [name for name in first if first[name] != second[name]] == []
     check_result(results[0], kept)
+    if method == "windows":
+        check_colmap(results[0], tmp_path / "colmap")
 
 
 def check_result(result: Reconstruction, kept: np.ndarray) -> None:
@@ -255,6 +258,16 @@ def check_result(result: Reconstruction, kept: np.ndarray) -> None:
     tracks = find_tracks(result, None, progress=False)
     u, v = np.rint(tracks.pixels).astype(int).T
     assert small[tracks.frames, v, u].all(), "no observation of a point lies under a mask"
+
+
+def check_colmap(result: Reconstruction, folder: Path) -> None:
+    pytest.importorskip("pycolmap", reason='needs pycolmap: pip install "logvggt-jax[colmap]"')
+    folder.mkdir()
+    export_colmap(result, folder, progress=False)
+    for index, image in enumerate(sorted((folder / "images").iterdir())):
+        with Image.open(folder / "masks" / f"{image.name}.png") as picture:
+            black = np.asarray(picture) == 0
+        np.testing.assert_array_equal(black, original_depth(result, index) == 0)
 
 
 def test_a_run_is_taken_up_with_its_own_masks_alone(walk: Path, masks: Path, tmp_path: Path) -> None:
