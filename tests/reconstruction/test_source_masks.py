@@ -73,7 +73,7 @@ def test_masks_are_named_as_frames_or_their_files(walk: Path, kept: np.ndarray, 
 def test_one_mask_serves_all_frames_and_the_note_says_how_much(walk: Path, masks: Path, kept: np.ndarray) -> None:
     np.testing.assert_array_equal(read_masks(walk, masks / "001.png"), kept[[1] * COUNT])
     note = open_source(walk, masks=masks / "001.png").notes[-1]
-    assert note == f"{1 - kept[1].mean():.0%} of the pixels are masked by {masks / '001.png'}"
+    assert note == f"{1 - kept[1].mean():.0%} of the pixels are masked, black in {masks / '001.png'}"
     assert "5 masks were looked at" in open_source(walk, masks=masks).notes[-1]
 
 
@@ -178,6 +178,11 @@ def test_masks_that_cannot_be_used_are_named(walk: Path, masks: Path, damage: st
 def test_the_images_are_no_masks_of_themselves(walk: Path) -> None:
     with pytest.raises(InputError, match="holds the images themselves"):
         open_source(walk, masks=walk)
+
+
+def test_a_camera_takes_one_mask_for_all_frames(masks: Path) -> None:
+    with pytest.raises(InputError, match="masks is a folder: a camera or a stream takes one mask"):
+        open_source("rtsp://127.0.0.1:1/nothing", masks=masks)
 
 
 def test_masks_of_nearly_everything_are_doubted(walk: Path, tmp_path: Path) -> None:

@@ -107,6 +107,11 @@ class Masks:
             self.file("frame-000000")
         return self._looked_at([Masked(name, "", size) for name in sorted(self._of_frame)], from_start=from_start)
 
+    def check_live(self) -> None:
+        """InputError for a folder: nobody knows the frames of a camera or a network stream before they come."""
+        if not self._for_all:
+            raise InputError(f"{self.path} is a folder: a camera or a stream takes one mask, a picture, for all frames")
+
     def file(self, name: str) -> Path:
         """The mask of the frame of this name. MissingInput where a video's frame has none."""
         if self._for_all:
@@ -178,7 +183,7 @@ class Masks:
             )
         share, count = float(np.mean(shares)), "" if self._for_all else f" ({len(shares)} masks were looked at)"
         doubt = f"; {_INVERTED}" if share > _SUSPICIOUS else ""
-        return f"{share:.0%} of the pixels are masked by {self.path}{count}{doubt}"
+        return f"{share:.0%} of the pixels are masked, black in {self.path}{count}{doubt}"
 
     @staticmethod
     def _decoded(file: Path, size: tuple[int, int], orientation: int) -> np.ndarray:

@@ -76,6 +76,8 @@ class VideoSource(Source):
                 self.notes.append(masks.check_video(self._header.size, from_start=not options.start))
             return
         self.address = None
+        if masks is not None:
+            masks.check_live()
         if str(path).isdecimal():
             self.name = f"camera {path}"
             self._decoder = OpenCVDecoder(int(str(path)), self.name)
