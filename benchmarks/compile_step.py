@@ -2,7 +2,7 @@
 
     python benchmarks/compile_step.py --target cpu
     python benchmarks/compile_step.py --target v5e:2x2x1 --target v5p:2x2x1
-    python benchmarks/compile_step.py --target cuda
+    python benchmarks/compile_step.py --target cuda --masks
 
 TPU targets need the `libtpu` wheel and no TPU: the compiler runs on the CPU for one device of a described slice,
 the memory figures are its own. The CUDA program is lowered with a stand-in for JAX's check of the installed cuDNN;
@@ -13,7 +13,9 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import functools
 import os
+import re
 import time
 from unittest import mock
 
@@ -30,24 +32,27 @@ IMAGE_SIZE = (392, 518)
 GIB = 2**30
 
 
-def abstract_step(model: LogVGGT, sharding: jax.sharding.Sharding | None = None) -> tuple:
-    """Abstract arguments (variables, state, frames, frame_mask) of one step with a batch of one."""
+def abstract_step(model: LogVGGT, masked: bool, sharding: jax.sharding.Sharding | None = None) -> tuple:
+    """Abstract arguments (variables, state, frames, frame_mask, masks) of one step with a batch of one."""
     windows = model.config.windows
 
     def frames(count: int) -> jax.ShapeDtypeStruct:
         return jax.ShapeDtypeStruct((1, count, *IMAGE_SIZE, 3), jnp.uint8)
 
-    variables = variable_shapes(model.config)
-    state = jax.eval_shape(model.start, variables, frames(windows.size - windows.stride))
+    def masks(count: int) -> jax.ShapeDtypeStruct | None:
+        return jax.ShapeDtypeStruct((1, count, *IMAGE_SIZE), bool) if masked else None
+
+    variables, overlap = variable_shapes(model.config), windows.size - windows.stride
+    state = jax.eval_shape(model.start, variables, frames(overlap), None, masks(overlap))
     mask = jax.ShapeDtypeStruct((1, windows.stride), bool)
     place = lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding)  # noqa: E731
-    return jax.tree.map(place, (variables, state, frames(windows.stride), mask))
+    return jax.tree.map(place, (variables, state, frames(windows.stride), mask, masks(windows.stride)))
 
 
-def compile_for_cpu(config: ModelConfig) -> tuple[float, float, jax.stages.Compiled]:
+def compile_for_cpu(config: ModelConfig, masked: bool) -> tuple[float, float, jax.stages.Compiled]:
     """Seconds to lower, seconds to compile, and the program."""
     model = LogVGGT(config)
-    arguments = abstract_step(model)
+    arguments = abstract_step(model, masked)
     started = time.perf_counter()
     lowered = jax.jit(model.step, donate_argnums=1).lower(*arguments)
     lowered_at = time.perf_counter()
@@ -55,7 +60,7 @@ def compile_for_cpu(config: ModelConfig) -> tuple[float, float, jax.stages.Compi
     return lowered_at - started, time.perf_counter() - lowered_at, compiled
 
 
-def compile_for_tpu(config: ModelConfig, topology: str) -> jax.stages.Compiled:
+def compile_for_tpu(config: ModelConfig, masked: bool, topology: str) -> jax.stages.Compiled:
     """The step for one device of a described TPU slice, such as "v5e:2x2x1", with the Pallas flash kernel."""
     from jax.experimental import topologies
 
@@ -63,10 +68,10 @@ def compile_for_tpu(config: ModelConfig, topology: str) -> jax.stages.Compiled:
     sharding = jax.sharding.SingleDeviceSharding(described.devices[0])
     model = LogVGGT(dataclasses.replace(config, attention="tpu_flash"))
     step = jax.jit(model.step, donate_argnums=1)
-    return step.lower(*abstract_step(model, sharding)).compile()
+    return step.lower(*abstract_step(model, masked, sharding)).compile()
 
 
-def lower_for_cuda(config: ModelConfig) -> str:
+def lower_for_cuda(config: ModelConfig, masked: bool) -> str:
     """The step's StableHLO for CUDA with cuDNN attention, lowered with a stand-in for the cuDNN version check."""
     from jax._src.cudnn import fused_attention_stablehlo
 
@@ -77,7 +82,21 @@ def lower_for_cuda(config: ModelConfig) -> str:
         mock.patch.object(fused_attention_stablehlo, "check_compute_capability", lambda _: True),
         mock.patch.object(fused_attention_stablehlo, "is_cuda_compute_capability_equal", lambda _: False),
     ):
-        return step.trace(*abstract_step(model)).lower(lowering_platforms=("cuda",)).as_text()
+        return step.trace(*abstract_step(model, masked)).lower(lowering_platforms=("cuda",)).as_text()
+
+
+def count_calls(program: str, kernel: str) -> int:
+    """Calls of a kernel in StableHLO whose functions call one another, each as often as it is called from `main`."""
+    functions = dict(re.findall(r"func\.func \w+ @(\w+)(.*?)(?=func\.func|\Z)", program, re.DOTALL))
+
+    @functools.cache
+    def within(name: str) -> int:
+        body = functions[name]
+        return body.count(kernel) + sum(
+            within(called) for called in re.findall(r"call @(\w+)\(", body) if called in functions
+        )
+
+    return within("main")
 
 
 def describe_memory(compiled: jax.stages.Compiled) -> str:
@@ -95,18 +114,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--target", action="append", help="cpu, cuda, or a TPU topology; default cpu")
     parser.add_argument("--dtype", default="bfloat16")
+    parser.add_argument("--masks", action="store_true", help="a step of a stream with masks of pixels")
     options = parser.parse_args()
     config = ModelConfig(dtype=options.dtype)
     print(f"VGGT-1B sizes, one step of 2 new frames {IMAGE_SIZE[0]}x{IMAGE_SIZE[1]}, {options.dtype}")
     for target in options.target or ["cpu"]:
         if target == "cpu":
-            lowering, compilation, compiled = compile_for_cpu(config)
+            lowering, compilation, compiled = compile_for_cpu(config, options.masks)
             print(f"cpu: lowered in {lowering:.1f} s, compiled in {compilation:.1f} s; {describe_memory(compiled)}")
         elif target == "cuda":
-            text = lower_for_cuda(config)
-            print(f"cuda: lowered, {text.count('__cudnn$fmha')} calls of cuDNN attention (not compiled, not run)")
+            text = lower_for_cuda(config, options.masks)
+            calls = count_calls(text, "__cudnn$fmha")
+            print(f"cuda: lowered, {calls} calls of cuDNN attention (not compiled, not run)")
         else:
-            compiled = compile_for_tpu(config, target)
+            compiled = compile_for_tpu(config, options.masks, target)
             kernels = compiled.as_text().count("tpu_custom_call")
             print(f"{target}: compiled, {kernels} calls of the flash kernel; {describe_memory(compiled)}")
 

@@ -19,7 +19,8 @@ __all__ = ["Frames", "Predictions", "WindowOutput"]
 class Predictions:
     """What `LogVGGT.apply` returns; every leaf starts with B, frames are in input order.
 
-    Cameras live in the frame of the sequence's first camera, up to scale; depth is in the same unit.
+    Cameras live in the frame of the sequence's first camera, up to scale; depth is in the same unit. Where a mask drops
+    a pixel, depth, points and confidences are 0.
 
     Attributes:
       pose_encoding: [B, T, 9] float32, the last round of `pose_encodings`.
@@ -49,7 +50,7 @@ class Predictions:
 
 @struct.dataclass
 class WindowOutput:
-    """Frames that became final in a call of `step` or `finish`, oldest first.
+    """Frames that became final in a call of `step` or `finish`, oldest first; 0 where a mask drops a pixel.
 
     Attributes:
       depth: [B, n, H, W] float32, z-depth.

@@ -271,6 +271,10 @@ def test_bad_input_is_one_line_and_exit_code_2(
     ):
         given = ("--method", method, "--setting", setting, "--dry-run")
         assert_fails(capsys, reconstruct(room, checkpoint, *given), *words)
+    masks = ("--masks", str(empty))
+    assert_fails(capsys, reconstruct(room, tmp_path / "no-model", *masks), "no mask in", str(empty))
+    masks = ("--masks", str(next(room.glob("*.color.png"))), "--method", "causal")
+    assert_fails(capsys, reconstruct(room, checkpoint, *masks), "--method causal takes no masks")
     loops = ("--mode", "offline", "--loops")
     assert_fails(capsys, reconstruct(room, checkpoint, *loops), "--loops needs --method chunks or windows, not offline")
     truncated = tmp_path / "truncated"

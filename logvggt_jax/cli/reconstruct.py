@@ -28,13 +28,14 @@ def _reconstruct(options: argparse.Namespace) -> int:
     from logvggt_jax.reconstruction.method import choose_method
     from logvggt_jax.reconstruction.point_cloud import PointFilter
     from logvggt_jax.reconstruction.reconstruct import LONGER_EDGE, reconstruct
-    from logvggt_jax.reconstruction.request import check_request, describe
+    from logvggt_jax.reconstruction.request import check_masks, check_request, describe
     from logvggt_jax.reconstruction.sources import open_source
     from logvggt_jax.weights import resolve
     from logvggt_jax.weights.checkpoints import from_pretrained, read_config, read_provenance
 
     # Before the model: a misspelt path should not have to wait for gigabytes of weights.
-    source = open_source(options.source, **{name: getattr(options, name) for name in SOURCE_OPTIONS})
+    taken = {name: getattr(options, name) for name in SOURCE_OPTIONS}
+    source = open_source(options.source, masks=options.masks, **taken)
     point_filter = PointFilter(
         confidence_percentile=options.confidence_percentile,
         edge_threshold=options.edge_threshold or None,
@@ -57,6 +58,7 @@ def _reconstruct(options: argparse.Namespace) -> int:
     check_devices()
     enable_compilation_cache(options.compilation_cache)
     method = choose_method(provenance, None if options.method == "auto" else options.method)
+    check_masks(source, method)
     settings = _settings(options, method)
     needs = describe(source, target, config if options.dry_run else None, method, settings, longer_edge, point_filter)
     if provenance.longer_edge not in (None, longer_edge):
@@ -183,6 +185,15 @@ def add_to(commands: Any) -> None:
     )
     frames.add_argument(
         "--strict", action="store_true", help="stop at a frame that cannot be read instead of leaving it out"
+    )
+    frames.add_argument(
+        "--masks",
+        default=None,
+        metavar="PATH",
+        help="folder with a mask for each frame, NAME.png or NAME.jpg.png (for a video its position, from 0: "
+        "000123.png), or one picture for all frames (a car's bonnet, dirt on the lens). What is black or transparent "
+        "is left out (no influence, no depth, no points), all else counts, as COLMAP has it. With --method windows, "
+        "chunks and offline",
     )
     execution_options(sub)
     sub.add_argument(

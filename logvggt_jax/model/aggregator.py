@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from logvggt_jax.config import ModelConfig
 from logvggt_jax.model.initializers import normal
-from logvggt_jax.model.layers import Block
+from logvggt_jax.model.layers import Block, with_special
 from logvggt_jax.model.memory import LayerMemory, Memory
 from logvggt_jax.model.parameters import given, run
 from logvggt_jax.model.rope import rope_table
@@ -59,6 +59,7 @@ class Aggregator(ShapeCheck, nn.Module):
         memory: Memory | None,
         *,
         grid: tuple[int, int],
+        seen: jax.Array | None = None,
     ) -> tuple[WindowTokens, Memory | None]:
         """Runs all layers over a window.
 
@@ -71,6 +72,8 @@ class Aggregator(ShapeCheck, nn.Module):
           memory: what the global blocks attend to besides the window: with cross-window attention the caches of the
             key layers, see `cross_window.py`. None for the window alone.
           grid: (h, w).
+          seen: bool [B, K, h * w], False for patches that nothing attends to, see `masks.py`; None for all. A memory
+            then gets its block's own keys with a validity bool [B, K · P].
 
         Returns:
           The tokens, and the memory as the global blocks left it.
@@ -83,6 +86,12 @@ class Aggregator(ShapeCheck, nn.Module):
         shape, tokens = x.shape, x.shape[2]
         rope = rope_table(grid, num_special, width // sizes.num_heads, sizes.rope_base)
         valid = None if lengths is None else lengths * tokens
+        frame_valid = None
+        if seen is not None:
+            in_frame = with_special(seen, num_special)
+            frame_valid = in_frame.reshape(batch * frames, tokens)
+            real = jnp.full(batch, frames) if lengths is None else lengths
+            valid = (in_frame & (jnp.arange(frames) < real[:, None])[..., None]).reshape(batch, frames * tokens)
         outlets = {*sizes.key_layers, sizes.depth - 1}
 
         def block(**options: Any) -> Block:
@@ -101,7 +110,7 @@ class Aggregator(ShapeCheck, nn.Module):
             frame_block: BlockFunction, global_block: BlockFunction, x: jax.Array, read: LayerMemory | None
         ) -> tuple[jax.Array, jax.Array, LayerMemory | None]:
             """Outputs of both blocks [B, K, P, C], and the memory that the global block leaves."""
-            frame_out, _ = frame_block(x.reshape(batch * frames, tokens, width), rope=rope)
+            frame_out, _ = frame_block(x.reshape(batch * frames, tokens, width), rope=rope, valid=frame_valid)
             x, left = global_block(
                 frame_out.reshape(batch, frames * tokens, width), rope=rope, valid=valid, memory=read
             )

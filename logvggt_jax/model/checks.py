@@ -51,6 +51,12 @@ def check_pixels(images: Any, patch_size: int, name: str) -> None:
             )
 
 
+def check_masks(images: jax.Array, masks: jax.Array | None) -> None:
+    """Raises ValueError unless masks are None, or bool [B, T, H, W] for images [B, T, H, W, 3]."""
+    if masks is not None:
+        check_array("masks", masks, images.shape[:4], jnp.bool_)
+
+
 def checked_mask(images: jax.Array, mask: jax.Array | None) -> jax.Array:
     """The frame mask bool [B, T] of images [B, T, …]: all frames where None is given."""
     if mask is None:

@@ -27,16 +27,27 @@ class CachedTokens:
     Attributes:
       tokens: [B, F, P, C], of the F frames that the windows share.
       length: int32 [B], how many of the F frames count, always the first ones; 0 before the first window.
+      seen: bool [B, F, P], which of the tokens count; None for all.
     """
 
     tokens: jax.Array
     length: jax.Array
+    seen: jax.Array | None = None
 
     def attend(self, own: OwnTokens, attention: Attend, project: Project) -> tuple[jax.Array, LayerMemory]:
         """Keys and values are [H, C]; the cache is replaced by the windows, not by the block."""
         batch, frames, tokens, width = self.tokens.shape
         cached = project(self.tokens.astype(jnp.float32).reshape(batch, frames * tokens, width))
         key, value, valid = own.keys
+        if self.seen is not None:
+            assert valid is not None  # the window's own tokens are masked as well
+            there = self.seen & (jnp.arange(frames) < self.length[:, None])[..., None]
+            both = Keys(
+                jnp.concatenate([key, cached.key], axis=1),
+                jnp.concatenate([value, cached.value], axis=1),
+                jnp.concatenate([valid, there.reshape(batch, frames * tokens)], axis=1),
+            )
+            return attention(own.query, both), self
         empty = self.length == 0
         count = jnp.int32(key.shape[1]) if valid is None else valid
         keys = Keys(
@@ -55,17 +66,19 @@ class CrossWindowMemory:
       tokens: [B, key layers, F, P, C].
       length: int32 [B], see `CachedTokens`.
       key_layers: static.
+      seen: bool [B, F, P], see `CachedTokens`.
     """
 
     tokens: jax.Array
     length: jax.Array
     key_layers: tuple[int, ...] = struct.field(pytree_node=False)
+    seen: jax.Array | None = None
 
     def at(self, layer: int) -> CachedTokens | None:
         """The cache of `layer`; None for layers that are not key layers."""
         if layer not in self.key_layers:
             return None
-        return CachedTokens(self.tokens[:, self.key_layers.index(layer)], self.length)
+        return CachedTokens(self.tokens[:, self.key_layers.index(layer)], self.length, self.seen)
 
     def updated(self, layer: int, memory: LayerMemory) -> CrossWindowMemory:
         """The same: what a window leaves is known when it has run."""

@@ -11,12 +11,12 @@ import numpy as np
 
 from logvggt_jax.config import EncoderConfig
 from logvggt_jax.model.initializers import constant, fan_in_normal, normal
-from logvggt_jax.model.layers import Block, layer_norm
+from logvggt_jax.model.layers import Block, layer_norm, with_special
 from logvggt_jax.model.parameters import given, run
 from logvggt_jax.model.precision import product_precision
 from logvggt_jax.model.shape_check import ShapeCheck
 
-_IMAGE_MEAN = np.array([0.485, 0.456, 0.406], np.float32)
+IMAGE_MEAN = np.array([0.485, 0.456, 0.406], np.float32)
 _IMAGE_STD = np.array([0.229, 0.224, 0.225], np.float32)
 
 
@@ -45,7 +45,8 @@ class PatchEmbedding(ShapeCheck, nn.Module):
 class DinoV2(ShapeCheck, nn.Module):
     """Images [N, H, W, 3], float32 in [0, 1], to patch tokens [N, h * w, C] float32 (h = H/14, w = W/14).
 
-    Blocks run one after the other or, where their parameters come stacked, as one loop; see `Aggregator`.
+    Blocks run one after the other or, where their parameters come stacked, as one loop; see `Aggregator`. Nothing
+    attends to the patches that `seen`, bool [N, h * w], leaves out; None for none.
     """
 
     config: EncoderConfig
@@ -54,11 +55,11 @@ class DinoV2(ShapeCheck, nn.Module):
     remat: bool = False
 
     @nn.compact
-    def __call__(self, images: jax.Array) -> jax.Array:
+    def __call__(self, images: jax.Array, seen: jax.Array | None = None) -> jax.Array:
         config = self.config
         width, side = config.embed_dim, config.position_grid
         tokens = PatchEmbedding(width, config.patch_size, self.dtype, name="patch_embed")(
-            (images - _IMAGE_MEAN) / _IMAGE_STD
+            (images - IMAGE_MEAN) / _IMAGE_STD
         ).astype(jnp.float32)
         tiny, small = normal(1e-6), normal(0.02)
         cls_token = self.param("cls_token", tiny, (1, 1, width))
@@ -71,6 +72,7 @@ class DinoV2(ShapeCheck, nn.Module):
         tokens = tokens + _resize_positions(pos_embed[:, 1:], side, grid)
         first = jnp.concatenate([cls_token + pos_embed[:, :1], registers], axis=1)
         x = jnp.concatenate([jnp.broadcast_to(first, (len(tokens), *first.shape[1:])), tokens], axis=1)
+        valid = None if seen is None else with_special(seen, first.shape[1])
 
         def block(**options: Any) -> Block:
             return Block(
@@ -86,7 +88,7 @@ class DinoV2(ShapeCheck, nn.Module):
         detached = block(parent=None)
 
         def layer(x: jax.Array, params: Any) -> tuple[jax.Array, None]:
-            return run(detached, params, x)[0], None
+            return run(detached, params, x, valid=valid)[0], None
 
         if self.has_variable("params", "blocks"):
             body = jax.checkpoint(layer, prevent_cse=False) if self.remat else layer
@@ -95,7 +97,7 @@ class DinoV2(ShapeCheck, nn.Module):
             for i in range(config.depth):
                 name = f"block_{i}"
                 own = self.get_variable("params", name) if given(self, name) else None
-                x, _ = block(name=name)(x) if own is None else layer(x, own)
+                x, _ = block(name=name)(x, valid=valid) if own is None else layer(x, own)
         return layer_norm(1e-6, "norm", self.dtype)(x[:, 1 + config.num_registers :])
 
 

@@ -63,6 +63,12 @@ class LayerScale(ShapeCheck, nn.Module):
         return gamma * branch.astype(jnp.float32)
 
 
+def with_special(seen: jax.Array, count: int) -> jax.Array:
+    """Which of a frame's tokens count, bool [..., count + h * w]: its `count` special ones, which come first, and the
+    patches that are `seen`, bool [..., h * w]."""
+    return jnp.pad(seen, [*[(0, 0)] * (seen.ndim - 1), (count, 0)], constant_values=True)
+
+
 def _gelu(x: jax.Array, dtype: str) -> jax.Array:
     """x Φ(x), exact, of float32 values that products of `dtype` read.
 
@@ -170,8 +176,8 @@ class Block(nn.Module):
         Args:
           x: [B, n · P, C] float32, the tokens of n frames, frame after frame.
           rope: rotary table of one frame's P tokens; None for tokens without a position.
-          valid: which tokens of `x` count, see `Keys.valid`; with a memory a number of tokens or None. No token
-            attends to the others, and what becomes of them means nothing.
+          valid: which tokens of `x` count, see `Keys.valid`; what forms the memory takes is its own. No token attends
+            to the others.
           memory: what the block has seen before; None for its own tokens alone.
         """
         width = x.shape[-1]

@@ -89,6 +89,7 @@ class LogVGGT:
         images: jax.Array,
         frame_mask: jax.Array | None = None,
         *,
+        masks: jax.Array | None = None,
         remat: bool = False,
     ) -> Predictions:
         """Cameras, depth and tokens of sequences of any length T >= 1.
@@ -98,14 +99,18 @@ class LogVGGT:
           images: [B, T, H, W, 3].
           frame_mask: bool [B, T], True … True False … False for sequences of unequal length; None for full ones.
             Entries of padded frames mean nothing.
+          masks: bool [B, T, H, W], True for pixels that count; None for all pixels. What lies under a mask has no
+            influence on anything: its pixels are not seen, nothing attends to patches of which more than half is
+            masked, and depth, points and confidences are 0 there. A frame that is masked whole gets a camera all the
+            same, which means nothing.
           remat: for training. Layers run as one loop, and the backward pass keeps what enters a layer or a dense head
             and recomputes the rest; a frozen encoder runs once a frame.
         """
         check_images(images, self.config.encoder.patch_size)
         if remat:
-            out = Windows(self.config, remat=True).scan(stack_layers(variables), images, frame_mask)
+            out = Windows(self.config, remat=True).scan(stack_layers(variables), images, frame_mask, masks)
         else:
-            out = self.windows.scan(variables, images, frame_mask)
+            out = self.windows.scan(variables, images, frame_mask, masks)
         frame_mask = checked_mask(images, frame_mask)
         pose_encodings = self.refinement.refine_sequence(variables, out.camera_tokens, out.register_tokens, frame_mask)
         pose_encoding = pose_encodings[:, :, -1]
@@ -124,9 +129,18 @@ class LogVGGT:
         )
 
     @splits_as_its_batch
-    def start(self, variables: Variables, frames: jax.Array, frame_mask: jax.Array | None = None) -> WindowState:
-        """The state of a stream before its first window, of its first K − s frames [B, K − s, H, W, 3]."""
-        return self.windows.start(variables, frames, frame_mask)
+    def start(
+        self,
+        variables: Variables,
+        frames: jax.Array,
+        frame_mask: jax.Array | None = None,
+        masks: jax.Array | None = None,
+    ) -> WindowState:
+        """The state of a stream before its first window, of its first K − s frames [B, K − s, H, W, 3].
+
+        With `masks` [B, K − s, H, W], see `apply`, every `step` has to have masks, too.
+        """
+        return self.windows.start(variables, frames, frame_mask, masks)
 
     @splits_as_its_batch
     def step(
@@ -135,12 +149,13 @@ class LogVGGT:
         state: WindowState,
         frames: jax.Array,
         frame_mask: jax.Array | None = None,
+        masks: jax.Array | None = None,
     ) -> tuple[WindowState, WindowOutput]:
         """Runs the window that s new frames [B, s, H, W, 3] complete; its s oldest frames become final.
 
         See `Windows.step`; `state` may be donated.
         """
-        return self.windows.step(variables, state, frames, frame_mask)
+        return self.windows.step(variables, state, frames, frame_mask, masks)
 
     @splits_as_its_batch
     def finish(self, variables: Variables, state: WindowState) -> WindowOutput:

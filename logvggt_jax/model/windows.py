@@ -13,10 +13,12 @@ from flax import struct
 
 from logvggt_jax.config import ModelConfig
 from logvggt_jax.model.aggregator import Aggregator, WindowTokens
-from logvggt_jax.model.checks import check_images, checked_mask
+from logvggt_jax.model.checks import check_images, check_masks, checked_mask
 from logvggt_jax.model.cross_window import CrossWindowMemory
 from logvggt_jax.model.dinov2 import DinoV2
 from logvggt_jax.model.dpt_head import DPTHead, depth_activation, point_activation
+from logvggt_jax.model.layers import with_special
+from logvggt_jax.model.masks import seen_patches, without_masked, zero_where_masked
 from logvggt_jax.model.parameters import Variables, run
 from logvggt_jax.types import WindowOutput
 
@@ -38,6 +40,7 @@ class WindowState:
       frame_mask: bool [B, F], False for padding.
       step: int32 [B], windows done.
       image_size: (H, W), static.
+      masks: bool [B, F, H, W], see `masks.py`; None for a stream without masks.
     """
 
     patch_tokens: jax.Array
@@ -46,6 +49,7 @@ class WindowState:
     frame_mask: jax.Array
     step: jax.Array
     image_size: tuple[int, int] = struct.field(pytree_node=False)
+    masks: jax.Array | None = None
 
 
 def num_windows(num_frames: int, size: int, stride: int) -> int:
@@ -66,19 +70,27 @@ class Windows:
 
     # A stream.
 
-    def start(self, variables: Variables, frames: jax.Array, frame_mask: jax.Array | None = None) -> WindowState:
+    def start(
+        self,
+        variables: Variables,
+        frames: jax.Array,
+        frame_mask: jax.Array | None = None,
+        masks: jax.Array | None = None,
+    ) -> WindowState:
         """The state of a stream before its first window.
 
         Args:
           variables: {"params": …}.
           frames: the first K − s frames [B, K − s, H, W, 3]; fewer are padded and masked.
           frame_mask: bool [B, K − s], False for padding.
+          masks: bool [B, K − s, H, W], True for pixels that count, see `masks.py`; None for a stream without masks.
         """
         config, overlap = self.config, self.overlap
         frame_mask = self._checked_group(frames, frame_mask, overlap, "start")
         batch, image_size = frames.shape[0], _image_size(frames)
         width, registers = config.encoder.embed_dim, config.aggregator.num_registers
-        patch_tokens = self.encode(variables, frames)
+        check_masks(frames, masks)
+        patch_tokens = self.encode(variables, frames, masks)
         tokens = patch_tokens.shape[2] + 1 + registers
         key_shape = (batch, len(config.aggregator.key_layers), overlap, tokens, 2 * width)
         return WindowState(
@@ -88,6 +100,7 @@ class Windows:
             frame_mask=frame_mask,
             image_size=image_size,
             step=jnp.zeros((batch,), jnp.int32),
+            masks=masks,
         )
 
     def step(
@@ -96,6 +109,7 @@ class Windows:
         state: WindowState,
         frames: jax.Array,
         frame_mask: jax.Array | None = None,
+        masks: jax.Array | None = None,
     ) -> tuple[WindowState, WindowOutput]:
         """Runs the window that s new frames complete; its s oldest frames become final.
 
@@ -106,6 +120,7 @@ class Windows:
           frame_mask: bool [B, s], False for padding. An item whose new frames are all padding has ended: it only
             hands out what it still holds. None says that all frames are real, those that the state holds as well:
             attention then knows no padding, which is the faster program.
+          masks: bool [B, s, H, W], True for pixels that count; None for a stream that has been started without masks.
         """
         stride, padded = self.config.windows.stride, frame_mask is not None
         frame_mask = self._checked_group(frames, frame_mask, stride, "step")
@@ -115,9 +130,17 @@ class Windows:
                 f"step continues a stream of {len(state.step)} x {state.image_size} images (batch, height and width), "
                 f"got {len(frames)} x {image_size}; start a new stream for other shapes"
             )
-        patch_tokens = jnp.concatenate([state.patch_tokens, self.encode(variables, frames)], axis=1)
+        check_masks(frames, masks)
+        if (masks is None) != (state.masks is None):
+            raise ValueError(
+                "a stream has masks for all frames or for none: give them to start and to every step, all True for "
+                "frames without"
+            )
+        patch_tokens = jnp.concatenate([state.patch_tokens, self.encode(variables, frames, masks)], axis=1)
         window_mask = jnp.concatenate([state.frame_mask, frame_mask], axis=1)
-        window = self.attend(variables, state, patch_tokens, window_mask.sum(1) if padded else None)
+        if masks is not None and state.masks is not None:
+            masks = jnp.concatenate([state.masks, masks], axis=1)
+        window = self.attend(variables, state, patch_tokens, window_mask.sum(1) if padded else None, masks)
         key_tokens, special_tokens = window
         if padded:
             # An item that has ended shifts its held frames out instead.
@@ -125,11 +148,14 @@ class Windows:
             key_tokens = _select(active, key_tokens, _shift_in(state.key_tokens, stride, axis=2))
             special_tokens = _select(active, special_tokens, _shift_in(state.special_tokens, stride, axis=1))
             window_mask = _select(active, window_mask, _shift_in(state.frame_mask, stride, axis=1))
+            if masks is not None and state.masks is not None:
+                masks = _select(active, masks, _shift_in(state.masks, stride, axis=1))
         out = self.decode_dense(
             variables,
             WindowTokens(key_tokens[:, :, :stride], special_tokens[:, :stride]),
             window_mask[:, :stride],
             image_size,
+            None if masks is None else masks[:, :stride],
         )
         state = WindowState(
             patch_tokens=patch_tokens[:, stride:],
@@ -138,13 +164,14 @@ class Windows:
             frame_mask=window_mask[:, stride:],
             image_size=image_size,
             step=state.step + 1,
+            masks=None if masks is None else masks[:, stride:],
         )
         return state, out
 
     def finish(self, variables: Variables, state: WindowState) -> WindowOutput:
         """The K − s frames that the last window still holds."""
         held = WindowTokens(state.key_tokens, state.special_tokens)
-        return self.decode_dense(variables, held, state.frame_mask, state.image_size)
+        return self.decode_dense(variables, held, state.frame_mask, state.image_size, state.masks)
 
     # A whole sequence.
 
@@ -153,6 +180,7 @@ class Windows:
         variables: Variables,
         images: jax.Array,
         frame_mask: jax.Array | None = None,
+        masks: jax.Array | None = None,
     ) -> WindowOutput:
         """All windows of sequences [B, T, H, W, 3] as one scan over `step`.
 
@@ -160,27 +188,30 @@ class Windows:
           variables: {"params": …}.
           images: [B, T, H, W, 3].
           frame_mask: bool [B, T]; None for all frames.
+          masks: bool [B, T, H, W], True for pixels that count; None for all pixels.
         """
         check_images(images, self.config.encoder.patch_size)
+        check_masks(images, masks)
         frame_mask = None if frame_mask is None else checked_mask(images, frame_mask)
         num_frames, stride, overlap = images.shape[1], self.config.windows.stride, self.overlap
         windows = num_windows(num_frames, self.config.windows.size, stride)
         padded = windows * stride + overlap
         all_real = frame_mask is None and padded == num_frames
 
-        def frames_from(first: jax.Array | int, count: int) -> tuple[jax.Array, jax.Array | None]:
+        def frames_from(first: jax.Array | int, count: int) -> tuple[jax.Array, jax.Array | None, jax.Array | None]:
             # A short tail repeats the last frame, masked, instead of padding a copy of all images.
             index = first + jnp.arange(count)
             clipped = jnp.minimum(index, num_frames - 1)
             frames = jnp.take(images, clipped, axis=1)
+            of_frames = None if masks is None else jnp.take(masks, clipped, axis=1)
             if all_real:
-                return frames, None
+                return frames, None, of_frames
             mask = jnp.broadcast_to(index < num_frames, frames.shape[:2])
-            return frames, mask if frame_mask is None else mask & jnp.take(frame_mask, clipped, axis=1)
+            mask = mask if frame_mask is None else mask & jnp.take(frame_mask, clipped, axis=1)
+            return frames, mask, of_frames
 
         def advance(state: WindowState, window: jax.Array) -> tuple[WindowState, WindowOutput]:
-            frames, mask = frames_from(window * stride + overlap, stride)
-            return self.step(variables, state, frames, mask)
+            return self.step(variables, state, *frames_from(window * stride + overlap, stride))
 
         state = self.start(variables, *frames_from(0, overlap))
         # Outputs live in buffers that the scan updates in place: stacked ones would be copied to put B first.
@@ -205,18 +236,26 @@ class Windows:
 
     # The parts of a step.
 
-    def encode(self, variables: Variables, images: jax.Array) -> jax.Array:
-        """Patch tokens [B, n, h * w, C] float32 of images [B, n, H, W, 3]; frames are independent."""
+    def encode(self, variables: Variables, images: jax.Array, masks: jax.Array | None = None) -> jax.Array:
+        """Patch tokens [B, n, h * w, C] float32 of images [B, n, H, W, 3]; frames are independent. Nothing of what
+        `masks`, bool [B, n, H, W], drops is in them."""
         params = variables["params"]["encoder"]
         if self.config.encoder.frozen:
             # At the source: nothing of the encoder's pass is then kept for a backward pass.
             params = jax.lax.stop_gradient(params)
         pixels = jnp.asarray(images, jnp.float32) / (255.0 if images.dtype == jnp.uint8 else 1.0)
-        tokens = run(self.encoder, params, pixels.reshape(-1, *images.shape[2:]))
+        pixels, seen = without_masked(pixels, masks), seen_patches(masks, self.config.encoder.patch_size)
+        of_each = None if seen is None else seen.reshape(-1, seen.shape[-1])
+        tokens = run(self.encoder, params, pixels.reshape(-1, *images.shape[2:]), of_each)
         return tokens.reshape(*images.shape[:2], *tokens.shape[1:])
 
     def attend(
-        self, variables: Variables, state: WindowState, patch_tokens: jax.Array, lengths: jax.Array | None = None
+        self,
+        variables: Variables,
+        state: WindowState,
+        patch_tokens: jax.Array,
+        lengths: jax.Array | None = None,
+        masks: jax.Array | None = None,
     ) -> WindowTokens:
         """All attention blocks over one window.
 
@@ -225,14 +264,21 @@ class Windows:
           state: of the stream before the window, whose cache the key layers see.
           patch_tokens: [B, K, h * w, C] of the window's frames.
           lengths: int32 [B], how many of the frames are real, always the first ones; None for all.
+          masks: bool [B, K, H, W] of the frames, where the state has masks.
         """
         is_first, grid = state.step == 0, self.grid(state.image_size)
-        params = variables["params"]["aggregator"]
-        tokens, _ = run(self.aggregator, params, patch_tokens, lengths, is_first, self._memory(state), grid=grid)
+        params, seen = variables["params"]["aggregator"], seen_patches(masks, self.config.encoder.patch_size)
+        memory = self._memory(state)
+        tokens, _ = run(self.aggregator, params, patch_tokens, lengths, is_first, memory, grid=grid, seen=seen)
         return tokens
 
     def decode_dense(
-        self, variables: Variables, tokens: WindowTokens, frame_mask: jax.Array, image_size: tuple[int, int]
+        self,
+        variables: Variables,
+        tokens: WindowTokens,
+        frame_mask: jax.Array,
+        image_size: tuple[int, int],
+        masks: jax.Array | None = None,
     ) -> WindowOutput:
         """Dense heads over the tokens of n frames, which are independent.
 
@@ -241,6 +287,7 @@ class Windows:
           tokens: key [B, key layers, n, P, 2C], special [B, n, 5, 2C].
           frame_mask: bool [B, n], handed on.
           image_size: (H, W).
+          masks: bool [B, n, H, W], False for pixels whose outputs are 0; None for none.
         """
         params, grid = variables["params"], self.grid(image_size)
         batch, num_levels, count = tokens.key.shape[:3]
@@ -256,10 +303,12 @@ class Windows:
             raw = _in_groups(frames, levels, max(1, _DENSE_PIXELS // math.prod(image_size)))
             return raw.reshape(batch, count, *raw.shape[1:])
 
-        depth, depth_confidence = depth_activation(dense(self.depth_head, "depth_head"))
+        maps = depth_activation(dense(self.depth_head, "depth_head"))
+        depth, depth_confidence = (zero_where_masked(x, masks) for x in maps)
         points = points_confidence = None
         if self.config.point_head is not None:
-            points, points_confidence = point_activation(dense(self.point_head, "point_head"))
+            maps = point_activation(dense(self.point_head, "point_head"))
+            points, points_confidence = (zero_where_masked(x, masks) for x in maps)
         return WindowOutput(
             depth=depth,
             depth_confidence=depth_confidence,
@@ -303,12 +352,14 @@ class Windows:
     def _memory(self, state: WindowState) -> CrossWindowMemory:
         """What the key layers see of the window before; before the first window nothing."""
         windows, width = self.config.windows, self.config.encoder.embed_dim
+        seen = seen_patches(state.masks, self.config.encoder.patch_size)
         # Key tokens hold the frame block's output, which is the global block's input, before that block's output.
         half = slice(width, None) if windows.cache == "output" else slice(None, width)
         return CrossWindowMemory(
             state.key_tokens[..., half],
             jnp.where(state.step == 0, 0, state.frame_mask.sum(1)),
             self.config.aggregator.key_layers if windows.cross_window else (),
+            None if seen is None else with_special(seen, 1 + self.config.aggregator.num_registers),
         )
 
     def _checked_group(self, frames: jax.Array, mask: jax.Array | None, count: int, name: str) -> jax.Array:

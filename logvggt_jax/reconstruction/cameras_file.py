@@ -38,6 +38,7 @@ def write_cameras(
     metric: bool = False,
     depth_scale: np.ndarray | None = None,
     loops: np.ndarray | None = None,
+    masked: Sequence[float] | None = None,
 ) -> None:
     """Writes all cameras as one JSON file.
 
@@ -57,6 +58,7 @@ def write_cameras(
       metric: whether lengths are metres.
       depth_scale: [N], by which the depth files' depth has to be multiplied to fit the cameras; None where it fits.
       loops: int [L, 2], the frames at which the sequence came back to a place; None where nobody looked for them.
+      masked: [N], the share of the depth maps' pixels that a mask drops; None where there were no masks.
     """
     frames: list[dict[str, Any]] = [
         {
@@ -66,6 +68,7 @@ def write_cameras(
             "intrinsics": intrinsics[i].tolist(),
             "depth_intrinsics": model_intrinsics[i].tolist(),
             **({} if depth_scale is None else {"depth_scale": float(depth_scale[i])}),
+            **({} if masked is None else {"masked": round(masked[i], 4)}),
         }
         for i, (name, timestamp) in enumerate(zip(names, timestamps, strict=True))
     ]
@@ -159,6 +162,8 @@ def _checked(document: Any) -> dict[str, Any]:
         where = f"of frame {index}, {name!r:.80},"
         frame["depth_scale"] = float(_numbers(frame.get("depth_scale", 1.0), (), f"the depth_scale {where}"))
         _require(frame["depth_scale"] > 0, f"the depth_scale {where} must be above 0")
+        frame["masked"] = float(_numbers(frame.get("masked", 0.0), (), f"masked {where}"))
+        _require(0 <= frame["masked"] <= 1, f"masked {where} must be a share, got {frame['masked']}")
         frame["timestamp"] = float(_numbers(frame.get("timestamp"), (), f"the timestamp {where}"))
         for key, shape in (("extrinsics", (3, 4)), ("intrinsics", (3, 3)), ("depth_intrinsics", (3, 3))):
             frame[key] = _numbers(frame.get(key), shape, f"the {key} {where}")

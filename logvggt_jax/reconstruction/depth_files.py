@@ -28,7 +28,7 @@ def write_depth(path: str | Path, depth: np.ndarray, confidence: np.ndarray) -> 
     """Writes an .npz file with `depth` and `confidence`, [H, W] float16.
 
     That is 11 bits (0.05 % of the depth, finer than the estimate); values beyond its range become 65504. Depth is
-    z-depth in the unit of the trajectory, confidence is at least 1.
+    z-depth in the unit of the trajectory, confidence is at least 1; both are 0 where a mask has dropped the pixel.
 
     Returns:
       Depth and confidence as `read_depth` will give them back.

@@ -26,13 +26,15 @@ _NARROWEST_FIELD_OF_VIEW = 0.01  # radians
 
 
 class Picture(NamedTuple):
-    """A frame at the model's size, uint8 [h, w, 3]."""
+    """A frame at the model's size, uint8 [h, w, 3]; where the source has masks with its own, bool [h, w], and without
+    what lies under it."""
 
     name: str
     timestamp: float
     image: np.ndarray
     transform: ResizeTransform
     focal_length: float | None = None
+    mask: np.ndarray | None = None
 
 
 class FrameWriter:
@@ -47,6 +49,7 @@ class FrameWriter:
       names, timestamps: of the frames that were added.
       transform: from the original images to the model's; None before the first frame.
       focal_length: pixels of the original images, as the camera noted it; None where it did not.
+      masked: of the frames that were added, the share of the pixels that their mask drops; empty without masks.
       images: of the frames whose depth is not final yet, by position in the sequence.
       health: measures of the frames that are written.
     """
@@ -55,6 +58,7 @@ class FrameWriter:
         self._folder, self._pool, self._selection = folder, pool, selection
         self.names: list[str] = []
         self.timestamps: list[float] = []
+        self.masked: list[float] = []
         self.transform: ResizeTransform | None = None
         self.focal_length: float | None = None
         self.images: dict[int, np.ndarray] = {}
@@ -67,6 +71,8 @@ class FrameWriter:
         self.images[len(self.names)] = picture.image
         self.names.append(picture.name)
         self.timestamps.append(picture.timestamp)
+        if picture.mask is not None:
+            self.masked.append(1 - float(picture.mask.mean()))
         self.transform, self.focal_length = picture.transform, picture.focal_length or self.focal_length
 
     def write(self, results: Sequence[FrameResult]) -> list[Path]:
@@ -120,6 +126,7 @@ class FrameWriter:
             source=source,
             depth_scale=cameras.depth_scale,
             loops=cameras.loops,
+            masked=self.masked or None,
         )
 
     def write_health(self, result: Reconstruction, predictor: Predictor) -> None:

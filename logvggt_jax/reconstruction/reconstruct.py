@@ -33,7 +33,7 @@ from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE
 from logvggt_jax.reconstruction.finishing import finish
 from logvggt_jax.reconstruction.frame_pool import FramePool
 from logvggt_jax.reconstruction.point_cloud import PointFilter, PointSelection
-from logvggt_jax.reconstruction.request import check_request
+from logvggt_jax.reconstruction.request import check_masks, check_request
 from logvggt_jax.reconstruction.result import Reconstruction
 from logvggt_jax.reconstruction.run import Run
 from logvggt_jax.reconstruction.sources import Source, open_source
@@ -71,7 +71,7 @@ def reconstruct(
     up. SIGTERM and SIGHUP save and end.
 
     Args:
-      source: folder of images or video; what `open_source` gives chooses among the frames.
+      source: folder of images or video; what `open_source` gives chooses among the frames, and has their masks.
       output: folder to make; it appears when all is done.
       model: the model.
       variables: {"params": …}.
@@ -97,6 +97,7 @@ def reconstruct(
     source = source if isinstance(source, Source) else open_source(source)
     calibration, point_filter = calibration or Calibration(), point_filter or PointFilter()
     target = check_request(source, output, longer_edge=longer_edge, overwrite=overwrite, calibration=calibration)
+    check_masks(source, method)
     request = {
         "version": importlib.metadata.version("logvggt-jax"),
         "jax": jax.__version__,
@@ -108,6 +109,8 @@ def reconstruct(
         "longer_edge": str(longer_edge),
         "point_filter": str(point_filter),
         "calibration": str(calibration),
+        # Left out where there are none, as by earlier versions, whose runs can be taken up.
+        **({} if source.masks is None else {"masks": str(source.masks.path.resolve())}),
     }
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Rate(), TimeRemainingColumn())
     console = Console(stderr=True)

@@ -54,6 +54,13 @@ def check_request(
     return target
 
 
+def check_masks(source: Source, method: str) -> None:
+    """Raises InputError where the source has masks and the method takes none."""
+    if source.masks is not None and not METHODS[method].takes_masks:
+        able = ", ".join(name for name, each in METHODS.items() if each.takes_masks)
+        raise InputError(f"--method {method} takes no masks: choose one of {able}, or leave --masks out")
+
+
 def disk_bytes(num_frames: int | None, size: tuple[int, int], point_filter: PointFilter) -> tuple[int, int]:
     """Bytes that a result of frames of `size` (h, w) needs on the disk: a frame, and in all (None: of one frame)."""
     height, width = size

@@ -44,6 +44,8 @@ class Reconstruction:
       depth_scale: [N] float64, by which the depth files' depth is multiplied where it is read, so that it fits the
         extrinsics.
       loops: pairs of frames at which the sequence came back to a place; None where nobody looked for them.
+      masked: [N] float64, the share of the depth maps' pixels that a mask has dropped, which have depth and confidence
+        0; zeros where there were no masks.
       seconds: from the first frame to the last depth map, compilation included; None for a folder opened later.
     """
 
@@ -62,6 +64,7 @@ class Reconstruction:
     skipped: tuple[str, ...] = ()
     noted_focal_length: float | None = None
     source: SourceRecord | None = None
+    masked: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
     seconds: float | None = None
 
     @classmethod
@@ -110,6 +113,7 @@ class Reconstruction:
             noted_focal_length=document["noted_focal_length"],
             skipped=tuple(frame["name"] for frame in document["skipped"]),
             source=document["source"],
+            masked=np.array([frame["masked"] for frame in frames], np.float64),
         )
 
     @property
@@ -123,11 +127,11 @@ class Reconstruction:
         return count_points(self.folder / POINTS_FILE)
 
     def depth(self, index: int) -> np.ndarray:
-        """Depth of a frame, [h, w] float32: z-depth in the unit of the extrinsics."""
+        """Depth of a frame, [h, w] float32: z-depth in the unit of the extrinsics, 0 where there is none."""
         return self.depth_and_confidence(index)[0]
 
     def confidence(self, index: int) -> np.ndarray:
-        """Confidence of a frame's depth, [h, w] float32, at least 1."""
+        """Confidence of a frame's depth, [h, w] float32, at least 1; 0 where a mask has dropped the pixel."""
         return self.depth_and_confidence(index)[1]
 
     def depth_and_confidence(self, index: int) -> tuple[np.ndarray, np.ndarray]:
@@ -184,6 +188,8 @@ class Reconstruction:
         notes = [] if self.complete else ["ended early: the same command goes on from here"]
         if self.skipped:
             notes.append(f"{len(self.skipped)} frames left out: {', '.join(map(printable, self.skipped[:5]))}")
+        if self.masked.any():
+            notes.append(f"masked: {self.masked.mean():.0%} of the pixels, which have no depth and no points")
         if self.loops is not None:
             pairs = ", ".join(f"{self.names[a]} with {self.names[b]}" for a, b in self.loops[:5])
             notes.append(f"loops closed: {len(self.loops)}" + (f" ({printable(pairs)})" if pairs else ""))

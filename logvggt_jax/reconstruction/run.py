@@ -15,6 +15,7 @@ from logvggt_jax.interruption import Interrupted, StopRequest
 from logvggt_jax.reconstruction.calibration import Calibration
 from logvggt_jax.reconstruction.frame_pool import FramePool
 from logvggt_jax.reconstruction.frame_writer import FrameWriter, Picture
+from logvggt_jax.reconstruction.masking import mask_at, without_masked
 from logvggt_jax.reconstruction.point_cloud import PointSelection
 from logvggt_jax.reconstruction.result import Reconstruction
 from logvggt_jax.reconstruction.sources import SkippedFrame, Source, SourceFrame
@@ -83,7 +84,8 @@ class Run:
             self.num_taken += 1
             if picture is not None:
                 self._frames.add(picture)
-                self._hand_on(self._predictor.push(picture.image))
+                mask = () if picture.mask is None else (picture.mask,)
+                self._hand_on(self._predictor.push(picture.image, *mask))
             advance()
             if stop.reason:
                 break
@@ -134,8 +136,10 @@ class Run:
         frame = load()
         if frame is None:
             return None
-        image, transform = resize(frame.image, longer_edge=self._longer_edge)
-        return Picture(frame.name, frame.timestamp, image, transform, frame.focal_length)
+        image = frame.image if frame.mask is None else without_masked(frame.image, frame.mask)
+        image, transform = resize(image, longer_edge=self._longer_edge)
+        mask = None if frame.mask is None else mask_at(frame.mask, transform.size)
+        return Picture(frame.name, frame.timestamp, image, transform, frame.focal_length, mask)
 
     def _hand_on(self, results: list[FrameResult]) -> None:
         self._files += self._frames.write(results)
@@ -154,6 +158,8 @@ class Run:
             "num_taken": self.num_taken,
             "names": self._frames.names,
             "timestamps": self._frames.timestamps,
+            "masked": self._frames.masked,
+            "masks": None if self._source.masks is None else self._source.masks.fingerprint(self._frames.names),
             "skipped": self._source.skipped,
             "focal_length": self._frames.focal_length,
             "size": None if self._frames.transform is None else self._frames.transform.original_size,
@@ -172,6 +178,13 @@ class Run:
                 f"{self._source.path} has changed since {self._work.path} was left unfinished: frames that were read "
                 "are other ones, or are taken otherwise; pass --overwrite to start anew"
             )
+        masks = self._source.masks
+        if (None if masks is None else masks.fingerprint(facts["names"])) != facts.get("masks"):
+            raise InputError(
+                f"the masks of frames that were read have changed since {self._work.path} was left unfinished; pass "
+                "--overwrite to start anew"
+            )
+        self._frames.masked = facts.get("masked", [])  # of earlier versions
         self._frames.focal_length = facts["focal_length"]
         self._frames.names, self._frames.timestamps = facts["names"], facts["timestamps"]
         self._source.skipped[:] = [SkippedFrame(*each) for each in facts["skipped"]]

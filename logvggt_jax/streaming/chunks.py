@@ -31,10 +31,11 @@ from logvggt_jax.streaming.results import (
     Progress,
     Signals,
     checked_frames,
+    checked_masks,
     device_memory,
 )
 
-PredictChunk = Callable[[np.ndarray], PlainPrediction]
+PredictChunk = Callable[..., PlainPrediction]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,32 +71,35 @@ class ChunkChain:
     predictions is held.
 
     Args:
-      predict: images [n, H, W, 3] of a chunk to its prediction, in a frame and unit of the chunk's own.
+      predict: images [n, H, W, 3] of a chunk, and their masks bool [n, H, W] where they have some, to its prediction,
+        in a frame and unit of the chunk's own.
       plan: sizes of the chunks.
     """
 
     def __init__(self, predict: PredictChunk, plan: ChunkPlan) -> None:
         self._predict, self._plan = predict, plan
         self._images: list[np.ndarray] = []
+        self._masks: list[np.ndarray] = []  # of the images; empty where there are none
         self._shared: PlainPrediction | None = None
         self._first = 0
         # Of every chunk but the first: the first frame that it adds, its scale and its residual, see `Signals`.
         self.joints: list[tuple[int, float, float]] = []
 
-    def push(self, image: np.ndarray) -> PlainPrediction | None:
-        """Takes the next image [H, W, 3]; the frames that became final with it, oldest first, if any.
+    def push(self, image: np.ndarray, mask: np.ndarray | None = None) -> PlainPrediction | None:
+        """Takes the next image [H, W, 3] and its mask; the frames that became final with it, oldest first, if any.
 
         Raises:
           PredictionError: a chunk cannot be aligned with the one before.
         """
         self._images.append(image)
+        self._masks += [] if mask is None else [mask]
         if len(self._images) < self._plan.size:
             return None
         chunk = self._next_chunk()
         step = self._plan.size - self._plan.overlap
         # A copy: a view would keep the whole chunk alive.
         self._shared = jax.tree.map(lambda x: x[step:].copy(), chunk)
-        self._images = self._images[step:]
+        self._images, self._masks = self._images[step:], self._masks[step:]
         self._first += step
         return jax.tree.map(lambda x: x[:step], chunk)
 
@@ -105,17 +109,19 @@ class ChunkChain:
             return None
         known = 0 if self._shared is None else self._plan.overlap
         last = self._shared if len(self._images) == known else self._next_chunk()
-        self._images, self._shared = [], None
+        self._images, self._masks, self._shared = [], [], None
         return last
 
     @property
     def held_bytes(self) -> int:
         """Bytes of the images held and of what the next chunk is aligned with."""
-        return sum(array.nbytes for array in (*self._images, *jax.tree.leaves(self._shared)))
+        return sum(array.nbytes for array in (*self._images, *self._masks, *jax.tree.leaves(self._shared)))
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The images held and the last chunk's prediction of those it shares, for `restore`."""
         arrays = {"images": np.stack(self._images), "first": np.array([self._first])} if self._images else {}
+        if self._masks:
+            arrays["masks"] = np.stack(self._masks)
         if self.joints:
             arrays["joints"] = np.array(self.joints, np.float64)
         shared = {} if self._shared is None else self._shared._asdict()
@@ -125,6 +131,7 @@ class ChunkChain:
         """Takes up what `arrays` gave."""
         if "images" in arrays:
             self._images, self._first = list(arrays["images"]), int(arrays["first"][0])
+            self._masks = list(arrays.get("masks", ()))
         if "joints" in arrays:
             self.joints = [(int(first), scale, apart) for first, scale, apart in arrays["joints"].tolist()]
         if "shared/depth" in arrays:
@@ -132,7 +139,7 @@ class ChunkChain:
             self._shared = PlainPrediction(**found)  # type: ignore[arg-type]
 
     def _next_chunk(self) -> PlainPrediction:
-        chunk = self._predict(np.stack(self._images))
+        chunk = self._predict(*(np.stack(arrays) for arrays in (self._images, self._masks) if arrays))
         if self._shared is None:
             return chunk
         shared = self._plan.overlap
@@ -174,6 +181,7 @@ class ChunkSession:
         self._patch_size, self._plan = model.config.encoder.patch_size, plan
         self._chain = ChunkChain(predict, plan)
         self._newest: np.ndarray | None = None
+        self._newest_mask: np.ndarray | None = None
         self._final = FinalFrames()
         self._loops: LoopCloser | None = None
         if (settings := loop_settings(plan.loops)) is not None:
@@ -194,24 +202,28 @@ class ChunkSession:
         """See `Predictor.state_bytes`: at most a chunk of images, and the prediction of an overlap."""
         return self._chain.held_bytes
 
-    def push(self, frames: np.ndarray | jax.Array | Sequence[np.ndarray]) -> list[FrameResult]:
+    def push(
+        self, frames: np.ndarray | jax.Array | Sequence[np.ndarray], masks: np.ndarray | None = None
+    ) -> list[FrameResult]:
         """Takes frames and returns those that became final; see `Predictor.push`."""
         if self._closed:
             raise ValueError("this stream is closed: make another ChunkSession for another sequence")
         results: list[FrameResult] = []
-        for frame in checked_frames(frames, patch_size=self._patch_size, before=self._newest):
-            self._newest = frame
+        frames = checked_frames(frames, patch_size=self._patch_size, before=self._newest)
+        masks = checked_masks(masks, frames, before=self._newest, mask_before=self._newest_mask)
+        for frame, mask in zip(frames, [None] * len(frames) if masks is None else masks, strict=True):
+            self._newest, self._newest_mask = frame, mask
             if self._loops is not None:
-                self._loops.see(frame)
+                self._loops.see(frame, mask)
             with self._memory():
-                results += self._handed_out(self._chain.push(frame))
+                results += self._handed_out(self._chain.push(frame, mask))
         return results
 
     def close(self, progress: Progress | None = None) -> list[FrameResult]:
         """Ends the stream: the frames still held; PredictionError where the last chunk does not fit the others."""
         if self._closed:
             return []
-        self._closed, self._newest = True, None
+        self._closed, self._newest, self._newest_mask = True, None, None
         with self._memory():
             results = self._handed_out(self._chain.close())
             if self._loops is not None and len(self._final):
@@ -232,6 +244,7 @@ class ChunkSession:
             self._loops.restore({name.removeprefix("loops/"): x for name, x in arrays.items() if name[:6] == "loops/"})
         if "images" in arrays:
             self._newest = arrays["images"][-1]
+            self._newest_mask = arrays["masks"][-1] if "masks" in arrays else None
 
     def cameras(self) -> Cameras:
         """Cameras of the frames handed out so far; all are final, but with loops, which change them at the end."""

@@ -27,6 +27,7 @@ from logvggt_jax.streaming.results import (
     checked_frames,
     decoded_cameras,
     device_memory,
+    refuse_masks,
 )
 from logvggt_jax.types import WindowOutput
 
@@ -124,8 +125,12 @@ class FrameSession:
         """Bytes of the device's memory that `state_bytes` lie in, empty places and all."""
         return sum(_bytes(cache) for cache in _caches(self._memory))
 
-    def push(self, frames: np.ndarray | jax.Array | Sequence[np.ndarray]) -> list[FrameResult]:
-        """Takes frames and returns those that became final; see `Predictor.push`."""
+    def push(
+        self, frames: np.ndarray | jax.Array | Sequence[np.ndarray], masks: np.ndarray | None = None
+    ) -> list[FrameResult]:
+        """Takes frames and returns those that became final; see `Predictor.push`. It takes no masks: caches do not know
+        which of their keys count."""
+        refuse_masks(masks, "windows, chunks or offline")
         if self._closed:
             raise ValueError("this stream is closed: open another one for another sequence")
         frames = checked_frames(frames, patch_size=self._model.config.encoder.patch_size, before=self._newest)

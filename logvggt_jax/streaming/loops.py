@@ -24,6 +24,7 @@ import numpy as np
 from logvggt_jax.config import require_counts, require_within
 from logvggt_jax.geometry import camera_centres, matrix_to_quaternion, scale_of, similarity_exp, similarity_log
 from logvggt_jax.model.logvggt import LogVGGT, Variables
+from logvggt_jax.model.masks import seen_patches
 from logvggt_jax.streaming.loop_check import check_loop
 from logvggt_jax.streaming.offline import PlainPrediction
 from logvggt_jax.streaming.pose_graph import Edges, optimise
@@ -77,9 +78,11 @@ def loop_settings(asked: LoopSettings | bool) -> LoopSettings | None:
 
 @dataclasses.dataclass
 class _Place:
-    """A frame that may be come back to; depth and confidence [h, w] on the grid come when they are final."""
+    """A frame that may be come back to, and its mask where it has one; depth and confidence [h, w] on the grid come
+    when they are final."""
 
     image: np.ndarray
+    mask: np.ndarray | None = None
     depth: np.ndarray | None = None
     confidence: np.ndarray | None = None
 
@@ -88,25 +91,25 @@ class LoopCloser:
     """Keeps a sequence's places, and closes its loops when it has ended.
 
     Args:
-      describe: images [n, H, W, 3] to descriptors [n, C].
-      predict: images [n, H, W, 3] to a prediction of all of them together.
+      describe: images [n, H, W, 3], and their masks bool [n, H, W] where they have some, to descriptors [n, C].
+      predict: the same to a prediction of all of them together.
       settings: how loops are looked for.
     """
 
     def __init__(
         self,
-        describe: Callable[[np.ndarray], np.ndarray],
-        predict: Callable[[np.ndarray], PlainPrediction],
+        describe: Callable[..., np.ndarray],
+        predict: Callable[..., PlainPrediction],
         settings: LoopSettings,
     ) -> None:
         self._describe, self._predict, self._settings = describe, predict, settings
         self._places: dict[int, _Place] = {}
         self._spacing, self._seen = settings.spacing, 0
 
-    def see(self, image: np.ndarray) -> None:
-        """Takes the next frame's image [H, W, 3]."""
+    def see(self, image: np.ndarray, mask: np.ndarray | None = None) -> None:
+        """Takes the next frame's image [H, W, 3] and mask bool [H, W]; all frames have one, or none has."""
         if self._seen % self._spacing == 0:
-            self._places[self._seen] = _Place(image.copy())
+            self._places[self._seen] = _Place(image.copy(), None if mask is None else mask.copy())
         self._seen += 1
         if len(self._places) > self._settings.max_places:
             self._spacing *= 2
@@ -155,7 +158,8 @@ class LoopCloser:
             return arrays
         known = {index: place for index, place in self._places.items() if place.depth is not None}
         arrays["indices"] = np.array(list(self._places))
-        arrays["images"] = np.stack([place.image for place in self._places.values()])
+        images, *masks = _stacked(list(self._places.values()))
+        arrays |= {"images": images, **({"masks": masks[0]} if masks else {})}
         arrays["known"] = np.array(list(known), np.int64)
         for name in ("depth", "confidence") if known else ():
             arrays[name] = np.stack([getattr(place, name) for place in known.values()])
@@ -166,8 +170,9 @@ class LoopCloser:
         self._seen, self._spacing = (int(count) for count in arrays["counts"])
         if "indices" not in arrays:
             return
-        images = zip(arrays["indices"].tolist(), arrays["images"], strict=True)
-        self._places = {index: _Place(image) for index, image in images}
+        masks = arrays.get("masks", [None] * len(arrays["images"]))
+        places = zip(arrays["indices"].tolist(), arrays["images"], masks, strict=True)
+        self._places = {index: _Place(image, mask) for index, image, mask in places}
         for position, index in enumerate(arrays["known"].tolist()):
             place = self._places[index]
             place.depth, place.confidence = arrays["depth"][position], arrays["confidence"][position]
@@ -175,17 +180,18 @@ class LoopCloser:
     def _loops(self, cameras: Cameras) -> list[tuple[tuple[int, int], np.ndarray]]:
         """Loops that passed: frames of both ends, and what carries the world at the second onto that at the first."""
         indices = np.array(list(self._places))
-        images = [place.image for place in self._places.values()]
-        parts = [images[start : start + _AT_ONCE] for start in range(0, len(images), _AT_ONCE)]
+        places = list(self._places.values())
+        parts = [places[start : start + _AT_ONCE] for start in range(0, len(places), _AT_ONCE)]
         # The last call is filled up, so that one program describes all.
-        described = [self._describe(np.stack(part + part[-1:] * (_AT_ONCE - len(part))))[: len(part)] for part in parts]
+        filled = [part + part[-1:] * (_AT_ONCE - len(part)) for part in parts]
+        described = [self._describe(*_stacked(full))[: len(part)] for part, full in zip(parts, filled, strict=True)]
         size = min(self._settings.frames, len(indices) // 2)
         gap = max(self._settings.gap, 2 * size * self._spacing)
         found = []
         for ends in candidates(np.concatenate(described), indices, self._settings, gap=gap):
             around = [indices[_around(end, size, len(indices))] for end in ends]
             own = [self._own(each, cameras) for each in around]
-            joint = self._predict(np.stack([self._places[index].image for index in np.concatenate(around)]))
+            joint = self._predict(*_stacked([self._places[index] for index in np.concatenate(around)]))
             check = check_loop(_on_grid(joint), *own)
             pair = int(indices[ends[0]]), int(indices[ends[1]])
             if check.passed and pair[0] // self._settings.stretch != pair[1] // self._settings.stretch:
@@ -218,14 +224,26 @@ class LoopCloser:
         return nodes
 
 
-def frame_describer(model: LogVGGT, variables: Variables) -> Callable[[np.ndarray], np.ndarray]:
-    """Images [n, H, W, 3] to descriptors [n, C] float32: the mean of the encoder's patch tokens."""
-    return lambda images: np.asarray(_pooled(model, variables, images))
+def _stacked(places: list[_Place]) -> list[np.ndarray]:
+    """The places' images [n, H, W, 3], and their masks [n, H, W] where they have some."""
+    masks = [place.mask for place in places if place.mask is not None]
+    return [np.stack(arrays) for arrays in ([place.image for place in places], masks) if arrays]
+
+
+def frame_describer(model: LogVGGT, variables: Variables) -> Callable[..., np.ndarray]:
+    """Images [n, H, W, 3], and masks bool [n, H, W] where there are some, to descriptors [n, C] float32: the mean of
+    the encoder's tokens of the patches that are seen."""
+    return lambda images, masks=None: np.asarray(_pooled(model, variables, images, masks))
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _pooled(model: LogVGGT, variables: Variables, images: jax.Array) -> jax.Array:
-    return jnp.mean(model.windows.encode(variables, images[None])[0], axis=1)
+def _pooled(model: LogVGGT, variables: Variables, images: jax.Array, masks: jax.Array | None) -> jax.Array:
+    if masks is None:
+        return jnp.mean(model.windows.encode(variables, images[None])[0], axis=1)
+    tokens = model.windows.encode(variables, images[None], masks[None])[0]
+    seen = seen_patches(masks, model.config.encoder.patch_size)
+    assert seen is not None  # of masks
+    return jnp.sum(tokens * seen[..., None], axis=1) / jnp.maximum(seen.sum(1), 1)[:, None]
 
 
 def candidates(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -17,6 +18,7 @@ from logvggt_jax.model.merging import TokenMerging, merging_of
 from logvggt_jax.model.parameters import run
 from logvggt_jax.streaming.offline import OfflineSession, OfflineSettings, PlainPrediction, plain_vggt
 from logvggt_jax.streaming.program import Program, abstract_variables, flops_of
+from logvggt_jax.streaming.results import FrameResult, refuse_masks
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,7 +56,14 @@ class MergedSession(OfflineSession):
         super().__init__(model, variables, settings)
         self._merging = settings
 
-    def _predict(self, images: np.ndarray) -> PlainPrediction:
+    def push(
+        self, frames: np.ndarray | jax.Array | Sequence[np.ndarray], masks: np.ndarray | None = None
+    ) -> list[FrameResult]:
+        """Takes frames; see `Predictor.push`. It takes no masks: what is merged stands for all that went into it."""
+        refuse_masks(masks, "offline")
+        return super().push(frames)
+
+    def _predict(self, images: np.ndarray, masks: np.ndarray | None) -> PlainPrediction:
         return predict_merged(self._model, self._variables, images, self._merging)
 
 

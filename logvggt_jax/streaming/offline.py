@@ -22,6 +22,7 @@ from logvggt_jax.streaming.results import (
     Progress,
     Signals,
     checked_frames,
+    checked_masks,
     device_memory,
 )
 
@@ -30,8 +31,8 @@ class PlainPrediction(NamedTuple):
     """What plain VGGT predicts of n frames, numpy arrays in one world and one unit of length.
 
     Attributes:
-      depth: [n, H, W] z-depth.
-      depth_confidence: [n, H, W], at least 1.
+      depth: [n, H, W] z-depth; 0 where a mask drops the pixel.
+      depth_confidence: [n, H, W], at least 1; likewise.
       extrinsics: [n, 3, 4], world-to-camera (OpenCV).
       intrinsics: [n, 3, 3], pixels of the images.
       points: [n, H, W, 3] in the world; None without point head.
@@ -59,20 +60,25 @@ def plain_vggt(model: LogVGGT, num_frames: int) -> LogVGGT:
     return LogVGGT(dataclasses.replace(model.config, windows=windows, refinement=refinement))
 
 
-def predict_plain(model: LogVGGT, variables: Variables, images: np.ndarray) -> PlainPrediction:
+def predict_plain(
+    model: LogVGGT, variables: Variables, images: np.ndarray, masks: np.ndarray | None = None
+) -> PlainPrediction:
     """Plain VGGT's prediction of images [n, H, W, 3], in the frame of the first; compiled once for each n.
 
     Args:
       model: whose parts are used; its windows are not.
       variables: {"params": …}.
       images: uint8, or floating point in [0, 1].
+      masks: bool [n, H, W], see `LogVGGT.apply`; None for none.
     """
-    return jax.device_get(_predict(plain_vggt(model, len(images)), variables, images))
+    return jax.device_get(_predict(plain_vggt(model, len(images)), variables, images, masks))
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _predict(model: LogVGGT, variables: Variables, images: jax.Array) -> PlainPrediction:
-    predictions = model.apply(variables, images[None])
+def _predict(
+    model: LogVGGT, variables: Variables, images: jax.Array, masks: jax.Array | None = None
+) -> PlainPrediction:
+    predictions = model.apply(variables, images[None], masks=None if masks is None else masks[None])
     wanted = {name: getattr(predictions, name) for name in PlainPrediction._fields}
     return jax.tree.map(lambda x: x[0], PlainPrediction(**wanted))
 
@@ -166,6 +172,7 @@ class OfflineSession:
         self._model, self._settings = model, settings
         self._variables = jax.device_put(in_compute_type(variables, model.config))
         self._images: list[np.ndarray] = []
+        self._masks: list[np.ndarray] = []  # of the images; empty where there are none
         self._final = FinalFrames()
         self._closed = False
 
@@ -177,14 +184,20 @@ class OfflineSession:
     @property
     def state_bytes(self) -> int:
         """See `Predictor.state_bytes`: the images, all of them until the end."""
-        return sum(image.nbytes for image in self._images)
+        return sum(array.nbytes for array in (*self._images, *self._masks))
 
-    def push(self, frames: np.ndarray | jax.Array | Sequence[np.ndarray]) -> list[FrameResult]:
+    def push(
+        self, frames: np.ndarray | jax.Array | Sequence[np.ndarray], masks: np.ndarray | None = None
+    ) -> list[FrameResult]:
         """Takes frames; see `Predictor.push`. Raises PredictionError for more than `max_frames`."""
         if self._closed:
             raise ValueError(f"this sequence is closed: make another {type(self).__name__} for another one")
         before = self._images[-1] if self._images else None
-        self._images += list(checked_frames(frames, patch_size=self._model.config.encoder.patch_size, before=before))
+        frames = checked_frames(frames, patch_size=self._model.config.encoder.patch_size, before=before)
+        mask_before = self._masks[-1] if self._masks else None
+        masks = checked_masks(masks, frames, before=before, mask_before=mask_before)
+        self._images += list(frames)
+        self._masks += [] if masks is None else list(masks)
         limit = self._settings.max_frames
         if limit is not None and len(self._images) > limit:
             raise PredictionError(
@@ -195,25 +208,26 @@ class OfflineSession:
 
     def close(self, progress: Progress | None = None) -> list[FrameResult]:
         """Predicts all frames at once."""
-        images, self._images, self._closed = self._images, [], True
+        images, masks, self._images, self._masks, self._closed = self._images, self._masks, [], [], True
         if not images:
             return []
         height, width = images[0].shape[:2]
         with device_memory(
             f"full attention over {len(images)} frames of {height} x {width} pixels", "take fewer or smaller frames"
         ):
-            return self._final.add(self._predict(np.stack(images)))
+            return self._final.add(self._predict(np.stack(images), np.stack(masks) if masks else None))
 
-    def _predict(self, images: np.ndarray) -> PlainPrediction:
-        return predict_plain(self._model, self._variables, images)
+    def _predict(self, images: np.ndarray, masks: np.ndarray | None) -> PlainPrediction:
+        return predict_plain(self._model, self._variables, images, masks)
 
     def snapshot(self) -> tuple[list[FrameResult], dict[str, np.ndarray]]:
         """See `Predictor.snapshot`: the frames, since nothing is computed before the end."""
-        return [], {"images": np.stack(self._images)} if self._images else {}
+        arrays = {"images": self._images, "masks": self._masks}
+        return [], {name: np.stack(values) for name, values in arrays.items() if values}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """See `Predictor.restore`."""
-        self._images = list(arrays.get("images", ()))
+        self._images, self._masks = list(arrays.get("images", ())), list(arrays.get("masks", ()))
 
     def cameras(self) -> Cameras:
         """Cameras of the frames handed out so far."""

@@ -46,14 +46,19 @@ class Predictor(Protocol):
         """
         ...
 
-    def push(self, frames: np.ndarray | jax.Array | Sequence[np.ndarray]) -> list[FrameResult]:
+    def push(
+        self, frames: np.ndarray | jax.Array | Sequence[np.ndarray], masks: np.ndarray | None = None
+    ) -> list[FrameResult]:
         """Takes frames and returns those that became final, oldest first.
 
         Args:
           frames: one frame [H, W, 3] or several [n, H, W, 3], uint8 or floating point in [0, 1]; H and W are
             multiples of the patch size and the same in every call, as is the dtype.
+          masks: bool [H, W] of all these frames or [n, H, W], True for pixels that count; see `LogVGGT.apply`. A
+            sequence has masks for all frames or for none.
 
         Raises:
+          InputError: masks, and a method that takes none, see `Method.takes_masks`.
           ValueError: another shape or dtype, or the sequence is closed.
           PredictionError: the method cannot go on, for want of memory or of an alignment.
         """
@@ -99,6 +104,7 @@ class Method(NamedTuple):
       summary: what the method does, in a few words.
       program: model, (H, W) of the images, settings and number of frames (None: not known) to the program in which the
         method spends its time.
+      takes_masks: whether `push` takes masks of pixels that are not to be seen.
     """
 
     title: str
@@ -107,6 +113,7 @@ class Method(NamedTuple):
     trained_for: str
     summary: str
     program: Callable[[LogVGGT, tuple[int, int], Any, int | None], Program]
+    takes_masks: bool = False
 
 
 METHODS: dict[str, Method] = {
@@ -117,6 +124,7 @@ METHODS: dict[str, Method] = {
         "windows",
         "overlapping windows that hand tokens on, poses refined globally",
         window_program,
+        takes_masks=True,
     ),
     "offline": Method(
         "VGGT offline",
@@ -125,6 +133,7 @@ METHODS: dict[str, Method] = {
         "vggt",
         "all frames in one window of full global attention",
         offline_program,
+        takes_masks=True,
     ),
     "chunks": Method(
         "VGGT on chunks",
@@ -133,6 +142,7 @@ METHODS: dict[str, Method] = {
         "vggt",
         "overlapping chunks without memory, chained by robust similarities",
         chunk_program,
+        takes_masks=True,
     ),
     "merged": Method(
         "FastVGGT",

@@ -26,9 +26,9 @@ class FrameResult:
 
     Attributes:
       index: position in the stream, from 0.
-      depth: [H, W] float32, z-depth in the unit of the poses' translations. Where loops are closed when the sequence
-        ends, `Cameras.depth_scale` then says by which factor it changes.
-      confidence: [H, W] float32, at least 1.
+      depth: [H, W] float32, z-depth in the unit of the poses' translations; 0 where a mask drops the pixel. Where loops
+        are closed when the sequence ends, `Cameras.depth_scale` then says by which factor it changes.
+      confidence: [H, W] float32, at least 1; 0 where a mask drops the pixel.
       pose_encoding: [9] float32, see `logvggt_jax.geometry.decode_poses`; None while the frame has no pose.
       pose_is_final: whether `pose_encoding` stays as it is.
       points: [H, W, 3] float32 in the first camera's frame; None without point head.
@@ -128,6 +128,46 @@ def checked_frames(
             f"frames of a stream must be alike: {before.dtype} {before.shape} before, now {frames.dtype} {shape[1:]}"
         )
     return frames
+
+
+def checked_masks(
+    masks: np.ndarray | jax.Array | None,
+    frames: np.ndarray,
+    *,
+    before: np.ndarray | None,
+    mask_before: np.ndarray | None,
+) -> np.ndarray | None:
+    """Masks bool [n, H, W] of frames [n, H, W, 3], of one mask [H, W] or as many; None for frames without.
+
+    Args:
+      masks: bool, True for pixels that count.
+      frames: that they are of.
+      before: an earlier frame of the same stream; None where there was none.
+      mask_before: its mask.
+
+    Raises:
+      ValueError: another shape or dtype, or a stream of which some frames have masks and others none.
+    """
+    if before is not None and (masks is None) != (mask_before is None):
+        raise ValueError(
+            "a stream has masks for all frames or for none: give masks that are True everywhere for frames without"
+        )
+    if masks is None:
+        return None
+    masks = np.asarray(masks)
+    size = frames.shape[:3]
+    if masks.dtype != np.bool_ or masks.shape not in (size, size[1:]):
+        raise ValueError(
+            f"masks must be bool {list(size)} or {list(size[1:])} for these frames, got {masks.dtype} "
+            f"{list(masks.shape)}"
+        )
+    return np.broadcast_to(masks, size)
+
+
+def refuse_masks(masks: object, instead: str) -> None:
+    """For methods that take none: InputError where there are masks, with what to take `instead`."""
+    if masks is not None:
+        raise InputError(f"this method takes no masks: take {instead}")
 
 
 @contextlib.contextmanager

@@ -29,6 +29,7 @@ from logvggt_jax.streaming.results import (
     Progress,
     Signals,
     checked_frames,
+    checked_masks,
     decoded_cameras,
     device_memory,
 )
@@ -39,18 +40,25 @@ from logvggt_jax.types import WindowOutput
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _start(model: LogVGGT, variables: Variables, frames: jax.Array, mask: jax.Array | None) -> WindowState:
-    return model.start(variables, frames, mask)
+def _start(
+    model: LogVGGT, variables: Variables, frames: jax.Array, mask: jax.Array | None, masks: jax.Array | None = None
+) -> WindowState:
+    return model.start(variables, frames, mask, masks)
 
 
 @functools.partial(jax.jit, static_argnums=0, donate_argnums=2)
 def _step(
-    model: LogVGGT, variables: Variables, state: WindowState, frames: jax.Array, mask: jax.Array | None
+    model: LogVGGT,
+    variables: Variables,
+    state: WindowState,
+    frames: jax.Array,
+    mask: jax.Array | None,
+    masks: jax.Array | None = None,
 ) -> tuple[WindowState, WindowOutput, jax.Array]:
     """The step, and how far apart the two copies are of each frame [B, s] that becomes final, as a fraction of its
     camera token's norm; NaN for a frame that was in one window alone."""
     before = state.special_tokens[:, :, 0]
-    state_after, output = model.step(variables, state, frames, mask)
+    state_after, output = model.step(variables, state, frames, mask, masks)
     twice = min(before.shape[1], output.camera_tokens.shape[1])
     change = relative_change(before[:, :twice], output.camera_tokens[:, :twice])
     change = jnp.where((state.step == 0)[:, None], jnp.nan, change)
@@ -84,6 +92,13 @@ def _without_refinement(model: LogVGGT) -> LogVGGT:
     know nothing of it."""
     plain = dataclasses.replace(model.config.refinement, enabled=True, period=None, context=None, max_registers=None)
     return LogVGGT(dataclasses.replace(model.config, refinement=plain))
+
+
+class _Frame(NamedTuple):
+    """A frame [H, W, 3] and its mask bool [H, W], where it has one."""
+
+    image: np.ndarray
+    mask: np.ndarray | None
 
 
 class _Flight(NamedTuple):
@@ -165,10 +180,10 @@ class StreamSession:
             first_capacity=self._settings.first_capacity,
             late=(self._settings.ahead + 1) * model.config.windows.size,
         )
-        self._pending: list[np.ndarray] = []
+        self._pending: list[_Frame] = []
         self._state: WindowState | None = None
         self._flights: deque[_Flight] = deque()
-        self._newest: np.ndarray | None = None
+        self._newest: _Frame | None = None
         self._image_size = (1, 1)  # (H, W), known with the first frame
         self._received = 0
         # When the frames came that are not handed out yet; None for those of a snapshot.
@@ -194,15 +209,19 @@ class StreamSession:
     @property
     def state_bytes(self) -> int:
         """See `Predictor.state_bytes`: cache and held tokens, compact tokens, and frames not yet in a window."""
-        arrays = (*jax.tree.leaves(self._state), *self._pending)
+        arrays = jax.tree.leaves((self._state, self._pending))
         return self._poses.filled_bytes + sum(array.nbytes for array in arrays)
 
-    def push(self, frames: np.ndarray | jax.Array | Sequence[np.ndarray]) -> list[FrameResult]:
+    def push(
+        self, frames: np.ndarray | jax.Array | Sequence[np.ndarray], masks: np.ndarray | None = None
+    ) -> list[FrameResult]:
         """Takes frames and returns those that became final, oldest first.
 
         Args:
           frames: one frame [H, W, 3] or several [n, H, W, 3], uint8 or floating point in [0, 1]; H and W are
             multiples of the patch size and the same in every call, as is the dtype.
+          masks: bool [H, W] of all these frames or [n, H, W], True for pixels that count; see `LogVGGT.apply`. A
+            sequence has masks for all frames or for none.
 
         Raises:
           ValueError: another shape or dtype, or the session is closed.
@@ -210,17 +229,19 @@ class StreamSession:
         """
         if self._closed:
             raise ValueError("this stream is closed: make another StreamSession for another sequence")
-        frames = checked_frames(frames, patch_size=self._model.config.encoder.patch_size, before=self._newest)
+        before, mask_before = (None, None) if self._newest is None else self._newest
+        frames = checked_frames(frames, patch_size=self._model.config.encoder.patch_size, before=before)
+        masks = checked_masks(masks, frames, before=before, mask_before=mask_before)
         self._image_size = (frames.shape[1], frames.shape[2])
         results: list[FrameResult] = []
         with self._memory():
-            for frame in frames:
-                self._pending.append(frame)
-                self._newest = frame
+            for image, mask in zip(frames, [None] * len(frames) if masks is None else masks, strict=True):
+                self._newest = _Frame(image, mask)
+                self._pending.append(self._newest)
                 self._received += 1
                 self._arrivals.append(time.monotonic())
                 if self._loops is not None:
-                    self._loops.see(frame)
+                    self._loops.see(image, mask)
                 if self._advance():
                     results += self._landed(self._settings.ahead)
         return results
@@ -279,15 +300,19 @@ class StreamSession:
             return results, {}
         arrays = {f"tokens/{name}": array for name, array in self._poses.arrays().items()}
         if self._state is not None:
-            fields = dataclasses.fields(self._state)
-            arrays |= {f"state/{field.name}": np.asarray(getattr(self._state, field.name)) for field in fields}
+            values = {field.name: getattr(self._state, field.name) for field in dataclasses.fields(self._state)}
+            arrays |= {f"state/{name}": np.asarray(value) for name, value in values.items() if value is not None}
         if self._pending:
-            arrays["pending"] = np.stack(self._pending)
+            arrays["pending"] = np.stack([frame.image for frame in self._pending])
+        if self._newest.mask is not None:
+            arrays["newest_mask"] = self._newest.mask
+        if masks := [frame.mask for frame in self._pending if frame.mask is not None]:
+            arrays["pending_masks"] = np.stack(masks)
         if self._loops is not None:
             arrays |= {f"loops/{name}": array for name, array in self._loops.arrays().items()}
         return results, {
             **arrays,
-            "newest": self._newest,
+            "newest": self._newest.image,
             "counts": np.array((self._received, self._handed_out), np.int64),
             "final": self._final.array.copy(),
             "overlap": self._overlap.array.copy(),
@@ -297,9 +322,10 @@ class StreamSession:
         """See `Predictor.restore`."""
         if not arrays:
             return
-        self._newest = arrays["newest"]
-        self._image_size = (self._newest.shape[0], self._newest.shape[1])
-        self._pending = list(arrays.get("pending", ()))
+        self._newest = _Frame(arrays["newest"], arrays.get("newest_mask"))
+        self._image_size = arrays["newest"].shape[:2]
+        pending = arrays.get("pending", ())
+        self._pending = list(map(_Frame, pending, arrays.get("pending_masks", [None] * len(pending))))
         self._received, self._handed_out = (int(count) for count in arrays["counts"])
         self._arrivals = deque([None] * (self._received - self._handed_out))
         self._final, self._overlap = Rows(arrays["final"]), Rows(arrays["overlap"])
@@ -367,24 +393,30 @@ class StreamSession:
         self._one_step()
         return True
 
-    def _take(self, count: int) -> tuple[jax.Array, jax.Array | None]:
-        """The next `count` pending frames [1, count, H, W, 3]; a short rest repeats the last and comes with a mask."""
+    def _take(self, count: int) -> tuple[jax.Array, jax.Array | None, jax.Array | None]:
+        """The next `count` pending frames [1, count, H, W, 3], which of them count where not all do (a short rest
+        repeats the last), and their masks [1, count, H, W] where they have some."""
         frames, self._pending = self._pending[:count], self._pending[count:]
-        if len(frames) == count:
-            return jnp.asarray(np.stack(frames)[None]), None
-        assert self._newest is not None
-        mask = np.arange(count) < len(frames)
-        frames += [self._newest] * (count - len(frames))
-        return jnp.asarray(np.stack(frames)[None]), jnp.asarray(mask[None])
+        real = None
+        if len(frames) < count:
+            assert self._newest is not None
+            real = jnp.asarray((np.arange(count) < len(frames))[None])
+            frames += [self._newest] * (count - len(frames))
+        images, masks = zip(*frames, strict=True)
+        return (
+            jnp.asarray(np.stack(images)[None]),
+            real,
+            None if masks[0] is None else jnp.asarray(np.stack(masks)[None]),
+        )
 
     def _begin(self) -> None:
         config = self._model.config.windows
         self._state = _start(self._windows, self._variables, *self._take(config.size - config.stride))
 
     def _one_step(self) -> None:
-        frames, mask = self._take(self._model.config.windows.stride)
+        frames = self._take(self._model.config.windows.stride)
         assert self._state is not None
-        self._state, out, change = _step(self._windows, self._variables, self._state, frames, mask)
+        self._state, out, change = _step(self._windows, self._variables, self._state, *frames)
         self._take_off(out, change)
 
     def _take_off(

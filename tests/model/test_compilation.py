@@ -20,12 +20,12 @@ ATTENTIONS = 3 * 24
 GIB = 2**30
 
 
-def described(target: str) -> str:
+def described(target: str, *options: str) -> str:
     """What the script prints of one target; shown with the test's report."""
     own = ("XLA_FLAGS", "JAX_PLATFORMS", "JAX_NUM_CPU_DEVICES")
     environment = {name: value for name, value in os.environ.items() if name not in own}
     finished = subprocess.run(
-        [sys.executable, str(SCRIPT), "--target", target],
+        [sys.executable, str(SCRIPT), "--target", target, *options],
         capture_output=True,
         text=True,
         timeout=1200,
@@ -58,8 +58,10 @@ def test_compiles_for_a_described_tpu_with_the_flash_kernel(topology: str, memor
 
 
 @pytest.mark.slow
-def test_lowers_for_cuda_with_cudnn_attention() -> None:
-    line = described("cuda")
+@pytest.mark.parametrize("options", [(), ("--masks",)])
+def test_lowers_for_cuda_with_cudnn_attention(options: tuple[str, ...]) -> None:
+    """Also where masks say which keys count."""
+    line = described("cuda", *options)
     assert figure(r"(\d+) calls of cuDNN attention", line) >= ATTENTIONS
 
 

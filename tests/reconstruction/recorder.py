@@ -63,10 +63,13 @@ class Recorder:
         return Signals.unknown(self.num_frames)
 
 
-def reconstruct_recorded(predictor: Predictor, source: Source | Path, output: Path, **options: Any) -> Reconstruction:
+def reconstruct_recorded(
+    predictor: Predictor, source: Source | Path, output: Path, *, takes_masks: bool = False, **options: Any
+) -> Reconstruction:
     """A reconstruction by a method whose predictor this is."""
     with pytest.MonkeyPatch.context() as patch:
-        method = Method("recorder", lambda *_: predictor, WindowSettings, "windows", "records", window_program)
+        facts = ("windows", "records", window_program, takes_masks)
+        method = Method("recorder", lambda *_: predictor, WindowSettings, *facts)
         patch.setitem(METHODS, "recorder", method)
         return reconstruct(
             source,

@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 
 from logvggt_jax.data.feeding.transforms import ResizeTransform
+from logvggt_jax.reconstruction.depth_files import write_picture
 from logvggt_jax.reconstruction.exporters.frame_names import file_stems
 from logvggt_jax.reconstruction.exporters.libraries import library
 from logvggt_jax.reconstruction.exporters.pictures import Pictures
 from logvggt_jax.reconstruction.exporters.tracks import Tracks, find_tracks
+from logvggt_jax.reconstruction.frame_pool import FramePool
 from logvggt_jax.reconstruction.point_cloud import PointFilter
 from logvggt_jax.reconstruction.result import Reconstruction
 
@@ -27,6 +29,7 @@ def export_colmap(
 ) -> None:
     """Fills a folder with `images/` and the model `sparse/0/`: cameras, poses, and a cloud with its observations.
 
+    Where the result has masks, `masks/` has one for each image, `NAME.jpg.png`, black where nothing is to be seen.
     Cameras are PINHOLE at the size of the pictures, one for frames of equal intrinsics; the centre of the first pixel
     is at (0.5, 0.5), as COLMAP has it.
 
@@ -51,9 +54,25 @@ def export_colmap(
     folder.mkdir(parents=True)
     model.write_text(folder) if text else model.write_binary(folder)
     pictures.write(path / "images", file_stems(result.names), progress=progress)
+    if result.masked.any():
+        _write_masks(result, path / "masks", files, pictures.size)
 
 
 export_colmap_text = partial(export_colmap, text=True)
+
+
+def _write_masks(result: Reconstruction, folder: Path, files: list[str], size: tuple[int, int]) -> None:
+    """A mask for each picture of `size`; those of the result are enlarged by their nearest pixels."""
+    folder.mkdir()
+    transform = ResizeTransform(original_size=size, size=result.depth_size)
+
+    def write(index: int) -> None:
+        kept = transform.depth_to_original(result.confidence(index) != 0)
+        write_picture(folder / f"{files[index]}.png", np.where(kept, np.uint8(255), np.uint8(0)))
+
+    with FramePool() as pool:
+        for _ in pool.map(write, iter(range(len(files)))):
+            pass
 
 
 def build_model(

@@ -96,6 +96,7 @@ def write_derived(
             skipped=[(name, "left out of the result that this one is made from") for name in result.skipped],
             source=result.source,
             metric=metric,
+            masked=result.masked[list(frames)].tolist() if result.masked.any() else None,
         )
         made = Reconstruction.with_cameras_of(folder)
         # Of the same frames: depths have changed, and so has what their scale says.

@@ -41,6 +41,9 @@ def look(image: np.ndarray, depth: np.ndarray, confidence: np.ndarray) -> Look:
     """
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     height, width = grey.shape
+    kept = confidence != 0
+    if not kept.all():  # a mask has dropped the others, and they must not pass for light and detail
+        grey[~kept] = grey[kept].mean() if kept.any() else 0
     fine = grey.astype(np.float32)
     coarse = cv2.resize(fine, (-(-width // _COARSE), -(-height // _COARSE)), interpolation=cv2.INTER_AREA)
     light = (float(fine.mean()) + 1.0) ** 2
@@ -50,11 +53,11 @@ def look(image: np.ndarray, depth: np.ndarray, confidence: np.ndarray) -> Look:
     cells = depth[np.ix_(rows, columns)]
     numbers = (
         fine.mean() / 255,
-        np.mean(grey <= _DARK),
-        np.mean(grey >= _BRIGHT),
+        np.mean(grey[kept] <= _DARK) if kept.any() else np.nan,
+        np.mean(grey[kept] >= _BRIGHT) if kept.any() else np.nan,
         cv2.Laplacian(fine, cv2.CV_32F).var() / light,
         slopes / light,
-        np.median(confidence),
+        np.median(confidence[kept]) if kept.any() else np.nan,
         np.median(depth[valid]) if valid.any() else np.nan,
     )
     return Look(

@@ -8,6 +8,7 @@ from typing import Any
 from logvggt_jax.errors import InputError, MissingInput, disk_errors
 from logvggt_jax.reconstruction.sources.image_folder import FolderSource
 from logvggt_jax.reconstruction.sources.listing import names_pictures
+from logvggt_jax.reconstruction.sources.masks import Masks
 from logvggt_jax.reconstruction.sources.pictures import IMAGE_SUFFIXES
 from logvggt_jax.reconstruction.sources.source import SkippedFrame, Source, SourceFrame, SourceOptions
 from logvggt_jax.reconstruction.sources.video import VideoSource, is_live
@@ -15,21 +16,22 @@ from logvggt_jax.reconstruction.sources.video import VideoSource, is_live
 __all__ = ["FolderSource", "SkippedFrame", "Source", "SourceFrame", "SourceOptions", "VideoSource", "open_source"]
 
 
-def open_source(path: str | Path, **options: Any) -> Source:
+def open_source(path: str | Path, *, masks: str | Path | None = None, **options: Any) -> Source:
     """A folder of images or a video as a `Source`.
 
     Args:
       path: folder, glob (`photos/*.jpg`) or list of image files (a text file with a path a line); video file, number of
         a camera (`0`), or address of a network stream (`rtsp://…`).
+      masks: folder with a mask for each frame, or one picture for all, black where nothing is to be seen; see `Masks`.
       options: those of `SourceOptions`: which frames are taken.
 
     Raises:
-      MissingInput: nothing is there, or the folder holds no image.
+      MissingInput: nothing is there, or the folder holds no image; a frame has no mask.
       InputError: the file is no video, or an option is out of range.
     """
-    chosen = SourceOptions(**options)
+    chosen, of_frames = SourceOptions(**options), None if masks is None else Masks(masks)
     if is_live(path):
-        return VideoSource(path, chosen)
+        return VideoSource(path, chosen, of_frames)
     given = path
     try:
         path = Path(path).expanduser()
@@ -43,7 +45,7 @@ def open_source(path: str | Path, **options: Any) -> Source:
         # No such user, or a null character.
         raise error if isinstance(error, InputError) else InputError(f"{given!r} is no path: {error}") from error
     if pictures:
-        return FolderSource(path, chosen)
+        return FolderSource(path, chosen, of_frames)
     if path.suffix.lower() in IMAGE_SUFFIXES:
         raise InputError(f"{path} is a single image: give the folder that holds the sequence, a glob, or a video")
-    return VideoSource(path, chosen)
+    return VideoSource(path, chosen, of_frames)

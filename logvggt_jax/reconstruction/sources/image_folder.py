@@ -18,6 +18,7 @@ from logvggt_jax.data.formats.ordering import natural_order, time_stamps
 from logvggt_jax.errors import InputError, MissingInput, MissingPackage, disk_errors
 from logvggt_jax.reconstruction.sources.headers import PictureHeader, read_header
 from logvggt_jax.reconstruction.sources.listing import is_glob, list_pictures, some, stem
+from logvggt_jax.reconstruction.sources.masks import Masked, Masks
 from logvggt_jax.reconstruction.sources.pictures import read_picture, refuse_depth
 from logvggt_jax.reconstruction.sources.source import SkippedFrame, Source, SourceFrame, SourceOptions, fingerprint
 
@@ -47,17 +48,18 @@ class FolderSource(Source):
     Args:
       path: the folder, a glob (`photos/*.jpg`), or a text file with the path of an image a line.
       options: which images are taken; `start` and `end` count from the first, and as `fps` need names that are times.
+      masks: one for each image, or one for all; None for none.
 
     Raises:
-      MissingInput: no image, or one that has gone.
+      MissingInput: no image, or one that has gone; an image without a mask, where there are masks.
       MissingPackage: all images are HEIC, or one is and `strict` is set, and pillow-heif is not installed.
       InputError: names or pictures that cannot be used; two sizes; too many broken pictures, or one with `strict`.
         While frames are loaded: too many broken ones.
     """
 
-    def __init__(self, path: Path, options: SourceOptions) -> None:
+    def __init__(self, path: Path, options: SourceOptions, masks: Masks | None = None) -> None:
         listing = list_pictures(path, options.pattern)
-        super().__init__(listing.root if is_glob(path) and not path.exists() else path, options)
+        super().__init__(listing.root if is_glob(path) and not path.exists() else path, options, masks)
         self.address = path
         self.notes += listing.left_out + listing.doubts
         self._doubts = listing.doubts
@@ -75,6 +77,10 @@ class FolderSource(Source):
             [(name, stamps[position], files[position]) for name, position in zip(names, chosen, strict=True)]
         )
         self._pictures, self._size = self._of_one_size(pictures)
+        if masks is not None:
+            if masks.path.resolve() in {picture.file.resolve().parent for picture in self._pictures}:
+                raise InputError(f"{masks.path} holds the images themselves: give their masks in a folder of their own")
+            self.notes.append(masks.check([_masked(picture) for picture in self._pictures]))
 
     def __len__(self) -> int:
         return len(self._pictures)
@@ -118,8 +124,9 @@ class FolderSource(Source):
         except MissingInput as error:
             raise MissingInput(f"{picture.file} was there when the source was opened and has gone since") from error
         (height, width), (above, left) = self._size, _margins(header.size, self._size)
-        image = image[above : above + height, left : left + width]
-        return SourceFrame(picture.name, picture.timestamp, image, header.focal_length)
+        part = slice(above, above + height), slice(left, left + width)
+        mask = None if self.masks is None else self.masks.read(_masked(picture))[part]
+        return SourceFrame(picture.name, picture.timestamp, image[part], header.focal_length, mask)
 
     def _leave_out(self, name: str, error: InputError) -> None:
         """Lists a broken picture, once however often it is loaded."""
@@ -220,6 +227,10 @@ class FolderSource(Source):
             f"--size-mismatch crop cuts all to {_pixels(smallest)} from their centre"
             + "".join(f"; {doubt}" for doubt in self._doubts)
         )
+
+
+def _masked(picture: _Picture) -> Masked:
+    return Masked(picture.name, picture.file.name, picture.header.size, picture.header.orientation)
 
 
 def _names(files: list[Path], root: Path) -> list[str]:

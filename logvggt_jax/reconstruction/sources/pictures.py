@@ -51,6 +51,8 @@ _SIGNATURES = (
     *((b"\x1aE\xdf\xa3", "video"), (b"<", "web page or XML file"), (b"version https://git-lfs", "Git LFS pointer")),
 )
 _HEIC_BRANDS = {b"heic", b"heix", b"hevc", b"hevx", b"heim", b"heis", b"mif1", b"msf1"}
+# Formats that keep every level as it was, as a rule.
+_EXACT = ("PNG", "BMP", "TIFF")
 # As ImageOps.exif_transpose: what turns the stored pixels upright, by EXIF orientation.
 _UPRIGHT = MappingProxyType(
     {
@@ -82,6 +84,31 @@ def read_picture(path: Path, *, orientation: int = 1) -> np.ndarray:
         with decoding_errors(path):
             picture = picture.transpose(_UPRIGHT[orientation])
     return _colours(path, picture)
+
+
+def read_not_black(path: Path, *, orientation: int = 1) -> np.ndarray:
+    """Where a picture is neither black nor transparent, bool [H, W], turned upright by the EXIF orientation.
+
+    Black is 0 in all channels; in formats that lose detail what is darker than half in all. Errors as `read_picture`.
+    """
+    with disk_errors(path):
+        data = path.read_bytes()
+    picture = _decode(path, data)
+    least = 1 if kind_of(data[:SIGNATURE_BYTES]) in _EXACT else 128
+    with decoding_errors(path):
+        if picture.mode.startswith("I;16"):
+            return upright(np.asarray(picture) > 0, orientation)
+        levels = np.asarray(picture.convert("RGBA"))
+    visible: np.ndarray = (levels[..., :3].max(-1) >= least) & (levels[..., 3] > 0)
+    return upright(visible, orientation)
+
+
+def upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
+    """Pixels [H, W], turned as `read_picture` turns those of a picture."""
+    if orientation not in _UPRIGHT:
+        return pixels
+    levels = Image.fromarray(pixels.astype(np.uint8))
+    return np.array(levels.transpose(_UPRIGHT[orientation])).astype(pixels.dtype)
 
 
 def refuse_depth(path: Path) -> None:

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from logvggt_jax.errors import InputError
+from logvggt_jax.reconstruction.sources.masks import Masks
 
 SIZE_MISMATCH = ("error", "crop", "skip")
 
@@ -26,12 +27,14 @@ class SourceFrame(NamedTuple):
         the sorted folder.
       image: [H, W, 3] uint8 RGB.
       focal_length: pixels of the image, as the camera noted it; None where it is not known.
+      mask: [H, W] bool, True where the image counts; None for a source without masks.
     """
 
     name: str
     timestamp: float
     image: np.ndarray
     focal_length: float | None = None
+    mask: np.ndarray | None = None
 
 
 class SkippedFrame(NamedTuple):
@@ -92,12 +95,13 @@ class Source(abc.ABC):
       name: what messages call it; without the password that an address may hold.
       address: what opens it again, a path or a glob; None for a camera or a network stream, whose frames are gone.
       options: which frames are taken.
+      masks: of the frames; None where all pixels count. They are no part of `fingerprint`, and have one of their own.
       notes: what the user should know before the work begins, one line each: what is left out, and why.
       skipped: frames that could not be read, filled when the source is opened and while frames are loaded.
     """
 
-    def __init__(self, path: Path, options: SourceOptions) -> None:
-        self.path, self.options = path, options
+    def __init__(self, path: Path, options: SourceOptions, masks: Masks | None = None) -> None:
+        self.path, self.options, self.masks = path, options, masks
         self.name = str(path)
         self.address: Path | None = path
         self.notes: list[str] = []

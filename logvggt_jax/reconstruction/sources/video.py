@@ -15,6 +15,7 @@ import numpy as np
 
 from logvggt_jax.errors import InputError, disk_errors
 from logvggt_jax.reconstruction.sources.decoding import Damage, Picture, VideoDecoder, VideoHeader
+from logvggt_jax.reconstruction.sources.masks import Masked, Masks
 from logvggt_jax.reconstruction.sources.opencv_decoder import OpenCVDecoder
 from logvggt_jax.reconstruction.sources.sampling import FrameClock, FrameSelection, expected_frames
 from logvggt_jax.reconstruction.sources.source import (
@@ -52,14 +53,16 @@ class VideoSource(Source):
     Args:
       path: the video file, the number of a camera, or the address of a stream.
       options: which frames are taken.
+      masks: one for each frame by its position, or one for all; None for none.
 
     Raises:
+      MissingInput: a frame without a mask, where there are masks.
       InputError: the file cannot be opened as a video, or nothing of it can be decoded; while iterating, the size of
         the pictures changes, too many frames cannot be decoded, or no frame lies where the options ask for it.
     """
 
-    def __init__(self, path: str | Path, options: SourceOptions) -> None:
-        super().__init__(Path(path), options)
+    def __init__(self, path: str | Path, options: SourceOptions, masks: Masks | None = None) -> None:
+        super().__init__(Path(path), options, masks)
         self._live = is_live(path)
         self.name = re.sub(r"(?<=://)[^/@]*:[^/@]*@", "", _address(path))
         self._header: VideoHeader | None = None
@@ -69,8 +72,12 @@ class VideoSource(Source):
             self._header = self._decoder.header()
             self._check_range(self._header)
             self.notes += self._header.notes
+            if masks is not None:
+                self.notes.append(masks.check_video(self._header.size, from_start=not options.start))
             return
         self.address = None
+        if masks is not None:
+            masks.check_live()
         if str(path).isdecimal():
             self.name = f"camera {path}"
             self._decoder = OpenCVDecoder(int(str(path)), self.name)
@@ -148,7 +155,8 @@ class VideoSource(Source):
                 f"{self.name}: {name} is {image.dtype} {image.shape} after decoding, expected 8 bits and three "
                 "colours; re-encode the video"
             )
-        return SourceFrame(name, seconds, image)
+        mask = None if self.masks is None else self.masks.read(Masked(name, "", picture.size))
+        return SourceFrame(name, seconds, image, mask=mask)
 
     def _skip(self, name: str, reason: str, taken: int) -> None:
         self.skipped.append(SkippedFrame(name, reason))
