@@ -75,6 +75,7 @@ def test_the_small_model_fits_the_package_and_is_the_papers_method(monkeypatch: 
     assert (long.clip_length - 1) * (long.min_stride + long.max_stride) / 2 > rooms.period, "most clips close a loop"
 
 
+@pytest.mark.slow
 def test_the_small_models_step_is_traced_at_its_shortest_and_longest_clips(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -171,7 +172,11 @@ FAST_ATTENTION = {
 @pytest.mark.parametrize(
     ("attention", "stage", "size"),
     # Sizes with an odd number of tokens, 1,041 and 893.
-    [("cudnn", 0, (392, 518)), ("cudnn", 1, (336, 518)), ("tpu_flash", 0, (392, 518))],
+    [
+        ("cudnn", 0, (392, 518)),
+        pytest.param("cudnn", 1, (336, 518), marks=pytest.mark.slow),
+        pytest.param("tpu_flash", 0, (392, 518), marks=pytest.mark.slow),
+    ],
 )
 def test_h20_step_is_lowered_with_fast_attention(
     attention: str, stage: int, size: tuple[int, int], monkeypatch: pytest.MonkeyPatch

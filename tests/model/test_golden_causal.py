@@ -136,6 +136,7 @@ def test_caches_hold_what_the_original_has(golden: Golden, streamed: dict[str, A
             np.testing.assert_allclose(cache.key[0, span], rotated, rtol=0, atol=TOKENS)
 
 
+@pytest.mark.slow
 def test_the_mask_form(golden: Golden) -> None:
     """One call over the whole sequence: tokens, depth and poses of training under the causal mask."""
     images = golden["images_u8"][None]

@@ -47,7 +47,9 @@ def _merging(golden: Golden, name: str) -> TokenMerging | None:
     return dataclasses.replace(merging, **{key: jnp.asarray(tokens) for key, tokens in published.items()})
 
 
-@pytest.mark.parametrize("name", RUNS)
+@pytest.mark.parametrize(
+    "name", [name if name == "default" else pytest.param(name, marks=pytest.mark.slow) for name in RUNS]
+)
 def test_golden_values(golden: Golden, name: str) -> None:
     arrays, images = golden.arrays, golden.arrays["images_u8"]
     model, params, merging = plain_vggt(LogVGGT(golden.config), len(images)), golden.variables, _merging(golden, name)

@@ -92,7 +92,14 @@ def _assert_entries(caches: list[PrunedCache], numbers: np.ndarray, rounds: int)
             assert known.setdefault(number, key.tobytes()) == key.tobytes()
 
 
-@pytest.mark.parametrize(("name", "cap"), [("mid", "cap_middle"), ("deg", "cap_degenerate"), ("cam", "cap_camera")])
+@pytest.mark.parametrize(
+    ("name", "cap"),
+    [
+        ("mid", "cap_middle"),
+        pytest.param("deg", "cap_degenerate", marks=pytest.mark.slow),
+        pytest.param("cam", "cap_camera", marks=pytest.mark.slow),
+    ],
+)
 def test_golden_values_in_16_bits(golden: Golden, name: str, cap: str) -> None:
     arrays = golden.arrays
     found, kept = _streamed(golden, PrunedSettings(golden.settings[cap], 16, "single"))
@@ -240,7 +247,10 @@ def test_golden_caches_before_and_after_coding(golden: Golden) -> None:
         assert (np.abs(found - expected) > TOKENS).sum() <= 5
 
 
-@pytest.mark.parametrize("name", ["quantall", "quantoff", "quant"])
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param("quantall", marks=pytest.mark.slow), pytest.param("quantoff", marks=pytest.mark.slow), "quant"],
+)
 def test_golden_values_in_4_bits(golden_quantised: Golden, name: str) -> None:
     """Loose where rounding to 4 bits decides ties, and pruning chooses by what came of it; tight where it does not."""
     arrays, sizes = golden_quantised.arrays, golden_quantised.settings["quant_config"]

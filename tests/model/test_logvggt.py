@@ -60,6 +60,7 @@ def thawed(config: ModelConfig) -> ModelConfig:
     return dataclasses.replace(config, encoder=dataclasses.replace(config.encoder, frozen=False))
 
 
+@pytest.mark.slow
 def test_a_thawed_encoder_is_trained_and_rematerialisation_changes_no_gradient(small_config, small_variables):
     arguments = small_variables, video(), ALL, ALL
     plain = gradient(small_config, False)(*arguments)[0]["params"]
@@ -96,7 +97,7 @@ def test_training_runs_a_frozen_encoder_once_a_frame(small_config):
     assert gradient == pytest.approx(forward, rel=1e-3)
 
 
-@pytest.mark.parametrize("cross_window", [True, False])
+@pytest.mark.parametrize("cross_window", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_layers_as_a_loop_are_the_layers_one_by_one(small_config, small_variables, cross_window):
     """Key layers that are not all layers: the loop reads the cache at some of them."""
     sizes = dataclasses.replace(small_config.aggregator, depth=5, key_layers=(0, 1, 3, 4))
@@ -181,6 +182,7 @@ def test_every_prediction_starts_with_the_batch(small_config, small_variables):
     assert {leaf.shape[:2] for leaf in jax.tree.leaves(out)} == {(3, FRAMES)}
 
 
+@pytest.mark.slow
 def test_works_inside_other_peoples_transformations(small_config, small_variables):
     """Under jit as a static argument, and sharded over devices by shard_map."""
     model = LogVGGT(small_config)

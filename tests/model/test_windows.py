@@ -88,7 +88,9 @@ def test_window_arithmetic(size, stride):
         assert windows == 1 or starts[-1] + size - stride < num_frames, "the last window brings a new frame"
 
 
-@pytest.mark.parametrize(("size", "stride"), WINDOWS)
+@pytest.mark.parametrize(
+    ("size", "stride"), [WINDOWS[0], *(pytest.param(*each, marks=pytest.mark.slow) for each in WINDOWS[1:])]
+)
 def test_streaming_equals_batch(small_config, small_variables, size, stride):
     """All lengths 1 … 13 in one padded batch, against each length as a stream of its own."""
     model = with_windows(small_config, size, stride)
@@ -189,6 +191,7 @@ def test_attention_mixes_patches_and_frames(small_config, small_variables):
         assert (moved[frame] > 1e-6).mean() > 0.9, "other frames of the window"
 
 
+@pytest.mark.slow
 def test_one_window_of_any_size_is_the_same(small_config, small_variables):
     """T <= K: cache, stride and K play no part, so plain VGGT over the T frames is all that happens."""
     for num_frames in (1, 3):

@@ -63,7 +63,10 @@ def test_an_output_that_cannot_be_made_is_refused(walk: Path, tmp_path: Path, mo
         check_request(source, tmp_path / "new" / "out", **options)
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    "method",
+    [name if name in ("windows", "rolling") else pytest.param(name, marks=pytest.mark.slow) for name in METHODS],
+)
 def test_the_device_needs_its_parameters_and_something_to_work_with(small_config: ModelConfig, method: str) -> None:
     model = LogVGGT(small_config)
     settings = ChunkPlan(4, 2) if method == "chunks" else None

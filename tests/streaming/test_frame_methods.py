@@ -127,6 +127,7 @@ def test_pruned_is_causal_until_it_prunes(
     assert_differ(found[-1], causal[-1])
 
 
+@pytest.mark.slow
 def test_four_bits_are_another_model_from_the_second_frame_on(
     small_config: ModelConfig, small_variables: dict, causal: list[FrameResult]
 ) -> None:

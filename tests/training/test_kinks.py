@@ -4,6 +4,7 @@ numbers of devices may differ by more than rounding, and why that is harmless.""
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from logvggt_jax.config import DPTConfig
 from logvggt_jax.model.dpt_head import DPTHead
@@ -12,6 +13,7 @@ SIZE, GRID = (28, 42), (2, 3)
 HIDDEN = "output_2_hidden"
 
 
+@pytest.mark.slow
 def test_a_unit_that_rounding_moves_across_zero_changes_the_gradient_by_its_share_and_the_loss_by_nothing() -> None:
     """The last rectifier sees 32 numbers a pixel, millions a batch: now and then one lies within rounding of zero."""
     head = DPTHead(DPTConfig(features=8, out_channels=(8, 8, 8, 8)), 2, "float32")

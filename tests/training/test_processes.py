@@ -147,7 +147,7 @@ def _free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-@pytest.mark.parametrize("lost", [1, 0])
+@pytest.mark.parametrize("lost", [1, pytest.param(0, marks=pytest.mark.slow)])
 def test_the_loss_of_a_process_ends_the_other_with_one_line(lost: int, tmp_path: Path) -> None:
     with PixelRuns(tmp_path, tmp_path) as runs:
         runs.training()

@@ -110,6 +110,7 @@ def _same_run(found: Outcome, expected: Outcome) -> None:
     assert len(found.losses) == 20 and found.losses == pytest.approx(expected.losses, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_twenty_steps_on_sixteen_devices_and_in_two_processes_are_those_of_one_device(
     run_config: TrainConfig, layered: LayeredModel, layered_params: Any, sixteen: Clips, tmp_path: Path
 ) -> None:

@@ -56,6 +56,7 @@ def test_a_real_model_is_trained_validated_and_saved(begun: Path) -> None:
         assert training is not None and training.steps == steps
 
 
+@pytest.mark.slow
 def test_the_same_command_goes_on_with_parameters_in_parts(begun: Path, tmp_path: Path) -> None:
     workdir = Path(shutil.copytree(begun, tmp_path / "run"))
     finished = run_train(workdir, "--config.shard_parameters=True")

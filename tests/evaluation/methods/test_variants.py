@@ -24,6 +24,7 @@ def predictions(small_config: ModelConfig, small_variables: dict) -> dict[str, C
     return {method.name: method.predict(IMAGES) for method in methods}
 
 
+@pytest.mark.slow
 def test_each_variant_comes_with_both_trunks(predictions: dict[str, ClipPrediction]) -> None:
     labels = [VARIANTS[name].label for name in NAMES]
     assert list(predictions) == [f"{label}, trunk {trunk}" for label in labels for trunk in ("all", "4")]
