@@ -102,7 +102,8 @@ def _read_source(name: str, root: Path, output: Path) -> None:
     _expect(len(shapes) == 1 and images[0].dtype == np.uint8 and images[0].ndim == 3, f"frames have shapes {shapes}")
     said = source.skipped or source.notes
     # Nothing tells that a folder had a picture before its first or after its last.
-    numbers = [int(file.stem.removeprefix("img")) for file in root.glob("img*")] or range(_FRAMES)
+    numbered = (file.stem.removeprefix("img") for file in root.glob("img*"))
+    numbers = [int(number) for number in numbered if number.isdecimal()] or range(_FRAMES)
     expected = max(numbers) - min(numbers) + 1
     _expect(len(images) >= expected or said, f"{len(images)} of {expected} frames, and nothing said")
 
