@@ -520,6 +520,20 @@ def test_damage_to_large_videos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     np.testing.assert_allclose(times(frames), np.array(names(frames)) / 10, atol=1e-6)
 
 
+def test_a_packet_that_gives_neither_picture_nor_error_is_named(tmp_path: Path) -> None:
+    path = write(tmp_path / "walk.mp4", [busy(i) for i in range(8)], codec="mpeg4")
+    content = bytearray(path.read_bytes())
+    position = packets(path)[3][0]
+    # The head of a picture that is "not coded", after the start code.
+    content[position + 4 : position + 12] = bytes.fromhex("000000000000f07f")
+    path.write_bytes(content)
+    source = open_source(path, most_broken=1.0)
+    shown = names(list(source))
+    left_out = [int(frame.name.removeprefix("frame-")) for frame in source.skipped]
+    assert 3 in left_out and shown[-1] == 7 and sorted([*shown, *left_out]) == list(range(8))
+    assert {frame.reason for frame in source.skipped} == {"gives no picture"}
+
+
 def test_the_first_damaged_frame_is_an_error_when_strict(tmp_path: Path, library: str) -> None:
     path, broken = damaged(tmp_path / "noise.mp4", [7, 15])
     frames = iter(open_source(path, strict=True))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import math
 import re
 from collections import deque
 from collections.abc import Iterator
@@ -32,6 +33,10 @@ _LONGEST_LEAD = 300
 _LARGE = 1920 * 1088
 # Packets whose frame has not come out; no codec holds back so many.
 _MOST_WAITING = 512
+# Codecs of which every packet shows a frame of its own, but for those of interlaced material and for empty ones, which
+# stand for no change. A decoder may drop a damaged packet of theirs without an error.
+_FRAME_A_PACKET = ("mpeg4", "h264", "hevc", "mjpeg")
+_EMPTY_PACKET = 8
 
 
 class PyAVDecoder:
@@ -161,7 +166,8 @@ class PyAVDecoder:
         waiting: list[int] = []
         failures: deque[str] = deque()
         self._lead = 0
-        started = False
+        started = shown = False
+        joined, last = False, -math.inf  # whether time goes back, as where recordings are joined
         for packet in self._packets(container, stream):
             if isinstance(packet, str):
                 failures.append(packet)
@@ -171,7 +177,9 @@ class PyAVDecoder:
             if not started:
                 self._lead += 1
                 continue
-            if packet.size and packet.pts is not None and not packet.is_discard:
+            if packet.dts is not None:
+                joined, last = joined or packet.dts < last, packet.dts
+            if packet.size > _EMPTY_PACKET and packet.pts is not None and not packet.is_discard:
                 heapq.heappush(waiting, packet.pts)
                 if len(waiting) > _MOST_WAITING:
                     heapq.heappop(waiting)
@@ -187,7 +195,11 @@ class PyAVDecoder:
                     failures.append(str(error.strerror))
             for frame in frames:
                 if frame.pts is not None:
-                    yield from ((damage, None) for damage in _missing(waiting, failures, frame.pts, stream.time_base))
+                    each = stream.codec_context.name in _FRAME_A_PACKET and not is_interlaced(frame, stream)
+                    every = shown and each and not joined
+                    missing = _missing(waiting, failures, frame.pts, stream.time_base, every=every)
+                    yield from ((damage, None) for damage in missing)
+                shown = True
                 yield None, frame
         if stream.width * stream.height > _LARGE:
             failures.extend("cannot be decoded" for _ in waiting[len(failures) :])
@@ -236,12 +248,16 @@ class PyAVDecoder:
             )
 
 
-def _missing(waiting: list[int], failures: deque[str], shown: int, time_base: Fraction) -> Iterator[Damage]:
-    """The frames before the one with time stamp `shown` that failed; takes all up to it from `waiting`."""
+def _missing(
+    waiting: list[int], failures: deque[str], shown: int, time_base: Fraction, *, every: bool
+) -> Iterator[Damage]:
+    """The frames before the one with time stamp `shown` that failed, or `every` one that has not come out; takes all up
+    to it from `waiting`."""
     while waiting and waiting[0] <= shown:
         stamp = heapq.heappop(waiting)
-        if stamp < shown and failures:
-            yield Damage(float(stamp * time_base), failures.popleft())
+        if stamp < shown and (failures or every):
+            reason = failures.popleft() if failures else "gives no picture"
+            yield Damage(float(stamp * time_base), reason)
 
 
 def _likely_frames(stated: int, seconds: float | None, rate: Fraction | None) -> int | None:
