@@ -4,7 +4,8 @@ import re
 from pathlib import Path
 from typing import Literal
 
-from logvggt_jax.errors import InputError, disk_errors
+from logvggt_jax.errors import InputError
+from logvggt_jax.files import open_regular
 
 Content = Literal["safetensors", "zip", "json"]
 """A safetensors file; an archive, as `torch.save` writes them; a JSON text, as indices of shards are."""
@@ -38,7 +39,7 @@ _OTHERS: tuple[tuple[bytes, str, str], ...] = (
 
 def content_of(path: Path) -> Content:
     """What an existing file holds. Raises InputError saying what it is, if it is nothing that weights are read from."""
-    with disk_errors(path), path.open("rb") as file:
+    with open_regular(path) as file:
         start = file.read(_START)
     if start[:2] == b"PK":
         return "zip"

@@ -8,6 +8,7 @@ import numpy as np
 import safetensors
 
 from logvggt_jax.errors import InputError, MissingInput, disk_errors, one_line
+from logvggt_jax.files import open_regular
 from logvggt_jax.weights.content import content_of
 from logvggt_jax.weights.lazy import LazyTensors, refused_type
 from logvggt_jax.weights.shards import INDEX_SUFFIX, is_shard, present_shards, read_index
@@ -114,7 +115,7 @@ def _enter_shards(stack: ExitStack, path: Path) -> LazyTensors:
 def open_safetensors(path: Path) -> Iterator[LazyTensors]:
     """The tensors of one safetensors file under its own names; a context manager, errors as of `open_state_dict`."""
     try:
-        with disk_errors(path):
+        with open_regular(path):
             opened = safetensors.safe_open(path, framework="numpy")
     except safetensors.SafetensorError as error:
         raise InputError(

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from logvggt_jax.errors import InputError, MissingInput
+from logvggt_jax.files import open_regular
 from logvggt_jax.weights.digests import MEND, json_digest
 from logvggt_jax.weights.json_file import read_json
 
@@ -18,8 +19,9 @@ def is_model_folder(path: Path) -> bool:
     if (path / "params").is_dir():
         return True
     try:
-        return FORMAT.encode() in (path / "config.json").read_bytes()
-    except OSError:
+        with open_regular(path / "config.json") as stream:
+            return FORMAT.encode() in stream.read()
+    except InputError:
         return False
 
 

@@ -4,13 +4,14 @@ import json
 from pathlib import Path
 from typing import Any
 
-from logvggt_jax.errors import InputError, disk_errors, one_line
+from logvggt_jax.errors import InputError, one_line
+from logvggt_jax.files import open_regular
 
 
 def read_json(path: Path, mend: str) -> Any:
-    """What a JSON file holds. Raises InputError ending in `mend` where it is no JSON, DiskError as `disk_errors`."""
-    with disk_errors(path):
-        content = path.read_bytes()
+    """What a JSON file holds. Raises InputError ending in `mend` where it is no JSON, others as `open_regular`."""
+    with open_regular(path) as stream:
+        content = stream.read()
     try:
         return json.loads(content.decode())
     except (ValueError, RecursionError) as error:

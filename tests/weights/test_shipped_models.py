@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -123,6 +124,14 @@ def test_weights_that_differ_from_their_digest_are_refused(shipped):
     file.write_bytes(content[:-7])
     with pytest.raises(InputError, match=r"params\.safetensors: not a readable safetensors file"):
         load_model("rooms")
+
+
+@pytest.mark.parametrize("name", [PARAMETERS_FILE, "config.json"])
+def test_a_pipe_in_place_of_a_file_is_not_waited_for(shipped, name):
+    (shipped / name).unlink()
+    os.mkfifo(shipped / name)
+    with pytest.raises(InputError, match=f"{name}(: no such file| is no file but)"):
+        load_model(shipped)
 
 
 def test_a_description_that_was_changed_is_refused(shipped):
