@@ -30,6 +30,16 @@ def open_regular(path: str | Path) -> Iterator[BinaryIO]:
             yield stream
 
 
+def check_regular_files(folder: Path) -> None:
+    """Raises InputError where anything in a folder, at any depth, is neither a file nor a folder, for libraries that
+    open all of it themselves; DiskError as `disk_errors`."""
+    with disk_errors(folder):
+        for path in folder.rglob("*"):
+            mode = path.stat().st_mode
+            if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+                raise InputError(f"{path} is neither a file nor a folder but a pipe or a device")
+
+
 @contextmanager
 def atomic_file(path: str | Path) -> Iterator[Path]:
     """A temporary name beside `path` that becomes `path` when the block ends, and vanishes if it fails.

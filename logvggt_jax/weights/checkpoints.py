@@ -24,7 +24,7 @@ from rich.progress import Progress
 
 from logvggt_jax.config import ModelConfig, from_mapping
 from logvggt_jax.errors import DiskError, InputError, MissingInput, OutputExists, disk_errors, one_line
-from logvggt_jax.files import atomic_folder, check_output, check_space, check_writable
+from logvggt_jax.files import atomic_folder, check_output, check_regular_files, check_space, check_writable
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.weights.address import hub_address, resolve, similar
 from logvggt_jax.weights.digests import check_finite, digests, named_leaves, verify_digests
@@ -77,7 +77,10 @@ def read_arrays(path: Path, target: Any) -> Any:
     """A folder of `write_arrays` in the shapes and placement of `target`.
 
     Of several processes each reads its own part. What Orbax raises passes through, see `read_with_orbax`.
+
+    Raises InputError where a pipe or a device lies in a file's place, for which Orbax would wait.
     """
+    check_regular_files(path)
     with _checkpointer() as checkpointer:
         return checkpointer.restore(path, target)
 
@@ -298,6 +301,7 @@ def _restore(folder: Path, target: Any) -> Any:
         raise MissingInput(f"{path}: the parameters are missing; {MEND}")
 
     def read() -> Any:
+        check_regular_files(path)
         with _checkpointer() as checkpointer:
             stored = checkpointer.metadata(path).item_metadata
         if stored is None:

@@ -134,6 +134,14 @@ def test_a_pipe_in_place_of_a_file_is_not_waited_for(shipped, name):
         load_model(shipped)
 
 
+def test_a_pipe_among_the_parameters_is_not_waited_for(trained, tmp_path):
+    folder = Path(shutil.copytree(trained, tmp_path / "model"))
+    (folder / "params" / "_METADATA").unlink()
+    os.mkfifo(folder / "params" / "_METADATA")
+    with pytest.raises(InputError, match="_METADATA is neither a file nor a folder"):
+        load_model(folder)
+
+
 def test_a_description_that_was_changed_is_refused(shipped):
     file = shipped / "config.json"
     file.write_text(file.read_text().replace('"commit": "1a2b3c"', '"commit": "1a2b3d"'))

@@ -166,7 +166,7 @@ class PyAVDecoder:
         waiting: list[int] = []
         failures: deque[str] = deque()
         self._lead = 0
-        started = shown = False
+        started, key = False, None  # the time stamp of the first key frame; what is shown before refers to lost frames
         joined, last = False, -math.inf  # whether time goes back, as where recordings are joined
         for packet in self._packets(container, stream):
             if isinstance(packet, str):
@@ -179,6 +179,7 @@ class PyAVDecoder:
                 continue
             if packet.dts is not None:
                 joined, last = joined or packet.dts < last, packet.dts
+            key = packet.pts if key is None else key
             if packet.size > _EMPTY_PACKET and packet.pts is not None and not packet.is_discard:
                 heapq.heappush(waiting, packet.pts)
                 if len(waiting) > _MOST_WAITING:
@@ -196,10 +197,9 @@ class PyAVDecoder:
             for frame in frames:
                 if frame.pts is not None:
                     each = stream.codec_context.name in _FRAME_A_PACKET and not is_interlaced(frame, stream)
-                    every = shown and each and not joined
-                    missing = _missing(waiting, failures, frame.pts, stream.time_base, every=every)
+                    since = None if joined or not each else key
+                    missing = _missing(waiting, failures, frame.pts, stream.time_base, since)
                     yield from ((damage, None) for damage in missing)
-                shown = True
                 yield None, frame
         if stream.width * stream.height > _LARGE:
             failures.extend("cannot be decoded" for _ in waiting[len(failures) :])
@@ -249,15 +249,14 @@ class PyAVDecoder:
 
 
 def _missing(
-    waiting: list[int], failures: deque[str], shown: int, time_base: Fraction, *, every: bool
+    waiting: list[int], failures: deque[str], shown: int, time_base: Fraction, since: int | None
 ) -> Iterator[Damage]:
-    """The frames before the one with time stamp `shown` that failed, or `every` one that has not come out; takes all up
-    to it from `waiting`."""
+    """The frames before the one with time stamp `shown` that failed, or every one from `since` on that has not come
+    out; takes all up to it from `waiting`."""
     while waiting and waiting[0] <= shown:
         stamp = heapq.heappop(waiting)
-        if stamp < shown and (failures or every):
-            reason = failures.popleft() if failures else "gives no picture"
-            yield Damage(float(stamp * time_base), reason)
+        if stamp < shown and (failures or (since is not None and stamp >= since)):
+            yield Damage(float(stamp * time_base), failures.popleft() if failures else "gives no picture")
 
 
 def _likely_frames(stated: int, seconds: float | None, rate: Fraction | None) -> int | None:
