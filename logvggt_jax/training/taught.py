@@ -203,7 +203,7 @@ def _stored(folder: Path) -> Labels:
     for name in Labels._fields:
         path = folder / f"{name}.npy"
         try:
-            arrays.append(np.load(path, mmap_mode="r"))
+            arrays.append(np.load(path, mmap_mode="r", allow_pickle=False))
         except (OSError, ValueError, EOFError) as error:
             raise InputError(f"{path}: cannot be read ({error}): start the run again, which labels the clip") from error
     return Labels(*arrays)

@@ -89,7 +89,8 @@ def _cameras(files: SourceFiles, folder: Path) -> tuple[np.ndarray, np.ndarray]:
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             names = archive.files
-            found = {name: archive[name] for name in ("intrinsics", "extrinsics") if name in names}
+            # What has no array's header comes as bytes.
+            found = {name: np.asarray(archive[name]) for name in ("intrinsics", "extrinsics") if name in names}
     except (OSError, EOFError, ValueError, LookupError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
         raise InputError(f"{path}: truncated or damaged npz file ({error}): fetch it again") from error
     if len(found) < 2 or _LATER_ARRAY not in names:

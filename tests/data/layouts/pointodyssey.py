@@ -1,5 +1,6 @@
 """PointOdyssey v1.2: 16-bit depth up to 1000 m, cameras in an npz file beside large point tracks."""
 
+import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -43,6 +44,15 @@ def flipped(content: bytes) -> bytes:
     return content[: start + 200] + bytes(40) + content[start + 240 :]
 
 
+def write_emptied(path: Path) -> None:
+    """Writes the archive anew with no bytes in its intrinsics."""
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, b"" if name == "intrinsics.npy" else content)
+
+
 SCENE = "train/dancing"
 FILES = [f"{SCENE}/{name}" for name in ("rgbs/rgb_00001.jpg", "depths/depth_00001.png", "anno.npz")]
 LAYOUT = Layout(
@@ -75,6 +85,7 @@ LAYOUT = Layout(
         ),
         (r"anno\.npz: truncated or damaged", changed(FILES[2], lambda data: data[:-50])),
         (r"anno\.npz: truncated or damaged", changed(FILES[2], flipped)),
+        (r"anno\.npz: expected intrinsics of 3 x 3 numbers", lambda root: write_emptied(root / FILES[2])),
         (
             r"anno\.npz: truncated or damaged",
             lambda root: [np.save(root / "a.npy", np.eye(4)), (root / "a.npy").rename(root / FILES[2])],
