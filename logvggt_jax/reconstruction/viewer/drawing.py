@@ -12,11 +12,13 @@ from logvggt_jax.reconstruction.viewer.opening_view import View
 
 # The line through all cameras, a camera, and the one that is looked at.
 PATH, FRUSTUM, PRESENT = (230, 80, 50), (120, 150, 200), (255, 190, 40)
+# Cameras that are drawn of a finished sequence, evenly over it.
+MOST_FRUSTA = 40
 # Pixels: pictures in the scene, and beside it.
 _THUMBNAIL, _PICTURE = 96, 320
 _LINES: dict[str, Any] = {"thickness": 1.5, "thickness_units": "screen"}
 # The size of cameras by that of the scene, at most and at least; between, as far as one is from the next.
-_LARGEST, _SMALLEST = 1 / 40, 1 / 100
+_LARGEST, _SMALLEST = 1 / 80, 1 / 200
 
 
 def draw_points(server: Any, points: np.ndarray, colours: np.ndarray, size: float) -> Any:

@@ -83,7 +83,7 @@ class GrowingScene:
         self._lock = threading.Lock()
 
     def add(self, frame: LiveResult) -> None:
-        """The next frame. Costs less than a millisecond, whatever its size, and a few now and then for thinning."""
+        """The next frame. Looks at some thousand of its pixels, whatever its size."""
         index, pose = frame.result.index, frame.result.pose_encoding
         with self._lock:
             self._count = index + 1

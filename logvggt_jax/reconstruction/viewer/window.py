@@ -17,6 +17,7 @@ from logvggt_jax.reconstruction.result import IMAGE_FOLDER, Reconstruction
 from logvggt_jax.reconstruction.viewer.colouring import IMAGE, colourings, level_limits, point_colours
 from logvggt_jax.reconstruction.viewer.detail import USUALLY_SHOWN, Detail, levels_of_detail
 from logvggt_jax.reconstruction.viewer.drawing import (
+    MOST_FRUSTA,
     PRESENT,
     camera_size,
     draw_camera,
@@ -34,8 +35,6 @@ from logvggt_jax.reconstruction.viewer.opening_view import (
     scene_span,
 )
 
-# Cameras that are drawn, evenly over the sequence.
-MOST_FRUSTA = 40
 _SCREENSHOT = (1080, 1920)
 # From which the scale of colours is taken.
 _SCALE_POINTS = 200_000
@@ -58,7 +57,6 @@ class Window:
         self._detail = Detail(self._cloud)
         self._centres = camera_centres(result.extrinsics)
         self._span = scene_span(self._cloud.points, self._centres)
-        self._spacing = point_spacing(self._span, min(len(self._cloud.points), USUALLY_SHOWN))
         self._view = opening_view(result.extrinsics, result.intrinsics, result.image_size, self._cloud.points)
         sample = self._detail.choose(_SCALE_POINTS)
         # The ends of each scale are the same whatever part of the cloud is shown.
@@ -68,6 +66,7 @@ class Window:
         # Callbacks come in threads of the server's, and some call one another.
         self._lock = threading.RLock()
         self._shown: int | None = None
+        self._spacing = point_spacing(self._span, 0)
         self._playing: threading.Event | None = None
         self._open_at(self._view)
         self._add_controls()
@@ -124,7 +123,12 @@ class Window:
             chosen = self._detail.choose(most, lowest=lowest, frame=frame)
             colouring = self.colouring.value
             colours = point_colours(colouring, self._cloud, chosen, self._result, self._limits[colouring])
-            self.points = draw_points(self._server, self._cloud.points[chosen], colours, self._point_size)
+            points = self._cloud.points[chosen]
+            if frame is None:
+                self._spacing = point_spacing(self._span, min(most, len(self._cloud.points)))
+            elif len(points):
+                self._spacing = point_spacing(scene_span(points, points[:1]), len(points))
+            self.points = draw_points(self._server, points, colours, self._point_size)
 
     @property
     def _point_size(self) -> float:
@@ -217,4 +221,5 @@ class Window:
         picture = client.get_render(*_SCREENSHOT, transport_format="png")
         content = io.BytesIO()
         Image.fromarray(picture[..., :3]).save(content, "PNG")
-        client.send_file_download(f"{self._result.folder.resolve().name}.png", content.getvalue())
+        name = f"{self._result.folder.resolve().name}.png"
+        client.send_file_download(name, content.getvalue(), save_immediately=True)
