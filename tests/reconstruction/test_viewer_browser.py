@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from devtools import Page, opened
@@ -32,6 +33,11 @@ def scene(page: Page) -> np.ndarray:
     return page.picture()[185:, :440].astype(int)
 
 
+def coarse(page: Page) -> np.ndarray:
+    """The same without detail: a slow browser draws less finely than it did at first."""
+    return cv2.resize(scene(page).astype(np.float32), None, fx=1 / 8, fy=1 / 8, interpolation=cv2.INTER_AREA)
+
+
 def drawn(page: Page, ground: int = 18) -> np.ndarray:
     """The pixels [n, 3] that are not ground."""
     found = scene(page)
@@ -49,12 +55,12 @@ def test_every_control_changes_the_picture_as_it_says(tmp_path: Path) -> None:
             assert soon(server.get_clients)
             client = next(iter(server.get_clients().values()))
             assert soon(lambda: len(drawn(page)) > 5000)
-            first = scene(page)
+            first = coarse(page)
 
             page.choose("colour", "depth")
-            assert soon(lambda: np.abs(scene(page) - first).mean() > 2)
+            assert soon(lambda: np.abs(coarse(page) - first).mean() > 5)
             page.choose("colour", "image")
-            assert soon(lambda: np.abs(scene(page) - first).mean() < 1)
+            assert soon(lambda: np.abs(coarse(page) - first).mean() < 3)
 
             count = len(drawn(page))
             page.type("size", 3)
@@ -63,9 +69,9 @@ def test_every_control_changes_the_picture_as_it_says(tmp_path: Path) -> None:
             assert soon(lambda: len(drawn(page)) < 0.8 * count)
             page.type("size", 1)
             page.choose("of 2,000", "200")
-            assert soon(lambda: np.abs(scene(page) - first).mean() > 2)
+            assert soon(lambda: np.abs(coarse(page) - first).mean() > 5)
             page.choose("of 2,000", "2,000")
-            assert soon(lambda: np.abs(scene(page) - first).mean() < 1)
+            assert soon(lambda: np.abs(coarse(page) - first).mean() < 3)
 
             page.tick("dark ground")
             assert soon(lambda: np.median(scene(page)[:, :40]) > 200)
