@@ -42,9 +42,9 @@ def _live(options: argparse.Namespace) -> int:
         warnings.warn(doubt, stacklevel=1)
     check_devices()
     enable_compilation_cache(options.compilation_cache)
-    model, variables = from_pretrained(checkpoint, dtype=options.dtype)
-    variables = in_compute_type(variables, model.config)
     with watched(options) as window:
+        model, variables = from_pretrained(checkpoint, dtype=options.dtype)
+        variables = in_compute_type(variables, model.config)
         session = LiveSession(
             lambda: online_stream(model, variables, online, provisional=window is not None),
             longer_edge=options.longer_edge or provenance.longer_edge or LONGER_EDGE,

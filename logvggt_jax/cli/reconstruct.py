@@ -71,10 +71,10 @@ def _reconstruct(options: argparse.Namespace) -> int:
         print(line if options.dry_run else f"logvggt: {line}", file=sys.stdout if options.dry_run else sys.stderr)
     if options.dry_run:
         return 0
-    model, variables = from_pretrained(checkpoint, dtype=options.dtype)
-    # Here rather than in the stream alone, so that nothing keeps the float32 parameters on the device.
-    variables = in_compute_type(variables, model.config)
     with watched(options) as window:
+        model, variables = from_pretrained(checkpoint, dtype=options.dtype)
+        # Here rather than in the stream alone, so that nothing keeps the float32 parameters on the device.
+        variables = in_compute_type(variables, model.config)
         result = reconstruct(
             source,
             options.output,

@@ -102,7 +102,7 @@ class FrameWriter:
         for name in self.names[count:]:
             depth_file(self._folder, name).unlink(missing_ok=True)
             image_file(self._folder, name).unlink(missing_ok=True)
-        del self.names[count:], self.timestamps[count:]
+        del self.names[count:], self.timestamps[count:], self.masked[count:]
         self.images.clear()
         return count
 
