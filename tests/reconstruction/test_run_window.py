@@ -186,15 +186,20 @@ def test_a_browser_shows_a_run_while_it_goes_on(tmp_path: Path) -> None:
                 sure = np.full((84, 112), 2.0, np.float32)
                 result = FrameResult(index, frames.depth[index], sure, encodings[index], True, None, None)
                 window.add(LiveResult(f"{index}", index / 8, image, (84, 112), result))
-            assert soon(lambda: window._drawn is not None)
-            assert soon(lambda: np.linalg.norm(np.subtract(client.camera.look_at, client.camera.position)) > 0.1)
-            time.sleep(1)
+            axis = frames.extrinsics[-1, 2, :3]
+
+            def along() -> float:
+                forward = np.subtract(client.camera.look_at, client.camera.position)
+                return forward @ axis / max(np.linalg.norm(forward), 1e-9)
+
+            # The thread may have begun to draw before all were there.
+            assert soon(lambda: window._drawn is not None and window._drawn.num_frames == 6)
+            assert soon(lambda: along() > 0.95)
+            time.sleep(0.5)
+            assert along() > 0.95
             picture = client.get_render(300, 400, timeout=60)[..., :3].astype(int)
-            forward = np.subtract(client.camera.look_at, client.camera.position)
     finally:
         stop_server(window.server)
-    axis = frames.extrinsics[-1, 2, :3]
-    assert forward @ axis / np.linalg.norm(forward) > 0.9
     drawn = np.abs(picture - 18).max(axis=2) > 25
     assert drawn.mean() > 0.3 and picture[drawn].std(axis=0).min() > 10
 

@@ -78,6 +78,9 @@ class RunWindow:
         server.on_client_connect(self._follow)
         server.on_client_disconnect(lambda client: self._followers.pop(client.client_id, None))
         set_ground(server, dark=True)
+        # The first camera's, whose frame is the world. It stays: a browser that learns of another one after it was put
+        # somewhere is turned away from there.
+        server.scene.set_up_direction("-y")
         self._thread = threading.Thread(target=self._run, name="viewer", daemon=True)
         self._thread.start()
 
@@ -138,7 +141,6 @@ class RunWindow:
         span = scene_span(scene.points, centres)
         if self._drawn is None:
             self._up = up_direction(scene.extrinsics)
-            server.scene.set_up_direction(tuple(self._up))
         self._drawn, self._spacing = scene, point_spacing(span, len(scene.points))
         with server.atomic():
             size = float(self.point_size.value) * self._spacing
@@ -173,7 +175,7 @@ class RunWindow:
         self._status.content = f"{scene.num_frames:,} frames are final, {len(scene.points):,} points are shown."
 
     def _follow(self, client: Any) -> None:
-        self._followers[client.client_id] = deque(maxlen=3)
+        self._followers[client.client_id] = deque(maxlen=4)
         self._news.set()
 
     def _look_from_start(self, client: Any) -> None:
@@ -187,8 +189,10 @@ class RunWindow:
         places = self._followers.get(client_id)
         if places is None or self._drawn is None or self._up is None:
             return
-        here = np.asarray(client.camera.position)
-        if places and min(np.linalg.norm(here - place) for place in places) > 0.02 * span:
+        here = np.array(client.camera.position)
+        if not places:
+            places.append(here)  # a slow browser may still tell of that when it was put elsewhere
+        elif min(np.linalg.norm(here - place) for place in places) > 0.02 * span:
             self._followers.pop(client_id, None)
             return
         pose, depth = self._drawn.extrinsics[-1], self._drawn.newest.result.depth
