@@ -48,6 +48,14 @@ class Onlooker:
         self.placed.append(len(pose_encodings))
 
 
+@pytest.fixture(autouse=True)
+def signals_reach_what_is_started() -> Iterator[None]:
+    """A shell starts what it runs in the background deaf to Ctrl-C."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 @pytest.fixture
 def walk(tmp_path: Path) -> Path:
     """Seven frames of noise."""
@@ -208,26 +216,24 @@ def test_a_browser_shows_a_run_while_it_goes_on(tmp_path: Path) -> None:
 def test_the_command_ends_its_run_without_a_browser_and_stays_until_ctrl_c(walk: Path, tmp_path: Path) -> None:
     pytest.importorskip("viser", reason="extra `viewer` is not installed")
     command = ["reconstruct", str(walk), "--checkpoint", "rooms", "--longer-edge", "42", "--port", "18300", "--view"]
-    process = subprocess.Popen(
+    with subprocess.Popen(
         [sys.executable, "-m", "logvggt_jax", *command, "--output", str(tmp_path / "out")],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
-    )
-    try:
-        lines: list[str] = []
-        reader = threading.Thread(target=lambda: lines.extend(process.stderr or ()))
-        reader.start()
-        assert soon(lambda: any("viewer stays open; Ctrl-C ends it" in line for line in lines)), lines
-        assert Reconstruction.open(tmp_path / "out").complete
-        address = next(word for line in lines for word in line.split() if word.startswith("http://127.0.0.1"))
-        with urllib.request.urlopen(address, timeout=10) as page:
-            assert page.status == 200
-        process.send_signal(signal.SIGINT)
-        assert process.wait(30) == 0
-        reader.join(10)
-        assert process.stdout is not None and process.stdout.read().startswith("7 frames in")
-    finally:
-        process.kill()
-        process.communicate()
+    ) as process:
+        try:
+            lines: list[str] = []
+            reader = threading.Thread(target=lambda: lines.extend(process.stderr or ()))
+            reader.start()
+            assert soon(lambda: any("viewer stays open; Ctrl-C ends it" in line for line in lines)), lines
+            assert Reconstruction.open(tmp_path / "out").complete
+            address = next(word for line in lines for word in line.split() if word.startswith("http://127.0.0.1"))
+            with urllib.request.urlopen(address, timeout=10) as page:
+                assert page.status == 200
+            process.send_signal(signal.SIGINT)
+            assert process.wait(30) == 0
+            reader.join(10)
+            assert process.stdout is not None and process.stdout.read().startswith("7 frames in")
+        finally:
+            process.kill()
