@@ -11,6 +11,7 @@ from typing import Any
 
 from logvggt_jax.cli.command import add_command, execution_options, longer_edge_option, overwrite_option
 from logvggt_jax.cli.exit_codes import BAD_INPUT
+from logvggt_jax.cli.viewing import stay_open, watch_options, watched
 from logvggt_jax.errors import InputError, one_line
 
 
@@ -41,25 +42,28 @@ def _live(options: argparse.Namespace) -> int:
         warnings.warn(doubt, stacklevel=1)
     check_devices()
     enable_compilation_cache(options.compilation_cache)
-    model, variables = from_pretrained(checkpoint, dtype=options.dtype)
-    variables = in_compute_type(variables, model.config)
-    session = LiveSession(
-        lambda: online_stream(model, variables, online),
-        longer_edge=options.longer_edge or provenance.longer_edge or LONGER_EDGE,
-        capacity=model.config.windows.stride if options.queue is None else options.queue,
-        recording=recording,
-    )
-    print(f"logvggt: {session.rule}", file=sys.stderr)
-    print(f"logvggt: {online.text(model)}", file=sys.stderr)
-    lost = follow(source, session, realtime=source.address is not None, reconnect=options.reconnect)
-    report = session.report()
-    print(json.dumps(report.as_json(), indent=1) if options.json else report.table())
-    if session.reconstruction is not None:
-        print(session.reconstruction.summary(), file=sys.stderr if options.json else sys.stdout)
-    if lost is None:
-        return 0
-    print(f"logvggt: error: {one_line(InputError(lost))}", file=sys.stderr)
-    return BAD_INPUT
+    with watched(options) as window:
+        model, variables = from_pretrained(checkpoint, dtype=options.dtype)
+        variables = in_compute_type(variables, model.config)
+        session = LiveSession(
+            lambda: online_stream(model, variables, online, provisional=window is not None),
+            longer_edge=options.longer_edge or provenance.longer_edge or LONGER_EDGE,
+            capacity=model.config.windows.stride if options.queue is None else options.queue,
+            on_result=None if window is None else window.add,
+            recording=recording,
+        )
+        print(f"logvggt: {session.rule}", file=sys.stderr)
+        print(f"logvggt: {online.text(model)}", file=sys.stderr)
+        lost = follow(source, session, realtime=source.address is not None, reconnect=options.reconnect)
+        report = session.report()
+        print(json.dumps(report.as_json(), indent=1) if options.json else report.table())
+        if session.reconstruction is not None:
+            print(session.reconstruction.summary(), file=sys.stderr if options.json else sys.stdout)
+        if lost is not None:
+            print(f"logvggt: error: {one_line(InputError(lost))}", file=sys.stderr)
+        if session.signal in (None, "SIGINT"):  # others ask the process to end
+            stay_open(window, session.reconstruction)
+    return 0 if lost is None else BAD_INPUT
 
 
 def add_to(commands: Any) -> None:
@@ -113,4 +117,5 @@ def add_to(commands: Any) -> None:
         "--max-registers", type=int, default=1024, metavar="N", help="register tokens that GCCR reads, four a frame"
     )
     execution_options(sub)
+    watch_options(sub)
     sub.add_argument("--json", action="store_true", help="print the numbers at the end as JSON, in seconds")

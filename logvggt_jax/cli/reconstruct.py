@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from logvggt_jax.cli.choices import FORMATS, METHOD_NAMES
 from logvggt_jax.cli.command import add_command, execution_options, longer_edge_option, output_option
 from logvggt_jax.cli.exit_codes import BAD_INPUT, INTERRUPTED
+from logvggt_jax.cli.viewing import stay_open, watch_options, watched
 from logvggt_jax.errors import InputError, one_line, printable
 
 if TYPE_CHECKING:
@@ -70,30 +71,34 @@ def _reconstruct(options: argparse.Namespace) -> int:
         print(line if options.dry_run else f"logvggt: {line}", file=sys.stdout if options.dry_run else sys.stderr)
     if options.dry_run:
         return 0
-    model, variables = from_pretrained(checkpoint, dtype=options.dtype)
-    # Here rather than in the stream alone, so that nothing keeps the float32 parameters on the device.
-    variables = in_compute_type(variables, model.config)
-    result = reconstruct(
-        source,
-        options.output,
-        model=model,
-        variables=variables,
-        method=method,
-        settings=settings,
-        longer_edge=longer_edge,
-        point_filter=point_filter,
-        calibration=calibration,
-        num_previews=options.previews,
-        overwrite=options.overwrite,
-    )
-    for note in source.notes[said:]:  # what only reading told
-        print(f"logvggt: note: {printable(note)}", file=sys.stderr)
-    print(result.summary())
-    if not result.complete:
-        if options.export:
+    with watched(options) as window:
+        model, variables = from_pretrained(checkpoint, dtype=options.dtype)
+        # Here rather than in the stream alone, so that nothing keeps the float32 parameters on the device.
+        variables = in_compute_type(variables, model.config)
+        result = reconstruct(
+            source,
+            options.output,
+            model=model,
+            variables=variables,
+            method=method,
+            settings=settings,
+            longer_edge=longer_edge,
+            point_filter=point_filter,
+            calibration=calibration,
+            num_previews=options.previews,
+            overwrite=options.overwrite,
+            watcher=window,
+        )
+        for note in source.notes[said:]:  # what only reading told
+            print(f"logvggt: note: {printable(note)}", file=sys.stderr)
+        print(result.summary())
+        code = INTERRUPTED
+        if result.complete:
+            code = _exports(result, options.export)
+        elif options.export:
             print("logvggt: note: not exported, since it is incomplete; see logvggt export --help", file=sys.stderr)
-        return INTERRUPTED
-    return _exports(result, options.export)
+        stay_open(window, result)
+    return code
 
 
 def _exports(result: Reconstruction, formats: Sequence[str]) -> int:
@@ -276,6 +281,7 @@ def add_to(commands: Any) -> None:
         help="write the finished result in this format too, into OUTPUT/exports; may be given several times "
         "(`logvggt export --help` lists the formats)",
     )
+    watch_options(sub)
     sub.add_argument(
         "--overwrite", action="store_true", help="begin anew and replace an earlier or unfinished reconstruction"
     )

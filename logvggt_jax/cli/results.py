@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from logvggt_jax.cli.choices import FORMATS
 from logvggt_jax.cli.command import add_command, output_option, overwrite_option
+from logvggt_jax.cli.viewing import address, address_options, say_access
 from logvggt_jax.errors import printable
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ def _print_fused(fused: Fused) -> None:
 
 
 def _view(options: argparse.Namespace) -> None:
-    from logvggt_jax.reconstruction.viewer import access_note, open_viewer, save_page, serve_forever
+    from logvggt_jax.reconstruction.viewer import open_viewer, save_page, serve_until_interrupt, stop_server
 
     if options.save is not None:
         shown, stored = save_page(options.folder, options.save, overwrite=options.overwrite)
@@ -75,10 +75,10 @@ def _view(options: argparse.Namespace) -> None:
         print(f"{printable(str(options.save))}: {shown:,} of {stored:,} points, {size:.1f} MB; open it in a browser")
         return
     server = open_viewer(options.folder, host=options.host, port=options.port)
-    print(f"open http://{server.get_host()}:{server.get_port()} in a browser; Ctrl-C ends the viewer", flush=True)
-    if note := access_note(options.host, server.get_port()):
-        print(f"logvggt: {note}", file=sys.stderr)
-    serve_forever(server)
+    print(f"open {address(server)} in a browser; Ctrl-C ends the viewer", flush=True)
+    say_access(server, options.host)
+    serve_until_interrupt()
+    stop_server(server)
 
 
 def _result_argument(parser: argparse.ArgumentParser, reading: str = "") -> None:
@@ -194,8 +194,7 @@ def add_to(commands: Any) -> None:
         "holds the scene, thinned to fit, and opens anywhere.",
     )
     sub.add_argument("folder", type=Path, help="output of `logvggt reconstruct`")
-    sub.add_argument("--port", type=int, default=8080, help="of the web page; the next free one if in use")
-    sub.add_argument("--host", default="127.0.0.1", help="serve at this address, to the network that it belongs to")
+    address_options(sub)
     sub.add_argument(
         "--save", type=Path, default=None, metavar="PAGE", help="write one HTML file to keep or send instead of serving"
     )

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from types import TracebackType
 from typing import Any, TypeVar
 
@@ -79,6 +79,11 @@ class FramePool:
         while self._jobs and (self._jobs[0].done() or len(self._jobs) >= 2 * self._ahead):
             self._jobs.popleft().result()
         self._jobs.append(self._workers.submit(function, *arguments))
+
+    def settle(self) -> None:
+        """Waits until all submitted calls are done, whatever becomes of them."""
+        wait(self._jobs)
+        self._jobs.clear()
 
     def finish(self) -> None:
         """Waits until all submitted calls are done; raises what one of them raised."""

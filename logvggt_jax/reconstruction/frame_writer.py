@@ -20,6 +20,7 @@ from logvggt_jax.reconstruction.health.report import HEALTH_FILE, HEALTH_PAGE, e
 from logvggt_jax.reconstruction.point_cloud import PointSelection
 from logvggt_jax.reconstruction.result import DEPTH_FOLDER, IMAGE_FOLDER, Reconstruction, depth_file, image_file
 from logvggt_jax.reconstruction.sources.record import SourceRecord
+from logvggt_jax.reconstruction.watching import LiveResult
 from logvggt_jax.streaming import Cameras, FrameResult, Predictor
 
 _NARROWEST_FIELD_OF_VIEW = 0.01  # radians
@@ -63,6 +64,7 @@ class FrameWriter:
         self.focal_length: float | None = None
         self.images: dict[int, np.ndarray] = {}
         self.health = HealthRecorder()
+        self._written: set[int] = set()
         for name in (DEPTH_FOLDER, IMAGE_FOLDER):
             (folder / name).mkdir(exist_ok=True)
 
@@ -75,6 +77,12 @@ class FrameWriter:
             self.masked.append(1 - float(picture.mask.mean()))
         self.transform, self.focal_length = picture.transform, picture.focal_length or self.focal_length
 
+    def live_result(self, result: FrameResult) -> LiveResult:
+        """The frame of a result that is not written yet, for whoever looks on."""
+        assert self.transform is not None  # there are frames
+        name, timestamp = self.names[result.index], self.timestamps[result.index]
+        return LiveResult(name, timestamp, self.images[result.index], self.transform.original_size, result)
+
     def write(self, results: Sequence[FrameResult]) -> list[Path]:
         """Has the pool write frames whose depth is final; the files it will have written when the pool has finished."""
         files: list[Path] = []
@@ -84,6 +92,19 @@ class FrameWriter:
             files += [depth, image]
             self._pool.submit(self._write, depth, image, self.images.pop(result.index), result)
         return files
+
+    def keep_written(self, most: int) -> int:
+        """Gives up all frames but the first ones that are written without a gap, `most` at most; how many they are.
+
+        For a sequence that an error has ended, when the pool has finished.
+        """
+        count = next(index for index in range(most + 1) if index == most or index not in self._written)
+        for name in self.names[count:]:
+            depth_file(self._folder, name).unlink(missing_ok=True)
+            image_file(self._folder, name).unlink(missing_ok=True)
+        del self.names[count:], self.timestamps[count:], self.masked[count:]
+        self.images.clear()
+        return count
 
     def write_cameras(
         self,
@@ -151,3 +172,4 @@ class FrameWriter:
         self._selection.see(result.index, *stored, pixels)
         with without_harm():
             self.health.see(result.index, *stored, pixels)
+        self._written.add(result.index)

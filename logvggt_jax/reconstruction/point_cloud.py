@@ -218,6 +218,14 @@ class PointSelection:
             points = FramePoints(*(arrays[name][part] for name in FramePoints._fields))
             self._samples[frame] = _Sample(points, arrays["places"][part], candidates)
 
+    def first(self, frames: int, *, most: int) -> PointSelection:
+        """What is chosen of the first frames alone, `most` points at most; of their confidences all are weighed."""
+        limit = most if self._filter.max_points is None else min(most, self._filter.max_points)
+        other = PointSelection(dataclasses.replace(self._filter, max_points=max(limit, 1)), self._frames)
+        other._histogram = self._histogram.copy()
+        other._samples = {frame: sample for frame, sample in self._samples.items() if frame < frames}
+        return other
+
     @functools.cached_property
     def threshold_bin(self) -> int:
         """Points of lower bins are left out; the largest bin that leaves out at most the percentile."""

@@ -37,6 +37,7 @@ from logvggt_jax.reconstruction.request import check_masks, check_request
 from logvggt_jax.reconstruction.result import Reconstruction
 from logvggt_jax.reconstruction.run import Run
 from logvggt_jax.reconstruction.sources import Source, open_source
+from logvggt_jax.reconstruction.watching import Watcher
 from logvggt_jax.reconstruction.work_folder import WorkFolder
 from logvggt_jax.streaming import open_predictor
 from logvggt_jax.weights.digests import digests
@@ -58,6 +59,7 @@ def reconstruct(
     progress: bool = True,
     workers: int | None = None,
     save_seconds: float = 1.0,
+    watcher: Watcher | None = None,
 ) -> Reconstruction:
     """Reconstructs a sequence and writes cameras, trajectory, depth and points.
 
@@ -86,6 +88,7 @@ def reconstruct(
       progress: show a progress bar where standard error is a terminal, and say there if a run is taken up.
       workers: threads beside the one that feeds the device; None for one a core, at most eight.
       save_seconds: time between two saved states; longer where saving takes more than a twentieth of the time.
+      watcher: is shown every frame whose depth is final, and poses as they are known; changes no result.
 
     Raises:
       OutputExists: `output` exists, or an unfinished result that was asked for otherwise lies beside it.
@@ -129,6 +132,7 @@ def reconstruct(
             selection=PointSelection(point_filter, source.expected_frames),
             longer_edge=longer_edge,
             save_seconds=save_seconds,
+            watcher=watcher,
         )
         task = bars.add_task("Depth and cameras", total=source.expected_frames, completed=run.num_taken)
         if run.num_taken and progress:

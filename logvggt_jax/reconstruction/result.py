@@ -13,6 +13,7 @@ from logvggt_jax.reconstruction.depth_files import read_depth, read_picture
 from logvggt_jax.reconstruction.health.report import HEALTH_FILE, HEALTH_PAGE, Health, read_health
 from logvggt_jax.reconstruction.point_cloud import Cloud, count_points, read_cloud, read_points
 from logvggt_jax.reconstruction.sources.record import SourceRecord
+from logvggt_jax.reconstruction.work_folder import is_unfinished
 
 TRAJECTORY_FILE = "trajectory.txt"
 POINTS_FILE = "points.ply"
@@ -185,7 +186,9 @@ class Reconstruction:
         took = ""
         if self.seconds:
             took = f" in {self.seconds:.1f} s ({self.num_frames / self.seconds:.2f} frames/s)"
-        notes = [] if self.complete else ["ended early: the same command goes on from here"]
+        notes = [] if self.complete else ["ended early"]
+        if is_unfinished(self.folder):
+            notes = ["ended early: the same command goes on from here"]
         if self.skipped:
             notes.append(f"{len(self.skipped)} frames left out: {', '.join(map(printable, self.skipped[:5]))}")
         if self.masked.any():

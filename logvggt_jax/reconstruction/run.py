@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from logvggt_jax.data.feeding.transforms import ResizeTransform, resize
-from logvggt_jax.errors import InputError
+from logvggt_jax.errors import InputError, one_line
 from logvggt_jax.interruption import Interrupted, StopRequest
 from logvggt_jax.reconstruction.calibration import Calibration
 from logvggt_jax.reconstruction.frame_pool import FramePool
@@ -20,12 +20,18 @@ from logvggt_jax.reconstruction.point_cloud import PointSelection
 from logvggt_jax.reconstruction.result import Reconstruction
 from logvggt_jax.reconstruction.sources import SkippedFrame, Source, SourceFrame
 from logvggt_jax.reconstruction.sources.record import record_source
+from logvggt_jax.reconstruction.watching import Watcher
 from logvggt_jax.reconstruction.work_folder import WorkFolder
 from logvggt_jax.streaming import FrameResult, Predictor, Progress
+from logvggt_jax.streaming.pose_stream import LONG_SEQUENCE
 from logvggt_jax.streaming.state_file import State
 
 # Saving takes at most this share of the time.
 _SAVING = 0.05
+# Likewise poses that are asked for before they are final, for those who watch.
+_LOOKING = 0.05
+# Seconds.
+_BETWEEN_LOOKS = 1.0
 
 
 class Run:
@@ -39,6 +45,7 @@ class Run:
       selection: sees every frame whose depth is final.
       longer_edge: of the model's images, in pixels.
       save_seconds: time between two saved states, at least.
+      watcher: is shown every frame whose depth is final, and poses as they are known; None for nobody.
 
     Raises:
       InputError: the source has changed since the state was saved, or the state is damaged.
@@ -54,11 +61,16 @@ class Run:
         selection: PointSelection,
         longer_edge: int,
         save_seconds: float,
+        watcher: Watcher | None = None,
     ) -> None:
         self._source, self._work, self._predictor, self._pool = source, work, predictor, pool
         self.selection, self._longer_edge = selection, longer_edge
         self._save_seconds = save_seconds
         self._last_save, self._saving = time.monotonic(), 0.0
+        self._watcher = watcher
+        # When poses that are not final may be asked for again; None once they are not worth it, or cannot be had.
+        self._next_look: float | None = 0.0
+        self._look_took = 0.0
         self._frames = FrameWriter(work.path, pool, selection)
         # Written since the last save.
         self._files: list[Path] = []
@@ -142,7 +154,30 @@ class Run:
         return Picture(frame.name, frame.timestamp, image, transform, frame.focal_length, mask)
 
     def _hand_on(self, results: list[FrameResult]) -> None:
+        if self._watcher is not None:
+            for result in results:
+                self._watcher.add(self._frames.live_result(result))
+            if any(not result.pose_is_final for result in results):
+                self._show_poses(self._watcher)
         self._files += self._frames.write(results)
+
+    def _show_poses(self, watcher: Watcher) -> None:
+        """Shows poses that are not final, seldom enough to cost a share of the time alone; an error ends that alone."""
+        began = time.monotonic()
+        if self._next_look is None or began < self._next_look:
+            return
+        try:
+            watcher.place(self._predictor.cameras(provisional=True).pose_encoding)
+        except Exception as error:  # of the device's memory above all
+            warnings.warn(f"poses are shown at the end alone, the run goes on: {one_line(error)}", stacklevel=2)
+            self._next_look = None
+            return
+        now = time.monotonic()
+        # Of two looks the quicker one, since now and then a program is compiled for longer buffers.
+        pause = min(self._look_took, now - began) / _LOOKING
+        self._look_took = now - began
+        # Beyond, they are not refined at once any more.
+        self._next_look = None if self._predictor.num_frames > LONG_SEQUENCE else now + max(pause, _BETWEEN_LOOKS)
 
     def _save(self) -> None:
         started = time.monotonic()

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import TracebackType
 
 from logvggt_jax.errors import InputError, OutputExists, disk_errors, one_line
-from logvggt_jax.files import FolderLock, check_output, move_folder, to_disk, write_text
+from logvggt_jax.files import FolderLock, atomic_file, check_output, move_folder, to_disk, write_text
 from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE, is_complete
 from logvggt_jax.streaming.state_file import State, read_state, write_state
 
 _PROGRESS = ".progress"
-_REQUEST, _STATE = "request.json", "state.safetensors"
+_REQUEST, _STATE, _RESERVE = "request.json", "state.safetensors", "reserve"
 _MEND = "pass --overwrite to start anew"
 
 
@@ -91,6 +92,13 @@ class WorkFolder:
         with disk_errors(self.path):
             to_disk(files)
         write_state(self._progress / _STATE, state)
+
+    def reserve(self, size: int) -> Path:
+        """A file that takes up so many bytes of the disk until it is removed; `commit` of a complete result does."""
+        file = self._progress / _RESERVE
+        with atomic_file(file) as temporary:
+            temporary.write_bytes(os.urandom(size))  # nothing that a file system could make smaller
+        return file
 
     def commit(self, *, complete: bool) -> None:
         """Puts the folder in the result's place; an incomplete one can still be taken up."""

@@ -246,7 +246,7 @@ class ChunkSession:
             self._newest = arrays["images"][-1]
             self._newest_mask = arrays["masks"][-1] if "masks" in arrays else None
 
-    def cameras(self) -> Cameras:
+    def cameras(self, *, provisional: bool = False) -> Cameras:
         """Cameras of the frames handed out so far; all are final, but with loops, which change them at the end."""
         if self._cameras is not None:
             return self._cameras

@@ -176,7 +176,7 @@ class FrameSession:
         leaves = [leaf.reshape(()) if kind.ndim == 0 else leaf for leaf, kind in zip(leaves, kinds, strict=True)]
         self._memory = jax.tree.unflatten(structure, [jnp.asarray(leaf) for leaf in leaves])
 
-    def cameras(self) -> Cameras:
+    def cameras(self, *, provisional: bool = False) -> Cameras:
         """Cameras of the frames handed out so far; all are final."""
         return decoded_cameras(self._encodings, self._image_size, final=len(self._encodings))
 

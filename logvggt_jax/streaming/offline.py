@@ -229,7 +229,7 @@ class OfflineSession:
         """See `Predictor.restore`."""
         self._images, self._masks = list(arrays.get("images", ())), list(arrays.get("masks", ()))
 
-    def cameras(self) -> Cameras:
+    def cameras(self, *, provisional: bool = False) -> Cameras:
         """Cameras of the frames handed out so far."""
         return self._final.cameras()
 

@@ -83,8 +83,9 @@ class Predictor(Protocol):
         """Takes up a snapshot of the same method, model and settings; for a predictor that has seen no frame."""
         ...
 
-    def cameras(self) -> Cameras:
-        """Cameras of the frames whose pose is final."""
+    def cameras(self, *, provisional: bool = False) -> Cameras:
+        """Cameras of the frames whose pose is final; with `provisional` of all frames handed out, as far as it can be
+        said before the end. The stream goes on as if nothing had been asked."""
         ...
 
     def signals(self) -> Signals:

@@ -95,6 +95,17 @@ class Cameras(NamedTuple):
     depth_scale: np.ndarray | None = None
     loops: np.ndarray | None = None
 
+    def first(self, count: int) -> Cameras:
+        """Those of the first `count` frames, and the loops among these."""
+        return Cameras(
+            self.pose_encoding[:count],
+            self.extrinsics[:count],
+            self.intrinsics[:count],
+            self.is_final[:count],
+            None if self.depth_scale is None else self.depth_scale[:count],
+            None if self.loops is None else self.loops[(self.loops < count).all(axis=1)],
+        )
+
 
 def decoded_cameras(encodings: np.ndarray, image_size: tuple[int, int], *, final: int) -> Cameras:
     """Cameras of pose encodings [N, 9] for images of (H, W) pixels, the first `final` of which are final."""

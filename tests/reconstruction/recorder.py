@@ -54,7 +54,7 @@ class Recorder:
         self.num_frames = int(arrays["num_frames"][0])
         self.frames = list(arrays.get("frames", ()))
 
-    def cameras(self) -> Cameras:
+    def cameras(self, *, provisional: bool = False) -> Cameras:
         encodings = np.tile(np.array([0, 0, 0, 0, 0, 0, 1, 1, 1.2], np.float32), (self.num_frames, 1))
         encodings[:, 0] = np.arange(self.num_frames)
         return decoded_cameras(encodings, (28, 42), final=self.num_frames)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import shutil
 import signal
 import threading
 import time
@@ -19,9 +20,9 @@ from recorder import LONGER_EDGE, Recorder
 
 from logvggt_jax import LogVGGT, ModelConfig, StreamSession
 from logvggt_jax.cli import main
-from logvggt_jax.errors import InputError
+from logvggt_jax.errors import DiskError, InputError
 from logvggt_jax.interruption import Interrupted
-from logvggt_jax.reconstruction import Reconstruction, Source, SourceFrame, SourceOptions
+from logvggt_jax.reconstruction import Reconstruction, Source, SourceFrame, SourceOptions, frame_writer
 from logvggt_jax.reconstruction.live import (
     LiveResult,
     LiveSession,
@@ -29,6 +30,7 @@ from logvggt_jax.reconstruction.live import (
     Recording,
     capture,
     online_stream,
+    recording,
 )
 from logvggt_jax.reconstruction.live.follow import follow
 from logvggt_jax.reconstruction.live.newest import FrameCounts, NewestFrames
@@ -236,12 +238,99 @@ def test_a_video_is_played_at_its_own_pace_and_its_end_is_no_loss(tmp_path: Path
     assert Reconstruction.open(tmp_path / "out").complete
 
 
-def test_an_error_in_the_session_reaches_the_caller_and_leaves_no_folder(tmp_path: Path) -> None:
-    def broken(_: LiveResult) -> None:
-        raise RuntimeError("the robot fell over")
+def kept(folder: Path, count: int) -> Reconstruction:
+    """The result in `folder/out`, which is whole, incomplete, of so many frames, and alone there."""
+    result = Reconstruction.open(folder / "out")
+    assert result.names == tuple(f"frame-{index:06d}" for index in range(count)) and not result.complete
+    assert len(list((result.folder / "depth").iterdir())) == len(list((result.folder / "images").iterdir())) == count
+    assert result.cloud().frame is not None and set(result.cloud().frame) == set(range(count))
+    assert "goes on" not in result.summary()
+    assert [entry.name for entry in folder.iterdir()] == ["out"]
+    return result
 
-    with pytest.raises(RuntimeError, match="fell over"):
-        follow(FakeCamera(8), session(on_result=broken, recording=Recording(tmp_path / "out")))
+
+def test_an_error_in_the_session_reaches_the_caller_and_what_was_final_is_kept(tmp_path: Path) -> None:
+    def broken(result: LiveResult) -> None:
+        if result.result.index == 3:
+            raise RuntimeError("the robot fell over")
+
+    live = session(on_result=broken, recording=Recording(tmp_path / "out", workers=1))
+    with (
+        pytest.raises(RuntimeError, match="fell over"),
+        pytest.warns(match=r"4 frames that were final are kept in .*out"),
+    ):
+        follow(FakeCamera(8), live)
+    assert live.reconstruction is not None and live.reconstruction.folder == kept(tmp_path, 4).folder
+
+
+def test_an_error_of_the_source_reaches_the_caller_and_every_frame_before_it_is_kept(tmp_path: Path) -> None:
+    def broken(number: int) -> None:
+        if number == 5:
+            raise RuntimeError("the decoder crashed")
+
+    live = session(recording=Recording(tmp_path / "out", workers=1))
+    with pytest.raises(RuntimeError, match="decoder crashed"), pytest.warns(match=r"before is kept in .*out"):
+        follow(FakeCamera(8, on_frame=broken), live)
+    kept(tmp_path, 5)
+
+
+def test_of_a_session_that_is_left_by_an_error_what_was_used_is_kept(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt), pytest.warns(match="frames that were final are kept"):  # noqa: SIM117
+        with session(recording=Recording(tmp_path / "out", workers=1)) as live:
+            for picture in PICTURES[:5]:
+                live.push(picture)
+            while live.report().used < 5:
+                time.sleep(0.001)
+            raise KeyboardInterrupt
+    kept(tmp_path, 5)
+
+
+def test_a_full_disk_leaves_what_was_written_with_the_points_that_fit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reserve, write = tmp_path / "out.partial" / ".progress" / "reserve", frame_writer.write_depth
+
+    def write_depth(path: Path, *arrays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if path.stem == "frame-000005":
+            assert reserve.stat().st_size == 16_000_000
+            raise DiskError(f"{path}: No space left on device")
+        return write(path, *arrays)
+
+    def disk_usage(_: Path) -> Any:
+        assert not reserve.exists()
+        return shutil._ntuple_diskusage(10**9, 10**9, 2 * 23 * 100)
+
+    monkeypatch.setattr(frame_writer, "write_depth", write_depth)
+    monkeypatch.setattr(recording.shutil, "disk_usage", disk_usage)
+    with pytest.raises(DiskError, match="No space left"), pytest.warns(match="5 frames that were final are kept"):
+        follow(FakeCamera(12), session(recording=Recording(tmp_path / "out", workers=1)))
+    assert 80 <= kept(tmp_path, 5).num_points <= 100
+
+
+def test_who_is_impatient_while_a_recording_is_finished_keeps_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls, finish = [], recording.finish
+
+    def interrupted(*arguments: Any, **options: Any) -> None:
+        calls.append(options["num_previews"])
+        if len(calls) == 1:
+            raise KeyboardInterrupt
+        finish(*arguments, **options)
+
+    monkeypatch.setattr(recording, "finish", interrupted)
+    with pytest.raises(KeyboardInterrupt), pytest.warns(match="6 frames that were final are kept"):
+        follow(FakeCamera(6), session(recording=Recording(tmp_path / "out", workers=1)))
+    kept(tmp_path, 6)
+    assert calls == [8, 0]
+
+
+def test_an_error_before_anything_was_final_leaves_no_folder(tmp_path: Path) -> None:
+    def broken(_: int) -> None:
+        raise RuntimeError("no device")
+
+    with pytest.raises(RuntimeError, match="no device"):
+        follow(FakeCamera(8), session(Recorder(broken), recording=Recording(tmp_path / "out")))
     assert list(tmp_path.iterdir()) == []
 
 

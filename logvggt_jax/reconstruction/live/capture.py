@@ -11,6 +11,8 @@ from logvggt_jax.reconstruction.sources import Source
 
 # Between two tries to reach a stream that was lost.
 _PAUSE = 1.0
+# Seconds that a read in progress is given when nothing is wanted any more.
+_LEAVE = 1.0
 
 
 class Capture:
@@ -44,8 +46,10 @@ class Capture:
         self._thread.start()
 
     def stop(self) -> None:
-        """Nothing is pushed any more; does not wait for a camera that is silent."""
+        """Nothing is pushed any more; a camera that is silent is not waited for longer than a second."""
         self._stop.set()
+        # A process that ends while a thread of it is inside a decoder crashes.
+        self._thread.join(_LEAVE)
 
     def _run(self) -> None:
         try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import warnings
 
 from logvggt_jax.errors import InputError
 from logvggt_jax.interruption import Interrupted, StopRequest
@@ -26,7 +27,8 @@ def follow(
 ) -> str | None:
     """Feeds a camera to a session and leaves it; what is final by then is kept in every case.
 
-    In the main thread Ctrl-C, SIGTERM and SIGHUP end the sequence; a second signal acts as usual.
+    In the main thread Ctrl-C, SIGTERM and SIGHUP end the sequence; a second signal acts as usual, but what was final is
+    kept even then if it is Ctrl-C.
 
     Args:
       source: the camera, stream or video.
@@ -41,23 +43,31 @@ def follow(
     Raises:
       InputError: not one frame came.
       Interrupted: the user ended it before one did.
-      Exception: what went wrong in the session.
+      Exception: what went wrong in the session, or in the source; what was final is kept.
     """
     lost: str | None = None
+    broken: Exception | None = None
     capture = Capture(source, session, realtime=realtime, reconnect=reconnect)
     with StopRequest("SIGINT", "SIGTERM", "SIGHUP") as stop, session:
         capture.start()
         status = _Status(session, shown=progress)
-        while not (stop.reason or session.failed or capture.ended.wait(_TICK)):
-            status.tick()
-        capture.stop()
-        status.end()
+        try:
+            while not (stop.reason or session.failed or capture.ended.wait(_TICK)):
+                status.tick()
+        finally:
+            capture.stop()
+            status.end()
         if not (stop.reason or session.failed):
             if capture.reason is not None and not isinstance(capture.reason, InputError):
-                raise capture.reason
-            if capture.reason is not None or not realtime:
+                broken = capture.reason
+            elif capture.reason is not None or not realtime:
                 lost = f"{source.name} is lost: {capture.reason or 'no more frames come; is it still connected?'}"
-                session.complete = False
+            session.complete = broken is None and lost is None
+        session.signal = stop.reason
+    if broken is not None:
+        if session.reconstruction is not None:
+            warnings.warn(f"what was seen before is kept in {session.reconstruction.folder}", stacklevel=2)
+        raise broken
     if session.report().received == 0:
         if stop.reason is not None:
             raise Interrupted(stop.reason, "no frame had come yet")

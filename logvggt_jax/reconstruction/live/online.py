@@ -37,13 +37,17 @@ class OnlineSettings:
         )
 
 
-def online_stream(model: LogVGGT, variables: Variables, settings: OnlineSettings = OnlineSettings()) -> StreamSession:
+def online_stream(
+    model: LogVGGT, variables: Variables, settings: OnlineSettings = OnlineSettings(), *, provisional: bool = False
+) -> StreamSession:
     """A stream of constant cost, whose results come as soon as the device has them.
 
     Args:
       model: the model; its own refinement's mode is replaced.
       variables: {"params": …}.
       settings: what is kept of the past.
+      provisional: give frames whose pose is not final yet, with a `period` longer than the windows' stride, the pose
+        that they would have if the stream ended now; costs a run of the camera head at every window.
 
     Raises:
       InputError: the context is smaller than the windows' stride.
@@ -57,4 +61,6 @@ def online_stream(model: LogVGGT, variables: Variables, settings: OnlineSettings
         context=settings.context,
         max_registers=settings.max_registers,
     )
-    return StreamSession(LogVGGT(dataclasses.replace(model.config, refinement=refinement)), variables, ahead=0)
+    return StreamSession(
+        LogVGGT(dataclasses.replace(model.config, refinement=refinement)), variables, ahead=0, provisional=provisional
+    )

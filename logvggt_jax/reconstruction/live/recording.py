@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
@@ -13,17 +14,21 @@ from logvggt_jax.reconstruction.calibration import Calibration
 from logvggt_jax.reconstruction.finishing import finish
 from logvggt_jax.reconstruction.frame_pool import FramePool
 from logvggt_jax.reconstruction.frame_writer import FrameWriter, Picture
-from logvggt_jax.reconstruction.point_cloud import PointFilter, PointSelection
+from logvggt_jax.reconstruction.point_cloud import VERTEX, PointFilter, PointSelection
 from logvggt_jax.reconstruction.result import Reconstruction
 from logvggt_jax.reconstruction.work_folder import WorkFolder
 from logvggt_jax.streaming import FrameResult, Predictor
+
+# Bytes that are kept free for what follows an error: cameras, trajectory and some points.
+_RESERVE = 16_000_000
 
 
 class Recording:
     """Where a live session's frames go to the disk as they become final.
 
     The work lies in `<output>.partial` until the session ends. What a camera has shown cannot be read again: a
-    recording is never taken up, and one that ends by an error is gone. A `LiveSession` enters and leaves it.
+    recording is never taken up, and when an error ends it, what was final by then becomes the result. So that this can
+    be written to a full disk, 16 MB of it are taken up from the beginning. A `LiveSession` enters and leaves it.
 
     Args:
       output: folder to make.
@@ -59,13 +64,14 @@ class Recording:
             self._pool = stack.enter_context(FramePool(self._workers))
             self._selection = PointSelection(self._filter, None)
             self._frames = FrameWriter(self._work.path, self._pool, self._selection)
+            self._reserve = self._work.reserve(_RESERVE)
             self._stack = stack.pop_all()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Lets go of the folder; without `finish` nothing of it is left."""
+        """Lets go of the folder; without `finish` or `rescue` nothing of it is left."""
         self._stack.__exit__(kind, error, trace)
 
     def add(self, picture: Picture) -> None:
@@ -89,7 +95,30 @@ class Recording:
         self._frames.write_cameras(stream.cameras(), self._calibration, complete=complete)
         result = Reconstruction.with_cameras_of(self._work.path)
         self._frames.write_health(result, stream)
-        finish(result, self._selection, self._pool, num_previews=self._num_previews, advance=lambda: None)
+        return self._finished(result, self._selection, num_previews=self._num_previews)
+
+    def rescue(self, stream: Predictor) -> Reconstruction | None:
+        """Puts what was final in the result's place after an error, marked as incomplete; None where nothing was.
+
+        It has no previews and no word on its health, and on a full disk fewer points. Nothing may be at work on the
+        recording or the stream any more.
+        """
+        self._pool.settle()
+        if not len(stream.cameras().is_final):
+            with contextlib.suppress(Exception):  # the poses of some streams are final when they are closed
+                stream.close()
+        cameras = stream.cameras()
+        count = self._frames.keep_written(len(cameras.is_final))
+        if not count:
+            return None
+        self._reserve.unlink(missing_ok=True)
+        self._frames.write_cameras(cameras.first(count), self._calibration, complete=False)
+        result = Reconstruction.with_cameras_of(self._work.path)
+        room = shutil.disk_usage(self._work.path).free // 2 // VERTEX.itemsize
+        return self._finished(result, self._selection.first(count, most=room), num_previews=0)
+
+    def _finished(self, result: Reconstruction, selection: PointSelection, *, num_previews: int) -> Reconstruction:
+        finish(result, selection, self._pool, num_previews=num_previews, advance=lambda: None)
         # Whatever ended it: nothing can go on from there.
         self._work.commit(complete=True)
         return dataclasses.replace(result, folder=self._target)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
+import warnings
 from collections import deque
 from collections.abc import Callable
 from types import TracebackType
@@ -13,34 +14,19 @@ from typing import NamedTuple
 import numpy as np
 
 from logvggt_jax.data.feeding.transforms import LONGER_EDGE, check_longer_edge, resize
-from logvggt_jax.errors import InputError
+from logvggt_jax.errors import InputError, one_line
 from logvggt_jax.reconstruction.frame_writer import Picture
 from logvggt_jax.reconstruction.live.newest import NewestFrames
 from logvggt_jax.reconstruction.live.recording import Recording
 from logvggt_jax.reconstruction.live.report import LiveReport, StageTimes
 from logvggt_jax.reconstruction.result import Reconstruction
+from logvggt_jax.reconstruction.watching import LiveResult
 from logvggt_jax.streaming import Cameras, FrameResult, Predictor
 
 # Used frames over which the rate is taken.
 _RATE_FRAMES = 100
-
-
-class LiveResult(NamedTuple):
-    """A frame whose depth is final.
-
-    Attributes:
-      name: `frame-000123` with its position among all frames that came.
-      timestamp: as it was pushed, seconds.
-      image: [h, w, 3] uint8, the frame at the model's size.
-      original_size: (H, W) as it was pushed.
-      result: depth, confidence and pose; `result.index` is its position among the frames that were used.
-    """
-
-    name: str
-    timestamp: float
-    image: np.ndarray
-    original_size: tuple[int, int]
-    result: FrameResult
+# Seconds for which the window at hand is waited for when its user has lost patience.
+_PATIENCE = 10.0
 
 
 class _Waiting(NamedTuple):
@@ -64,7 +50,8 @@ class LiveSession:
     with neighbours.
 
     Leaving the block uses the frames that wait, ends the stream, hands on what became final, and finishes the
-    recording. What goes wrong in the thread (`on_result` included) is raised by the next `push` or at the end.
+    recording. What goes wrong in the thread (`on_result` included) is raised by the next `push` or at the end. After an
+    error, there or in the block, the recording holds what was final, marked as incomplete, and a warning says where.
 
     Args:
       open_stream: gives a stream that has seen no frame, see `online_stream`.
@@ -79,7 +66,8 @@ class LiveSession:
     Attributes:
       unreadable: frames that whoever captures could not decode, for the report.
       complete: what a recording says of itself: False where the camera was lost.
-      reconstruction: what the recording has become; None before the end, or without any.
+      signal: name of the signal that ended the sequence; None where none did.
+      reconstruction: what the recording has become, after an error too; None before the end, or without any.
     """
 
     def __init__(
@@ -98,6 +86,7 @@ class LiveSession:
         self._open_stream, self._longer_edge, self._warm_up = open_stream, longer_edge, warm_up
         self._on_result, self._recording = on_result, recording
         self.unreadable, self.complete = 0, True
+        self.signal: str | None = None
         self.reconstruction: Reconstruction | None = None
         self.times = StageTimes()
         self._capacity = capacity
@@ -124,14 +113,38 @@ class LiveSession:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         with self._stack:
-            self._queue.close(drop=kind is not None)
-            self._thread.join()
-            if kind is not None:
-                return
-            if self._failure is not None:
-                raise self._failure
-            if self._recording is not None and self._stream is not None:
-                self.reconstruction = self._recording.finish(self._stream, complete=self.complete)
+            try:
+                self._queue.close(drop=kind is not None)
+                self._thread.join()
+                if kind is not None:
+                    self._rescue()
+                    return
+                if self._failure is not None:
+                    raise self._failure
+                if self._recording is not None and self._stream is not None:
+                    self.reconstruction = self._recording.finish(self._stream, complete=self.complete)
+            except BaseException:
+                if kind is None:
+                    self._rescue()
+                raise
+
+    def _rescue(self) -> None:
+        """Makes a result of what was final when an error came; what goes wrong with that must not hide the error."""
+        if self._recording is None or self._stream is None:
+            return
+        self._queue.close(drop=True)
+        self._thread.join(_PATIENCE)
+        if self._thread.is_alive():
+            warnings.warn("the recording is lost: the device does not answer", stacklevel=3)
+            return
+        try:
+            self.reconstruction = self._recording.rescue(self._stream)
+        except Exception as error:
+            warnings.warn(f"the recording is lost, too: {one_line(error)}", stacklevel=3)
+        else:
+            if self.reconstruction is not None:
+                kept = f"{self.reconstruction.num_frames} frames that were final are kept"
+                warnings.warn(f"{kept} in {self.reconstruction.folder}", stacklevel=3)
 
     @property
     def failed(self) -> bool:

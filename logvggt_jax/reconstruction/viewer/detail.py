@@ -10,6 +10,15 @@ from logvggt_jax.reconstruction.point_cloud import Cloud
 MOST_SHOWN = 2_000_000
 USUALLY_SHOWN = 500_000
 _BLOCK = 1_000_000
+# Choices of a number of points.
+_MOST_LEVELS = 6
+
+
+def levels_of_detail(count: int) -> list[int]:
+    """How many of `count` points may be shown: all that a browser turns, then fewer, 1, 2 and 5 times 10, 100, …"""
+    most = max(min(count, MOST_SHOWN), 1)
+    round_numbers = [digit * 10**power for power in range(len(str(most))) for digit in (1, 2, 5)]
+    return [most, *sorted((each for each in round_numbers if each < most), reverse=True)][:_MOST_LEVELS]
 
 
 class Detail:

@@ -12,8 +12,9 @@ from logvggt_jax.geometry import camera_centres
 _NARROWEST, _WIDEST = np.radians(30.0), np.radians(80.0)
 # Of the points before the first camera, those that the opening view shows.
 _SHARE = 0.9
-# Moving back ends at this many times the distance of what the first camera sees.
-_FARTHEST_BACK = 1.0
+# By the distance of what the first camera sees: moving back ends there, and begins where the camera itself, which is
+# drawn with its picture, does not stand in the way.
+_FARTHEST_BACK, _NEAREST_BACK = 1.0, 0.2
 _MOST_POINTS = 50_000
 
 
@@ -56,7 +57,8 @@ def up_direction(extrinsics: np.ndarray) -> np.ndarray:
 def opening_view(
     extrinsics: np.ndarray, intrinsics: np.ndarray, image_size: tuple[int, int], points: np.ndarray
 ) -> View:
-    """Where the first camera looks from, as far back as it takes to see nine tenths of what lies before it.
+    """Where the first camera looks from, a little behind it, or as far as it takes to see nine tenths of what lies
+    before it.
 
     Args:
       extrinsics: [N, 3, 4] world-to-camera.
@@ -74,7 +76,7 @@ def opening_view(
         distance = float(np.median(seen[:, 2]))
         tangents = np.tan(field_of_view / 2) * np.array([width / height, 1.0])
         needed = (np.abs(seen[:, :2]) / tangents).max(axis=1) - seen[:, 2]
-        back = float(np.clip(np.quantile(needed, _SHARE), 0.0, _FARTHEST_BACK * distance))
+        back = float(np.clip(np.quantile(needed, _SHARE), _NEAREST_BACK * distance, _FARTHEST_BACK * distance))
     centre, forward = camera_centres(first[None])[0], first[2, :3]
     up = up_direction(extrinsics)
     return View(centre - back * forward, centre + distance * forward, up, field_of_view)

@@ -22,6 +22,7 @@ from logvggt_jax.reconstruction.previews import depth_range
 from logvggt_jax.reconstruction.result import IMAGE_FOLDER, Reconstruction
 from logvggt_jax.reconstruction.viewer.colouring import IMAGE, colourings, level_limits, palette, point_levels
 from logvggt_jax.reconstruction.viewer.detail import Detail
+from logvggt_jax.reconstruction.viewer.drawing import MOST_FRUSTA, camera_size
 from logvggt_jax.reconstruction.viewer.opening_view import opening_view, point_spacing, scene_span
 
 # Mail and forums take files of up to 25 MB.
@@ -82,6 +83,7 @@ def _scene(result: Reconstruction, cloud: Cloud, steps: np.ndarray) -> dict[str,
     centres = camera_centres(result.extrinsics)
     view = opening_view(result.extrinsics, result.intrinsics, result.image_size, cloud.points)
     origin, size = _box(cloud.points)
+    span = scene_span(cloud.points, centres)
     height, width = result.image_size
     return {
         "view": {
@@ -90,7 +92,9 @@ def _scene(result: Reconstruction, cloud: Cloud, steps: np.ndarray) -> dict[str,
             "up": view.up.tolist(),
             "fieldOfView": view.field_of_view,
         },
-        "span": scene_span(cloud.points, centres),
+        "span": span,
+        "frustum": camera_size(centres[steps], span),
+        "mostFrusta": MOST_FRUSTA,
         "origin": origin.tolist(),
         "size": size.tolist(),
         "path": centres.round(6).tolist(),

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
+import io
+import logging
 import socket
 import time
 from pathlib import Path
@@ -10,6 +13,7 @@ from typing import Any
 
 from logvggt_jax.errors import InputError, MissingPackage, install_line
 from logvggt_jax.reconstruction.result import Reconstruction
+from logvggt_jax.reconstruction.viewer.run_window import RunWindow
 from logvggt_jax.reconstruction.viewer.window import Window
 
 HOST = "127.0.0.1"
@@ -29,6 +33,18 @@ def open_viewer(folder: str | Path, *, host: str = HOST, port: int = 8080) -> An
       MissingPackage: viser is not installed.
     """
     result = Reconstruction.open(folder)
+    server = open_server(host, port)
+    Window(server, result)
+    return server
+
+
+def watch_run(*, host: str = HOST, port: int = 8080) -> RunWindow:
+    """Starts a viewer of a run that is about to begin; the other arguments and errors are those of `open_viewer`."""
+    return RunWindow(open_server(host, port))
+
+
+def open_server(host: str, port: int) -> Any:
+    """A server (viser) of an empty page; arguments and errors as of `open_viewer`."""
     port = _free_port(host, port)
     try:
         import viser
@@ -36,9 +52,10 @@ def open_viewer(folder: str | Path, *, host: str = HOST, port: int = 8080) -> An
         raise MissingPackage(
             f"the viewer needs viser: {install_line('viewer')}; a page that needs nothing is written with --save"
         ) from error
-    server = viser.ViserServer(host=host, port=port, verbose=False)
-    Window(server, result)
-    return server
+    # Browsers open connections ahead and close them unused, which is no error.
+    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
+    with contextlib.redirect_stdout(io.StringIO()):  # a box of its own, where standard output may be data
+        return viser.ViserServer(host=host, port=port, verbose=False)
 
 
 def access_note(host: str, port: int) -> str:
@@ -71,10 +88,14 @@ def _free_port(host: str, port: int) -> int:
     raise InputError(f"the viewer cannot be served at {host!r}: every port from {port} to {candidate} is in use")
 
 
-def serve_forever(server: Any) -> None:
-    """Blocks until the user interrupts, then stops the server."""
-    try:
+def serve_until_interrupt() -> None:
+    """Blocks until the user interrupts."""
+    with contextlib.suppress(KeyboardInterrupt):
         while True:
             time.sleep(1.0)
-    except KeyboardInterrupt:
+
+
+def stop_server(server: Any) -> None:
+    """Ends a server of `open_viewer`, or of the window of `watch_run`, and says nothing."""
+    with contextlib.redirect_stdout(io.StringIO()):
         server.stop()

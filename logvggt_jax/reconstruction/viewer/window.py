@@ -7,16 +7,26 @@ import io
 import threading
 from typing import Any
 
-import cv2
 import numpy as np
 from PIL import Image
 
 from logvggt_jax.colours import depth_picture
-from logvggt_jax.geometry import camera_centres, matrix_to_quaternion
+from logvggt_jax.geometry import camera_centres
 from logvggt_jax.reconstruction.previews import depth_range
 from logvggt_jax.reconstruction.result import IMAGE_FOLDER, Reconstruction
 from logvggt_jax.reconstruction.viewer.colouring import IMAGE, colourings, level_limits, point_colours
-from logvggt_jax.reconstruction.viewer.detail import MOST_SHOWN, USUALLY_SHOWN, Detail
+from logvggt_jax.reconstruction.viewer.detail import USUALLY_SHOWN, Detail, levels_of_detail
+from logvggt_jax.reconstruction.viewer.drawing import (
+    MOST_FRUSTA,
+    PRESENT,
+    camera_size,
+    draw_camera,
+    draw_path,
+    draw_points,
+    look_from,
+    set_ground,
+    shrunk,
+)
 from logvggt_jax.reconstruction.viewer.opening_view import (
     View,
     camera_view,
@@ -25,11 +35,6 @@ from logvggt_jax.reconstruction.viewer.opening_view import (
     scene_span,
 )
 
-# Cameras that are drawn, evenly over the sequence, and the width of their pictures in pixels.
-MOST_FRUSTA, _THUMBNAIL = 100, 96
-_PICTURE = 320
-_PATH, _FRUSTUM, _PRESENT = (230, 80, 50), (120, 150, 200), (255, 190, 40)
-_LINES: dict[str, Any] = {"thickness": 1.5, "thickness_units": "screen"}
 _SCREENSHOT = (1080, 1920)
 # From which the scale of colours is taken.
 _SCALE_POINTS = 200_000
@@ -52,7 +57,6 @@ class Window:
         self._detail = Detail(self._cloud)
         self._centres = camera_centres(result.extrinsics)
         self._span = scene_span(self._cloud.points, self._centres)
-        self._spacing = point_spacing(self._span, min(len(self._cloud.points), USUALLY_SHOWN))
         self._view = opening_view(result.extrinsics, result.intrinsics, result.image_size, self._cloud.points)
         sample = self._detail.choose(_SCALE_POINTS)
         # The ends of each scale are the same whatever part of the cloud is shown.
@@ -62,6 +66,7 @@ class Window:
         # Callbacks come in threads of the server's, and some call one another.
         self._lock = threading.RLock()
         self._shown: int | None = None
+        self._spacing = point_spacing(self._span, 0)
         self._playing: threading.Event | None = None
         self._open_at(self._view)
         self._add_controls()
@@ -77,12 +82,13 @@ class Window:
 
     def _add_controls(self) -> None:
         gui, frames, points = self._server.gui, self._result.num_frames, len(self._cloud.points)
-        shown = max(min(points, MOST_SHOWN), 1)
+        levels = levels_of_detail(points)
         with gui.add_folder("Points"):
             self.colouring = gui.add_dropdown("colour", colourings(self._cloud), initial_value=IMAGE)
             self.point_size = gui.add_slider("size", 0.1, 4.0, 0.1, 1.0)
             self.left_out = gui.add_slider("least sure, % hidden", 0, 99, 1, 0, disabled=self._cloud.confidence is None)
-            self.most = gui.add_slider(f"shown of {points:,}", 1, shown, 1, min(shown, USUALLY_SHOWN))
+            usual = next((each for each in levels if each <= USUALLY_SHOWN), levels[-1])
+            self.most = gui.add_dropdown(f"of {points:,}", [f"{each:,}" for each in levels], initial_value=f"{usual:,}")
         with gui.add_folder("Frames"):
             self.frame = gui.add_slider("frame", 0, max(frames - 1, 1), 1, 0, disabled=frames == 1)
             self.alone = gui.add_checkbox("its points alone", False, disabled=self._cloud.frame is None)
@@ -104,8 +110,8 @@ class Window:
         self.play.on_update(lambda _: self._start_or_stop())
         self.dark.on_update(lambda _: self._set_ground())
         self.cameras.on_update(lambda _: self._show_cameras())
-        jump.on_click(lambda event: self._look(event.client, self._camera_view(int(self.frame.value))))
-        home.on_click(lambda event: self._look(event.client, self._view))
+        jump.on_click(lambda event: self._look_through(event.client, int(self.frame.value)))
+        home.on_click(lambda event: self._go_home(event.client))
         fly.on_click(lambda event: self._fly(event.client))
         screenshot.on_click(lambda event: self._screenshot(event.client))
 
@@ -113,18 +119,16 @@ class Window:
         with self._lock:
             frame = int(self.frame.value) if self.alone.value else None
             lowest = self._detail.confidence_at(float(self.left_out.value))
-            chosen = self._detail.choose(int(self.most.value), lowest=lowest, frame=frame)
+            most = int(self.most.value.replace(",", ""))
+            chosen = self._detail.choose(most, lowest=lowest, frame=frame)
             colouring = self.colouring.value
             colours = point_colours(colouring, self._cloud, chosen, self._result, self._limits[colouring])
-            self.points = self._server.scene.add_point_cloud(
-                "/points",
-                self._cloud.points[chosen],
-                colours,
-                point_size=self._point_size,
-                point_shape="circle",
-                point_shading="flat",
-                precision="float32",  # of half precision a scene shows the steps
-            )
+            points = self._cloud.points[chosen]
+            if frame is None:
+                self._spacing = point_spacing(self._span, min(most, len(self._cloud.points)))
+            elif len(points):
+                self._spacing = point_spacing(scene_span(points, points[:1]), len(points))
+            self.points = draw_points(self._server, points, colours, self._point_size)
 
     @property
     def _point_size(self) -> float:
@@ -135,31 +139,21 @@ class Window:
             self.points.point_size = self._point_size
 
     def _draw_cameras(self) -> None:
-        result, scene = self._result, self._server.scene
         self._frusta = []
-        for index in np.unique(np.linspace(0, result.num_frames - 1, MOST_FRUSTA).round().astype(int)).tolist():
-            frustum = self._frustum(f"/cameras/{index:06d}", index, self._span / 40, _FRUSTUM, _THUMBNAIL)
-            frustum.on_click(lambda event, index=index: self._look(event.client, self._camera_view(index)))
+        drawn = np.unique(np.linspace(0, self._result.num_frames - 1, MOST_FRUSTA).round().astype(int))
+        self._frustum_size = camera_size(self._centres[drawn], self._span)
+        for index in drawn.tolist():
+            frustum = self._frustum(f"/cameras/{index:06d}", index, size=self._frustum_size)
+            frustum.on_click(lambda event, index=index: self._look_through(event.client, index))
             self._frusta.append(frustum)
         if len(self._centres) > 1:
-            segments = np.stack([self._centres[:-1], self._centres[1:]], axis=1)
-            self._frusta.append(scene.add_line_segments("/path", segments, colors=_PATH, **_LINES))
+            self._frusta.append(draw_path(self._server, self._centres))
 
-    def _frustum(self, name: str, index: int, size: float, colour: tuple[int, int, int], width: int) -> Any:
-        height, image_width = self._result.image_size
-        x, y, z, w = matrix_to_quaternion(self._result.extrinsics[index : index + 1, :3, :3].swapaxes(-1, -2))[0]
-        return self._server.scene.add_camera_frustum(
-            name,
-            fov=2 * float(np.arctan(height / 2 / self._result.intrinsics[index, 1, 1])),
-            aspect=image_width / height,
-            scale=size,
-            color=colour,
-            **_LINES,
-            image=_shrunk(self._result.image(index), width) if self._has_images else None,
-            format="jpeg",
-            wxyz=(w, x, y, z),
-            position=tuple(self._centres[index]),
-        )
+    def _frustum(self, name: str, index: int, **options: Any) -> Any:
+        result = self._result
+        picture = result.image(index) if self._has_images else None
+        camera = result.extrinsics[index], result.intrinsics[index]
+        return draw_camera(self._server, name, *camera, result.image_size, picture=picture, **options)
 
     def _show_cameras(self) -> None:
         for drawn in (*self._frusta, self._present):
@@ -172,20 +166,18 @@ class Window:
                 return
             self._shown = index
             near, far = self._depth_range
-            self._depth.image = _shrunk(depth_picture(self._result.depth(index), near=near, far=far), _PICTURE)
+            self._depth.image = shrunk(depth_picture(self._result.depth(index), near=near, far=far))
             self._depth.label = f"depth, {near:.3g} (yellow) to {far:.3g}{' m' if self._result.metric else ''}"
             if self._has_images:
-                self._image.image = _shrunk(self._result.image(index), _PICTURE)
+                self._image.image = shrunk(self._result.image(index))
                 self._image.label = f"{self._result.names[index]}, {self._result.timestamps[index]:g}"
-            self._present = self._frustum("/present", index, self._span / 25, _PRESENT, _THUMBNAIL)
+            self._present = self._frustum("/present", index, size=1.6 * self._frustum_size, colour=PRESENT)
             self._present.visible = bool(self.cameras.value)
             if self.alone.value or not hasattr(self, "points"):
                 self._draw_points()
 
     def _set_ground(self) -> None:
-        dark = bool(self.dark.value)
-        self._server.gui.configure_theme(dark_mode=dark, show_logo=False, show_share_button=False)
-        self._server.scene.set_background_image(np.full((1, 1, 3), 18 if dark else 250, np.uint8), format="png")
+        set_ground(self._server, dark=bool(self.dark.value))
 
     def _camera_view(self, index: int) -> View:
         height = self._result.image_size[0]
@@ -193,12 +185,13 @@ class Window:
         distance = float(np.linalg.norm(self._view.target - self._centres[0])) or 1.0
         return camera_view(self._result.extrinsics[index], self._view.up, field_of_view, distance)
 
-    def _look(self, client: Any, view: View) -> None:
-        with client.atomic():
-            client.camera.up_direction = tuple(view.up)
-            client.camera.position = tuple(view.position)
-            client.camera.look_at = tuple(view.target)
-            client.camera.fov = view.field_of_view
+    def _look_through(self, client: Any, index: int) -> None:
+        look_from(client, self._camera_view(index))
+        self.cameras.value = False  # its own picture, and those of its neighbours, would stand in the way
+
+    def _go_home(self, client: Any) -> None:
+        look_from(client, self._view)
+        self.cameras.value = True
 
     def _start_or_stop(self) -> None:
         with self._lock:
@@ -222,17 +215,11 @@ class Window:
         for index in range(self._result.num_frames):
             if client.client_id not in self._server.get_clients() or stop.wait(1 / float(self.rate.value)):
                 return
-            self._look(client, self._camera_view(index))
+            self._look_through(client, index)
 
     def _screenshot(self, client: Any) -> None:
         picture = client.get_render(*_SCREENSHOT, transport_format="png")
         content = io.BytesIO()
         Image.fromarray(picture[..., :3]).save(content, "PNG")
-        client.send_file_download(f"{self._result.folder.resolve().name}.png", content.getvalue())
-
-
-def _shrunk(picture: np.ndarray, width: int) -> np.ndarray:
-    """The picture [h, w, 3] at this width."""
-    height = max(1, round(picture.shape[0] * width / picture.shape[1]))
-    smaller = width < picture.shape[1]
-    return cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA if smaller else cv2.INTER_NEAREST)
+        name = f"{self._result.folder.resolve().name}.png"
+        client.send_file_download(name, content.getvalue(), save_immediately=True)
