@@ -194,8 +194,14 @@ class VideoSource(Source):
             short = lacks_time
             told = f"{seconds + step:.4g} s decoded, its header announces {header.seconds or 0:.4g} s"
         else:
-            short = frames < 0.99 * header.announced - 2 and (lacks_time or header.seconds is None)
+            lacks_frames = frames < 0.99 * header.announced - 2
+            short = lacks_frames and (lacks_time or header.seconds is None)
             told = f"{frames} frames decoded, its header announces {header.announced}"
+            if lacks_frames and not short:
+                self._add_note(
+                    f"{self.name} shows {frames} of the {header.announced} frames in it: it was cut without encoding "
+                    "it anew, or its index is damaged"
+                )
         if short:
             warnings.warn(f"{self.name} ends early: {told}", stacklevel=3)
 
