@@ -11,6 +11,7 @@ import functools
 import importlib
 import json
 import shutil
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -95,12 +96,14 @@ def _write_video(root: Path) -> None:
 def _read_source(name: str, root: Path, output: Path) -> None:
     from logvggt_jax.reconstruction.sources import open_source
 
-    source = open_source(root / name)
-    images = [frame.image for frame in source]
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        source = open_source(root / name)
+        images = [frame.image for frame in source]
     _expect(images, "no frame and no error")
     shapes = {image.shape for image in images}
     _expect(len(shapes) == 1 and images[0].dtype == np.uint8 and images[0].ndim == 3, f"frames have shapes {shapes}")
-    said = source.skipped or source.notes
+    said = source.skipped or source.notes or warned
     # Nothing tells that a folder had a picture before its first or after its last.
     numbered = (file.stem.removeprefix("img") for file in root.glob("img*"))
     numbers = [int(number) for number in numbered if number.isdecimal()] or range(_FRAMES)
