@@ -79,6 +79,22 @@ def test_a_moving_subject_is_told_from_the_cameras_own_movement() -> None:
     assert ["the camera stands still" in text for text in said] == [False, True]
 
 
+def test_a_result_with_errors_everywhere_is_not_called_movement() -> None:
+    """Surfaces that float in front of a still scene in every frame: where they are large, the result is doubtful."""
+    frames = rooms.clean()
+    depth, random = np.array(frames.depth), np.random.default_rng(0)
+    height, width = rooms.SIZE
+    for index, each in enumerate(depth):
+        edge = height // 2 if 20 <= index <= 24 else height // 4
+        top, left = random.integers(height - edge), random.integers(width - edge)
+        each[top : top + edge, left : left + edge] *= 0.4
+    measures = measured(frames._replace(depth=depth), rooms.signals(rooms.COUNT, ()))
+    assert np.nanmedian(measures.conflicts) > 0.01
+    found = stretches(measures)
+    assert {stretch.cause for stretch in found} == {None}
+    assert all("conflicts" in stretch.signs for stretch in found)
+
+
 def test_trouble_that_the_footage_does_not_explain_is_said_to_be_so() -> None:
     measures = measured(rooms.clean(), rooms.signals(rooms.COUNT, range(30, 33)))
     (found,) = stretches(measures)

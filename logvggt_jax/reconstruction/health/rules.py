@@ -41,6 +41,9 @@ ALL_NEW, PICTURE_CHANGE, PICTURE_TIMES = 0.8, 0.6, 4.0
 ZOOM, ZOOM_FRAMES, ZOOM_TIMES = 0.1, 8, 6.0
 # Something moves: this share of the points that should be seen from four frames away is not, and so many times as many.
 CONFLICTS, CONFLICT_TIMES = 0.04, 4.0
+# Nobody can tell movement from an error of the result where the median frame has so many of these already, and nothing
+# that moves hides so much of the view.
+CLEAN_CONFLICTS, MOST_CONFLICTS = 0.01, 0.6
 
 # Signs that the result suffers: above this number and so many times the median.
 SIGNALS, SIGNAL_TIMES = 0.1, 4.0
@@ -69,6 +72,7 @@ SIGNS = {
     "correction": "the global refinement moved the camera far",
     "confidence": "the model is unsure of its depth",
     "disagreement": "depth does not fit that of the frame before",
+    "conflicts": "points that should be seen from four frames away are not",
     "chunks": "chunks do not fit one another",
 }
 
@@ -133,7 +137,7 @@ def _causes(m: Measures, signs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     clear = ~(poor | np.concatenate([[False], poor[:-1]]))
     unsure = signs["overlap_change"] | signs["correction"] | signs["disagreement"]
     cut = _over(m.picture_change, PICTURE_CHANGE, PICTURE_TIMES) & clear & unsure
-    moving = _over(m.conflicts, CONFLICTS, CONFLICT_TIMES)
+    moving = _over(m.conflicts, CONFLICTS, CONFLICT_TIMES) & ~signs["conflicts"]
     fast = (_over(new, NEW_VIEW, NEW_VIEW_TIMES) | (new > MOST_NEW)) & ~(new > ALL_NEW) & ~zoom
     no_overlap = (new > ALL_NEW) | (cut & ~moving & ~fast)
     stops = np.abs(np.log2(m.brightness / np.concatenate([[np.nan], m.brightness[:-1]])))
@@ -154,6 +158,8 @@ def _causes(m: Measures, signs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 def _signs(m: Measures) -> dict[str, np.ndarray]:
     scales = np.full(m.num_frames, np.nan)
+    missing = _over(m.conflicts, CONFLICTS, CONFLICT_TIMES)
+    no_movement = (m.conflicts > MOST_CONFLICTS) | (_median(m.conflicts) > CLEAN_CONFLICTS)
     joints = np.flatnonzero(np.isfinite(m.chunk_scale))
     scales[joints] = np.abs(np.diff(np.log(m.chunk_scale[joints]), prepend=0.0))  # the first chunk's is one
     return {
@@ -161,6 +167,7 @@ def _signs(m: Measures) -> dict[str, np.ndarray]:
         "correction": _over(m.correction, SIGNALS, SIGNAL_TIMES),
         "confidence": m.confidence - 1 < CONFIDENCE_SHARE * (_median(m.confidence) - 1),
         "disagreement": _over(m.disagreement, DISAGREEMENT, DISAGREEMENT_TIMES),
+        "conflicts": missing & no_movement,
         "chunks": (scales > np.log(CHUNK_SCALE)) | (m.chunk_residual > CHUNK_RESIDUAL),
     }
 
