@@ -124,7 +124,7 @@ def _check_request(folder: Path, request: Mapping[str, str]) -> None:
     try:
         stored = json.loads(file.read_text())
         others = sorted(name for name in stored.keys() | request.keys() if stored.get(name) != request.get(name))
-    except (ValueError, AttributeError) as error:
+    except (ValueError, AttributeError, RecursionError) as error:
         raise InputError(f"{file}: damaged ({one_line(error)}); {_MEND}") from error
     if others:
         raise OutputExists(

@@ -219,7 +219,7 @@ class RunCheckpoints:
         """The step that an earlier start of this run was told to go back to, and did."""
         try:
             found: int | None = json.loads(self._honoured.read_text())["resume_step"]
-        except (OSError, ValueError, KeyError, TypeError):
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):
             return None
         return found
 

@@ -108,7 +108,7 @@ def read_json_object(path: Path) -> dict[str, Any]:
         data = path.read_bytes()
     try:
         content = json.loads(data)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not JSON ({error}); {MEND}") from error
     if not isinstance(content, dict):
         raise InputError(f"{path}: not a JSON object; {MEND}")

@@ -158,9 +158,10 @@ def test_an_index_that_was_changed_is_refused(packed: Path, tmp_path: Path) -> N
     path.write_text(path.read_text().replace('"frames": 4', '"frames": 5', 1))
     with pytest.raises(InputError, match=r"packed\.json: differs from its digest"):
         open_dataset(NAME, output)
-    path.write_text("{")
-    with pytest.raises(InputError, match=r"packed\.json: not JSON"):
-        open_dataset(NAME, output)
+    for content in ("{", "[" * 100_000):
+        path.write_text(content)
+        with pytest.raises(InputError, match=r"packed\.json: not JSON"):
+            open_dataset(NAME, output)
 
 
 def test_another_set_split_option_or_plan_is_refused(scenes: Path, packed: Path, tmp_path: Path) -> None:
