@@ -4,6 +4,7 @@ import gzip
 import os
 import re
 import stat
+import zlib
 from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
 
@@ -81,8 +82,16 @@ def string_replaced(content: bytes, random: np.random.Generator) -> bytes:
 
 
 def unpacked(change: Damage) -> Damage:
-    """The damage to what a gzip file holds."""
-    return lambda content, random: gzip.compress(change(gzip.decompress(content), random))
+    """The damage to what a gzip file holds; to its bytes where it was damaged before."""
+
+    def spoiled(content: bytes, random: np.random.Generator) -> bytes:
+        try:
+            inside = gzip.decompress(content)
+        except (OSError, EOFError, zlib.error):
+            return change(content, random)
+        return gzip.compress(change(inside, random))
+
+    return spoiled
 
 
 CONTENT_DAMAGES: dict[str, Damage] = {
