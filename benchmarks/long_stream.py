@@ -3,9 +3,10 @@
     python benchmarks/long_stream.py --frames 100000                      # online, of constant size
     python benchmarks/long_stream.py --frames 20000 --mode full           # refined at the end
 
-The model is the one that ships, or `--checkpoint`'s; frames are noise. Prints a line every so many frames, and at the
-end the last thousand beside the second thousand, in one run. Processor time holds on a busy machine too; time by the
-clock needs one without other work. `online` refines after every window with a context of a window and so many
+The model is the one that ships, or `--checkpoint`'s; frames are noise. Prints a line every so many frames. The last
+thousand runs in turns with the second thousand of a stream that was begun afterwards, twenty frames each, so that a
+machine that gets slower or busier slows both; what it took is also set beside the second thousand of the same stream.
+`online` refines after every window with a context of a window and so many
 registers (`--max_registers`, 0 for all).
 """
 
@@ -14,7 +15,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,6 +27,8 @@ from logvggt_jax.streaming import StreamSession
 from logvggt_jax.weights.checkpoints import read_provenance
 
 PART = 1000
+# Frames of one stream before it is the other's turn.
+TURN = 20
 
 
 class Part(NamedTuple):
@@ -49,30 +52,58 @@ class Compilations:
             self.count, self.last = self.count + 1, time.monotonic()
 
 
-def run(session: StreamSession, image_size: tuple[int, int], num_frames: int) -> list[Part]:
-    """Streams frames of noise, and prints and returns what each thousand took."""
-    compilations, parts = Compilations(), []
-    started = clock = time.monotonic()
-    processor = time.process_time()
+class Clock:
+    """Seconds by the clock and of processor time since it was last read."""
+
+    def __init__(self) -> None:
+        self._clock, self._processor = time.monotonic(), time.process_time()
+
+    def read(self) -> np.ndarray:
+        """The two since then."""
+        before = self._clock, self._processor
+        self._clock, self._processor = time.monotonic(), time.process_time()
+        return np.subtract((self._clock, self._processor), before)
+
+
+def run(open_stream: Callable[[], StreamSession], image_size: tuple[int, int], num_frames: int) -> list[Part]:
+    """Streams frames of noise, and prints and returns what each thousand took; the last one is timed in turns with the
+    second thousand of another stream."""
+    compilations, parts, session = Compilations(), [], open_stream()
+    started, clock = time.monotonic(), Clock()
     noise = np.random.default_rng(0).integers(0, 256, (16, *image_size, 3), np.uint8)
-    for index in range(num_frames):
-        session.push(noise[index % len(noise)])
-        if (index + 1) % PART:
-            continue
-        now, used = time.monotonic(), time.process_time()
-        parts.append(Part(now - clock, used - processor, _resident_bytes(), compilations.count))
-        clock, processor = now, used
+
+    def push(stream: StreamSession, count: int) -> np.ndarray:
+        clock.read()
+        for index in range(count):
+            stream.push(noise[index % len(noise)])
+        return clock.read()
+
+    def told(took: np.ndarray) -> None:
+        parts.append(Part(*took, _resident_bytes(), compilations.count))
         if len(parts) <= 2 or len(parts) % max(num_frames // PART // 10, 1) == 0:
             print(
-                f"{index + 1:7,} frames: {1e3 * parts[-1].clock / PART:.2f} ms a frame, "
+                f"{PART * len(parts):7,} frames: {1e3 * parts[-1].clock / PART:.2f} ms a frame, "
                 f"{1e3 * parts[-1].processor / PART:.2f} ms of processor time, "
                 f"{parts[-1].memory / 2**20:.0f} MiB, {compilations.count} programs",
                 flush=True,
             )
+
+    for _ in range(num_frames // PART - 1):
+        told(push(session, PART))
+    grown, other = _resident_bytes(), open_stream()
+    push(other, PART)
+    turns = [(push(session, TURN), push(other, TURN)) for _ in range(PART // TURN)]
+    last, second = np.sum(turns, axis=0)
+    told(last)
+    parts[-1] = parts[-1]._replace(memory=grown)  # without the other stream
+    print(
+        f"last thousand over the second of a stream begun afterwards, in turns: {last[1] / second[1]:.3f} of processor "
+        f"time, {last[0] / second[0]:.3f} by the clock"
+    )
     print(f"nothing compiled after {compilations.last - started:.0f} s, of {time.monotonic() - started:.0f} s")
-    clock = time.monotonic()
+    clock.read()
     session.close()
-    print(f"close, with what is refined at the end: {time.monotonic() - clock:.1f} s")
+    print(f"close, with what is refined at the end: {clock.read()[0]:.1f} s")
     return parts
 
 
@@ -85,7 +116,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Parses, runs and prints."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--checkpoint", default="rooms")
-    parser.add_argument("--frames", type=int, default=10_000)
+    parser.add_argument("--frames", type=int, default=10_000, help="in whole thousands, at least three")
     parser.add_argument("--mode", choices=["online", "full"], default="online")
     parser.add_argument("--max_registers", type=int, default=1024)
     options = parser.parse_args(arguments)
@@ -99,14 +130,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
             context=windows.size,
             max_registers=options.max_registers or None,
         )
-    session = StreamSession(LogVGGT(dataclasses.replace(model.config, refinement=refinement)), variables)
-    parts = run(session, (edge * 3 // 4 // 14 * 14, edge), options.frames)
-    if len(parts) < 3:
-        return
+    chosen = LogVGGT(dataclasses.replace(model.config, refinement=refinement))
+    size = edge * 3 // 4 // 14 * 14, edge
+    parts = run(lambda: StreamSession(chosen, variables), size, max(options.frames // PART, 3) * PART)
     second, half, last = parts[1], parts[len(parts) // 2], parts[-1]
     grown = (last.memory - half.memory) / (PART * (len(parts) - 1 - len(parts) // 2))
     print(
-        f"last thousand over second: {last.processor / second.processor:.2f} of processor time, "
+        f"last thousand over the second of the same stream: {last.processor / second.processor:.2f} of processor time, "
         f"{last.clock / second.clock:.2f} by the clock; {grown:.0f} bytes a frame in the second half, "
         f"{last.programs - half.programs} programs compiled in it"
     )
