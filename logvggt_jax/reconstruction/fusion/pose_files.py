@@ -114,6 +114,7 @@ def _nerfstudio_frame(document: dict[str, Any], frame: dict[str, Any], path: Pat
     assert extrinsics is not None  # it is finite
     values = {**document, **frame}
     distorted = any(values.get(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    distorted |= values.get("camera_model", "PINHOLE") not in ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")
     if distorted or not all(key in values for key in ("fl_x", "fl_y", "cx", "cy", "w", "h")):
         return ExternalPose(name, None, extrinsics)
     fx, fy, cx, cy = (float(values[key]) for key in ("fl_x", "fl_y", "cx", "cy"))
