@@ -80,18 +80,8 @@ def follow_corners(
     """Points and where the images show them; each is seen by at least three frames.
 
     A corner's depth and the cameras say where another frame should show it; there Lucas and Kanade's method finds it to
-    a fraction of a pixel. It counts if the way back leads to where it began.
-
-    Args:
-      result: of images and depth.
-      frames: [n] numbers of the frames.
-      extrinsics: [n, 3|4, 4] world-to-camera.
-      intrinsics: [n, 3, 3] in pixels of the depth maps.
-      scales: [n] of the depth.
-      progress: show a progress bar.
-
-    Returns:
-      Tracks whose frames are places in `frames`, and whose points are black.
+    a fraction of a pixel. It counts if the way back leads to where it began. Arguments are those of `bundle_adjust`;
+    the tracks' frames are places in `frames`, their points are black.
     """
     views = _Frames(result, frames, extrinsics, intrinsics, scales)
     count = len(frames)
