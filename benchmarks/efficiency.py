@@ -43,7 +43,7 @@ from logvggt_jax.evaluation.costs.parts import (
     spread,
     time_part,
 )
-from logvggt_jax.evaluation.costs.throughput import random_pictures, time_stream
+from logvggt_jax.evaluation.costs.streams import random_pictures, time_stream
 from logvggt_jax.evaluation.environment import describe_device
 from logvggt_jax.evaluation.methods.variants import VARIANTS
 from logvggt_jax.evaluation.report.figures import efficiency_plot

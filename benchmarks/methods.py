@@ -30,8 +30,7 @@ from rich.console import Console
 from rich.table import Table
 
 from logvggt_jax import LogVGGT, ModelConfig, load_model
-from logvggt_jax.evaluation.costs.by_length import cost_of_length
-from logvggt_jax.evaluation.costs.throughput import random_pictures
+from logvggt_jax.evaluation.costs.streams import cost_of_length, random_pictures
 from logvggt_jax.evaluation.environment import describe_device
 from logvggt_jax.evaluation.methods.method import Checkpoint, model_row
 from logvggt_jax.model.parameters import in_compute_type
