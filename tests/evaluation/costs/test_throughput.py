@@ -40,7 +40,7 @@ def test_every_row_is_timed_once_and_kept(
     assert all(part["seconds"] > 0 for part in report["parts"])
     assert json.loads((tmp_path / "timings.json").read_text()) == report
 
-    def again(*_: object) -> None:
+    def again(*_: object, **__: object) -> None:
         raise AssertionError("measured again")
 
     with monkeypatch.context() as patch:
