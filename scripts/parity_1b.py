@@ -9,6 +9,7 @@ minutes and 6 GB of memory on two cores; exits with 1 if a figure misses its bou
 from __future__ import annotations
 
 import argparse
+import functools
 import importlib.util
 import os
 import sys
@@ -27,9 +28,8 @@ from rich.console import Console
 from rich.table import Table
 
 from logvggt_jax.config import ModelConfig, WindowConfig
-from logvggt_jax.model.aggregator import Aggregator
-from logvggt_jax.model.dinov2 import DinoV2
 from logvggt_jax.model.logvggt import LogVGGT
+from logvggt_jax.model.parameters import run
 from logvggt_jax.weights import params_from_vggt
 from logvggt_jax.weights.lazy import LazyTensors
 
@@ -53,7 +53,7 @@ def compare(golden: Path) -> list[Comparison]:
     with np.load(golden / "vggt_1b.npz") as arrays:
         reference = dict(arrays)
     config = ModelConfig(windows=WindowConfig(size=3, stride=1))
-    params, _ = params_from_vggt(reference_weights(golden), config)
+    params, _ = params_from_vggt(reference_weights(golden, "vggt_1b"), config)
     images = reference.pop("images_u8")[None]
     predictions = jax.device_get(jax.jit(LogVGGT(config).apply)({"params": params}, images))
     patches, layers = jax.device_get(_window_tokens(config, params, images))
@@ -72,40 +72,25 @@ def compare(golden: Path) -> list[Comparison]:
     return list(_comparisons(found, reference))
 
 
-def reference_weights(golden: Path) -> LazyTensors:
-    """The reference's weights in PyTorch names and layouts, each made when it is read."""
+def reference_weights(golden: Path, model: str) -> LazyTensors:
+    """Weights of the reference's `model` in PyTorch names and layouts, each made when it is read."""
     spec = importlib.util.spec_from_file_location("make_vggt_weights", golden / "make_vggt_weights.py")
     if spec is None or spec.loader is None:
         raise FileNotFoundError(f"{golden / 'make_vggt_weights.py'}: cannot be imported; give the golden folder")
     maker = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(maker)
-    shapes = maker.load_shapes(golden / "vggt_1b.json")
+    shapes = maker.load_shapes(golden / f"{model}.json")
     return LazyTensors(list(shapes), lambda name: maker.make(name, shapes[name]))
 
 
+@functools.partial(jax.jit, static_argnums=0)
 def _window_tokens(config: ModelConfig, params: dict, images: np.ndarray) -> tuple[jax.Array, jax.Array]:
     """Patch tokens [T, h * w, C] and key-layer tokens [1, 4, T, P, 2C] of images [1, T, H, W, 3] as one window."""
-    _, count, height, width, _ = images.shape
-    grid = (height // config.encoder.patch_size, width // config.encoder.patch_size)
-
-    @jax.jit
-    def run(params: dict, images: jax.Array) -> tuple[jax.Array, jax.Array]:
-        pixels = images[0].astype(jnp.float32) / 255.0
-        patches = DinoV2(config.encoder, config.dtype, config.attention).apply({"params": params["encoder"]}, pixels)
-        tokens = grid[0] * grid[1] + 1 + config.aggregator.num_registers
-        no_cache = jnp.zeros((1, len(config.aggregator.key_layers), 0, tokens, config.encoder.embed_dim))
-        layers, _ = Aggregator(config).apply(
-            {"params": params["aggregator"]},
-            patches[None],
-            jnp.ones((1, count), bool),
-            no_cache,
-            jnp.zeros((1, 0), bool),
-            jnp.ones(1, bool),
-            grid=grid,
-        )
-        return patches, layers
-
-    return run(params, images)
+    windows = LogVGGT(config).windows
+    patches, first = windows.encode({"params": params}, images), jnp.ones(1, bool)
+    grid = windows.grid(images.shape[2:4])
+    tokens, _ = run(windows.aggregator, params["aggregator"], patches, None, first, None, grid=grid)
+    return patches[0], tokens.key
 
 
 def _comparisons(found: dict[str, np.ndarray], reference: dict[str, np.ndarray]) -> Iterator[Comparison]:
