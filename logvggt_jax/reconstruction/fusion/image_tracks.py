@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from logvggt_jax.geometry import project, transform_points
-from logvggt_jax.geometry.cameras import invert
+from logvggt_jax.geometry import points_at, project
 from logvggt_jax.reconstruction.exporters.cloud import tracked
 from logvggt_jax.reconstruction.exporters.tracks import Tracks
 from logvggt_jax.reconstruction.frame_pool import FramePool
@@ -133,9 +132,7 @@ def _corners(views: _Frames, place: int) -> _Corners:
     least, most = (change(surface, around)[v, u] for change in (cv2.erode, cv2.dilate))
     valid = np.isfinite(depth) & (least > 0) & (most < _SURFACE * least)
     pixels, depth = pixels[valid], depth[valid]
-    matrix = views.intrinsics[place]
-    rays = np.concatenate([(pixels - matrix[:2, 2]) / matrix[(0, 1), (0, 1)], np.ones((len(pixels), 1))], axis=1)
-    return _Corners(pixels, transform_points(np.asarray(invert(views.extrinsics[place])), rays * depth[:, None]))
+    return _Corners(pixels, points_at(pixels, depth, views.intrinsics[place], views.extrinsics[place]))
 
 
 def _find(views: _Frames, start: int, corners: _Corners, place: int) -> tuple[np.ndarray, np.ndarray]:
