@@ -11,20 +11,20 @@ Layout: the root is such a recording, or holds folders that are. `transforms.jso
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path, PurePosixPath
+from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from logvggt_jax.data.dataset import EVALUATION, TRAINING, About
-from logvggt_jax.data.errors import missing_files
 from logvggt_jax.data.formats.calibration import OPENGL_AXES, in_pixels, pinhole, relative, world_to_camera
 from logvggt_jax.data.formats.image import read_rgb
 from logvggt_jax.data.formats.json_values import expecting, read_json, text_of
 from logvggt_jax.data.formats.ordering import natural_order
 from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame, read_depth_of
+from logvggt_jax.data.readers.own_recordings import file_below, find_recordings, names_beside
 from logvggt_jax.errors import InputError
 
 _TRANSFORMS = "transforms.json"
@@ -56,22 +56,20 @@ class Nerfstudio(FolderDataset):
     )
 
     def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
-        if files.exists(self.root / _TRANSFORMS):
-            # A root such as "." has no name of its own.
-            return {self.root.resolve().name: self.root}
-        folders = files.folders(self.root, self.expects)
-        return {name: folder for name, folder in folders.items() if files.exists(folder / _TRANSFORMS)}
+        return find_recordings(self.root, files, self.expects, lambda folder: files.exists(folder / _TRANSFORMS))
 
     def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
         path = folder / _TRANSFORMS
         content = read_json(files.text(path, "cameras and frames in nerfstudio's form"), path)
         with expecting(path, "an object with a list of frames"):
             entries = [{**content, **entry} for entry in content["frames"]]
-            names = [_inside(path, entry["file_path"]) for entry in entries]
+            images = [file_below(folder, text_of(entry["file_path"]), path) for entry in entries]
             depths = [
-                _inside(path, entry["depth_file_path"]) if entry.get("depth_file_path") else None for entry in entries
+                file_below(folder, text_of(entry["depth_file_path"]), path) if entry.get("depth_file_path") else None
+                for entry in entries
             ]
-        _check_present(files, path, [name for name in (*names, *depths) if name is not None])
+        names_beside(files, [file for file in (*images, *depths) if file is not None], path)
+        names = [str(image.relative_to(folder)) for image in images]
         for place in natural_order(names):
             if depths[place] is None and any(depths):
                 yield Dropped("no depth")
@@ -86,31 +84,13 @@ class Nerfstudio(FolderDataset):
                 pose = pose @ OPENGL_AXES
             extrinsics = world_to_camera(pose, where, stored="camera_to_world")
             # A picture in depth's place stands for no depth.
-            depth = folder / (depths[place] or names[place])
-            yield frame(folder / names[place], depth, intrinsics, extrinsics, name=names[place], calibration=path)
+            depth = depths[place] or images[place]
+            yield frame(images[place], depth, intrinsics, extrinsics, name=names[place], calibration=path)
 
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         image = read_rgb(record.image)
         intrinsics = in_pixels(record.intrinsics, image.shape[:2], record.image, record.calibration)
         return image, read_depth_of(record, image, _DEPTH_UNITS), intrinsics
-
-
-def _inside(path: Path, name: Any) -> str:
-    """A file's name below the recording; InputError naming `path` for one that leads out of it."""
-    relative_name = PurePosixPath(text_of(name))
-    if relative_name.is_absolute() or ".." in relative_name.parts or not relative_name.name:
-        raise InputError(f"{path}: {name!r} is no file's name below {path.parent}: export the recording again")
-    return str(relative_name)
-
-
-def _check_present(files: SourceFiles, path: Path, names: Sequence[str]) -> None:
-    paths = [path.parent / name for name in names]
-    held = {
-        folder: set(files.names(folder, f"the files that {path} names")) for folder in {path.parent for path in paths}
-    }
-    absent = [each for each in paths if each.name not in held[each.parent]]
-    if absent:
-        raise missing_files(dict.fromkeys(absent, f"but {path} names it; copy it there"))
 
 
 def _intrinsics(entry: Mapping[str, Any], where: str) -> np.ndarray:
