@@ -115,11 +115,11 @@ def test_intrinsics_that_come_with_the_poses_are_taken(truth: Reconstruction, tm
     np.testing.assert_allclose(made.intrinsics, truth.intrinsics, rtol=1e-9)
     np.testing.assert_allclose(made.depth_intrinsics, truth.depth_intrinsics, rtol=1e-9)
     document = json.loads(poses.read_text())
-    document["k1"] = 0.1
-    poses.write_text(json.dumps(document))
-    made, notes = fuse(wrong, tmp_path / "kept", poses=poses, progress=False)
-    np.testing.assert_allclose(made.intrinsics, wrong.intrinsics, rtol=1e-9)
-    assert any("intrinsics stay the result's" in note for note in notes)
+    for key, value in (("k1", 0.1), ("camera_model", "OPENCV_FISHEYE")):
+        poses.write_text(json.dumps({**document, key: value}))
+        made, notes = fuse(wrong, tmp_path / "kept", poses=poses, overwrite=True, progress=False)
+        np.testing.assert_allclose(made.intrinsics, wrong.intrinsics, rtol=1e-9)
+        assert any("intrinsics stay the result's" in note for note in notes)
 
 
 def test_frames_without_a_pose_and_poses_without_a_frame_are_said(

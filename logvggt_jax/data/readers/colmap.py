@@ -23,10 +23,9 @@ from logvggt_jax.data.formats.image import read_rgb
 from logvggt_jax.data.formats.ordering import natural_order
 from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame, read_depth_of
-from logvggt_jax.data.readers.own_recordings import file_below, find_recordings, names_beside
+from logvggt_jax.data.readers.own_recordings import PICTURE_SUFFIXES, file_below, find_recordings, names_beside
 from logvggt_jax.errors import InputError
 
-_PICTURE_SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
 _DEPTH_UNITS = 1000.0
 
 
@@ -67,7 +66,7 @@ class Colmap(FolderDataset):
             number: _intrinsics(cameras, number, camera_file, image_file) for number in {i.camera for i in images}
         }
         there = {each / name for each, held in names.items() for name in held}
-        yield from (Dropped("no pose") for path in there - set(paths) if path.suffix.lower() in _PICTURE_SUFFIXES)
+        yield from (Dropped("no pose") for path in there - set(paths) if path.suffix.lower() in PICTURE_SUFFIXES)
         depths = _depth_files(files, folder, [image.name for image in images])
         for image, path in zip(images, paths, strict=True):
             depth = depths.get(image.name) if depths else path  # a picture in depth's place stands for no depth

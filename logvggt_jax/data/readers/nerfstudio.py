@@ -18,19 +18,16 @@ from typing import Any
 import numpy as np
 
 from logvggt_jax.data.dataset import EVALUATION, TRAINING, About
-from logvggt_jax.data.formats.calibration import OPENGL_AXES, in_pixels, pinhole, relative, world_to_camera
+from logvggt_jax.data.formats.calibration import OPENGL_AXES, in_pixels, relative, world_to_camera
 from logvggt_jax.data.formats.image import read_rgb
 from logvggt_jax.data.formats.json_values import expecting, read_json, text_of
+from logvggt_jax.data.formats.nerfstudio_transforms import CAMERA, TRANSFORMS_FILE, camera_of, is_pinhole
 from logvggt_jax.data.formats.ordering import natural_order
 from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame, read_depth_of
 from logvggt_jax.data.readers.own_recordings import file_below, find_recordings, names_beside
 from logvggt_jax.errors import InputError
 
-_TRANSFORMS = "transforms.json"
-_CAMERA = ("fl_x", "fl_y", "cx", "cy", "w", "h")
-_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-_PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")
 _DEPTH_UNITS = 1000.0
 
 
@@ -44,7 +41,7 @@ class Nerfstudio(FolderDataset):
 
     name = "nerfstudio"
     title = "own recordings in nerfstudio's form"
-    expects = f"{_TRANSFORMS} with cameras and frames, and the pictures and depth that it names, or folders that do"
+    expects = f"{TRANSFORMS_FILE} with cameras and frames, and the pictures and depth that it names, or folders that do"
     metric = False
     splits = ("all",)
     own = True
@@ -56,10 +53,10 @@ class Nerfstudio(FolderDataset):
     )
 
     def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
-        return find_recordings(self.root, files, self.expects, lambda folder: files.exists(folder / _TRANSFORMS))
+        return find_recordings(self.root, files, self.expects, lambda folder: files.exists(folder / TRANSFORMS_FILE))
 
     def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
-        path = folder / _TRANSFORMS
+        path = folder / TRANSFORMS_FILE
         content = read_json(files.text(path, "cameras and frames in nerfstudio's form"), path)
         with expecting(path, "an object with a list of frames"):
             entries = [{**content, **entry} for entry in content["frames"]]
@@ -95,15 +92,14 @@ class Nerfstudio(FolderDataset):
 
 def _intrinsics(entry: Mapping[str, Any], where: str) -> np.ndarray:
     """Intrinsics [3, 3] of a picture of one pixel; the frame's own values come before those for all."""
-    model = entry.get("camera_model", "PINHOLE")
-    if model not in _PINHOLES or any(float(entry.get(name, 0.0)) for name in _DISTORTION):
+    if not is_pinhole(entry):
         raise InputError(
-            f"{where}: {model} with distortion, frames need a pinhole: undistort the pictures (`colmap "
-            "image_undistorter`; its output folder can be read as `colmap`)"
+            f"{where}: {entry.get('camera_model', 'PINHOLE')} with distortion, frames need a pinhole: undistort the "
+            "pictures (`colmap image_undistorter`; its output folder can be read as `colmap`)"
         )
-    if absent := [name for name in _CAMERA if name not in entry]:
+    if absent := [name for name in CAMERA if name not in entry]:
         raise InputError(f"{where}: no {', '.join(absent)}, neither here nor for all frames: add what is missing")
-    fx, fy, cx, cy, width, height = (float(entry[name]) for name in _CAMERA)
+    intrinsics, height, width = camera_of(entry)
     if not (width >= 1 and height >= 1 and math.isfinite(width * height)):
         raise InputError(f"{where}: pictures of w={width:g} x h={height:g} do not exist: edit the file")
-    return relative(pinhole(fx, fy, cx - 0.5, cy - 0.5), (int(height), int(width)))
+    return relative(intrinsics, (int(height), int(width)))

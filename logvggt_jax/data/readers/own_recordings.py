@@ -7,6 +7,8 @@ from logvggt_jax.data.errors import missing_files
 from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.errors import InputError
 
+PICTURE_SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
+
 
 def find_recordings(
     root: Path, files: SourceFiles, expects: str, is_recording: Callable[[Path], object]
