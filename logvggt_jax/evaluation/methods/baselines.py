@@ -12,6 +12,8 @@ from logvggt_jax.errors import InputError
 from logvggt_jax.evaluation.methods.method import Checkpoint, ClipPrediction, Method, model_row
 from logvggt_jax.model.logvggt import LogVGGT
 
+_SEQUENCES = 64  # of a data set whose depth is looked at, at most
+
 
 @dataclasses.dataclass(frozen=True)
 class DepthStatistics:
@@ -24,17 +26,17 @@ class DepthStatistics:
 
 
 def depth_statistics(
-    dataset: Dataset, image_size: tuple[int, int], *, source: str, max_sequences: int = 64, max_frames: int = 256
+    dataset: Dataset, image_size: tuple[int, int], *, source: str, max_frames: int = 256
 ) -> DepthStatistics:
     """Mean depth, mean depth map and mean intrinsics of evenly spaced frames, fitted to `image_size` (H, W).
 
-    They are of `max_sequences` sequences and `max_frames` frames at most, the same number from each; `source` is their
+    They are of some sequences and `max_frames` frames at most, the same number from each; `source` is their
     name in the table. Raises InputError where no frame has a valid depth.
     """
     depth_sum, valid_count = np.zeros(image_size), np.zeros(image_size)
     intrinsics: list[np.ndarray] = []
     sequences = list(dataset.sequences)
-    chosen = _evenly(len(sequences), max_sequences)
+    chosen = _evenly(len(sequences), _SEQUENCES)
     for s in chosen:
         # One frame at a time: hundreds at a data set's own size are gigabytes.
         for index in _evenly(dataset.num_frames(sequences[s]), max(1, max_frames // len(chosen))):
