@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from logvggt_jax.frames import evenly_spaced
 from logvggt_jax.geometry.cameras import camera_centres
 from logvggt_jax.geometry.rotations import nearest_rotation, rotation_angle
 
@@ -135,7 +136,7 @@ def pose_similarity(source: np.ndarray, target: np.ndarray) -> Similarity:
 
 def _central_rotation(rotations: np.ndarray) -> np.ndarray:
     """The rotation [3, 3] that is nearest to most of `rotations` [N, 3, 3]: a mean with weights one over the angle."""
-    candidates = rotations[np.unique(np.linspace(0, len(rotations) - 1, 64).round().astype(int))]
+    candidates = rotations[evenly_spaced(len(rotations), 64)]
     between = rotation_angle(candidates[:, None], rotations[None])
     centre = candidates[np.median(between, axis=1).argmin()]
     for _ in range(_ROUNDS):

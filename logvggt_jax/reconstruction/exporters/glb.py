@@ -9,6 +9,7 @@ import numpy as np
 
 from logvggt_jax.data.formats.calibration import OPENGL_AXES
 from logvggt_jax.files import atomic_file
+from logvggt_jax.frames import evenly_spaced
 from logvggt_jax.geometry import invert, matrix_to_quaternion
 from logvggt_jax.reconstruction.exporters.cloud import frame_cloud, select_points
 from logvggt_jax.reconstruction.exporters.libraries import library
@@ -62,7 +63,7 @@ def export_glb(
     if len(points):
         scene.add_geometry(trimesh.PointCloud(points, colours), node_name="points", geom_name="points")
     span = float(np.ptp(np.concatenate([points, poses[:, :3, 3]]), axis=0).max()) or 1.0
-    shown = np.unique(np.linspace(0, result.num_frames - 1, _MOST_FRUSTA).round().astype(int))
+    shown = evenly_spaced(result.num_frames, _MOST_FRUSTA)
     lines = np.concatenate([_frustum(result, index, poses[index], span * _FRUSTUM_SIZE) for index in shown])
     scene.add_geometry(trimesh.load_path(lines), node_name="cameras", geom_name="cameras")
 
