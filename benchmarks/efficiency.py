@@ -13,7 +13,6 @@ memory means something.
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
 import os
 import shlex
@@ -24,15 +23,15 @@ from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
-sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 from rich.table import Table
+from subject import add_options, subject
 
-from logvggt_jax import LogVGGT, ModelConfig, load_model
+from logvggt_jax import LogVGGT
 from logvggt_jax.evaluation.costs.parts import (
     PARTS,
     PartTime,
@@ -43,7 +42,7 @@ from logvggt_jax.evaluation.costs.parts import (
     spread,
     time_part,
 )
-from logvggt_jax.evaluation.costs.throughput import random_pictures, time_stream
+from logvggt_jax.evaluation.costs.streams import random_pictures, time_stream
 from logvggt_jax.evaluation.environment import describe_device
 from logvggt_jax.evaluation.methods.variants import VARIANTS
 from logvggt_jax.evaluation.report.figures import efficiency_plot
@@ -192,17 +191,8 @@ def print_tables(console: Console, report: dict[str, Any]) -> None:
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
     """The whole report, JSON types."""
-    if options.checkpoint is None:
-        from configs import tiny
-
-        base, variables = ModelConfig.from_dict(tiny.get_config().to_dict()["model"]), None
-    else:
-        loaded, variables = load_model(options.checkpoint)
-        base = loaded.config
-    base = dataclasses.replace(base, dtype=options.dtype or base.dtype)
-    if variables is None:
-        variables = LogVGGT(base).init(jax.random.key(0), jnp.zeros((1, 1, *options.image_size, 3), jnp.uint8))
-    variables = jax.device_put(variables)
+    model, variables = subject(options)
+    base, variables = model.config, jax.device_put(variables)
     context = options.context or base.windows.size
     known = {
         mode: LogVGGT(VARIANTS[variant].config(base, context=limit))
@@ -260,18 +250,10 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-def _size(text: str) -> tuple[int, int]:
-    height, separator, width = text.partition("x")
-    if not (separator and height.isdecimal() and width.isdecimal()) or int(height) % 14 or int(width) % 14:
-        raise argparse.ArgumentTypeError(f"expected height x width in multiples of 14 such as 56x70, got {text!r}")
-    return int(height), int(width)
-
-
 def main() -> None:
     """Measures, prints, writes."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--checkpoint", type=Path, help="model folder; default configs/tiny.py's model, random")
-    parser.add_argument("--image-size", type=_size, default=(56, 70), metavar="HxW", help="default 56x70")
+    add_options(parser)
     parser.add_argument("--lengths", type=int, nargs="+", default=[100, 200, 500, 1000], help="frames of the streams")
     parser.add_argument(
         "--modes",
@@ -283,7 +265,6 @@ def main() -> None:
     parser.add_argument("--context", type=int, help="refinement.context of the limited modes; default the window size")
     parser.add_argument("--rounds", type=int, default=3, help="streams of every length and mode")
     parser.add_argument("--pairs", type=int, default=5, help="interleaved streams of the shortest and longest length")
-    parser.add_argument("--dtype", choices=("float32", "bfloat16"), help="compute type instead of the model's own")
     parser.add_argument("--output", type=Path, default=Path("runs/efficiency"), help="folder of JSON and plot")
     options = parser.parse_args()
     console = Console()

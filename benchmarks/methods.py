@@ -18,39 +18,19 @@ import argparse
 import dataclasses
 import json
 import statistics
-import sys
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
 import jax
-import jax.numpy as jnp
 from rich.console import Console
 from rich.table import Table
+from subject import add_options, subject
 
-from logvggt_jax import LogVGGT, ModelConfig, load_model
-from logvggt_jax.evaluation.costs.by_length import cost_of_length
-from logvggt_jax.evaluation.costs.throughput import random_pictures
+from logvggt_jax.evaluation.costs.streams import cost_of_length, random_pictures
 from logvggt_jax.evaluation.environment import describe_device
 from logvggt_jax.evaluation.methods.method import Checkpoint, model_row
 from logvggt_jax.model.parameters import in_compute_type
 from logvggt_jax.streaming import METHODS
-
-
-def subject(options: argparse.Namespace) -> Checkpoint:
-    """The model, its parameters on the device."""
-    if options.checkpoint is None:
-        from configs import tiny
-
-        config, variables = ModelConfig.from_dict(tiny.get_config().to_dict()["model"]), None
-    else:
-        loaded, variables = load_model(options.checkpoint)
-        config = loaded.config
-    model = LogVGGT(dataclasses.replace(config, dtype=options.dtype or config.dtype))
-    if variables is None:
-        variables = model.init(jax.random.key(0), jnp.zeros((1, 1, *options.image_size, 3), jnp.uint8))
-    return Checkpoint(model, jax.device_put(in_compute_type(variables, model.config)), "")
 
 
 def measure(checkpoint: Checkpoint, options: argparse.Namespace) -> list[dict[str, Any]]:
@@ -89,27 +69,19 @@ def print_table(console: Console, rows: list[dict[str, Any]]) -> None:
     console.print(table)
 
 
-def _size(text: str) -> tuple[int, int]:
-    height, separator, width = text.partition("x")
-    if not (separator and height.isdecimal() and width.isdecimal()) or int(height) % 14 or int(width) % 14:
-        raise argparse.ArgumentTypeError(f"expected height x width in multiples of 14 such as 56x70, got {text!r}")
-    return int(height), int(width)
-
-
 def main() -> None:
     """Measures and prints."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--checkpoint", type=Path, help="model folder; default configs/tiny.py's model, random")
-    parser.add_argument("--image-size", type=_size, default=(56, 70), metavar="HxW", help="default 56x70")
+    add_options(parser)
     parser.add_argument("--lengths", type=int, nargs="+", default=[50, 100, 500], help="frames of the streams")
     parser.add_argument("--methods", nargs="+", choices=tuple(METHODS), default=list(METHODS), help="default all")
     parser.add_argument("--rounds", type=int, default=3, help="timed streams of every length and method")
-    parser.add_argument("--dtype", choices=("float32", "bfloat16"), help="compute type instead of the model's own")
     parser.add_argument("--output", type=Path, help="JSON file to write as well")
     options = parser.parse_args()
     console = Console()
     console.width = max(console.width, 110)
-    checkpoint = subject(options)
+    model, variables = subject(options)
+    checkpoint = Checkpoint(model, jax.device_put(in_compute_type(variables, model.config)), "")
     height, width = options.image_size
     console.print(f"{describe_device()}, {checkpoint.model.config.dtype}, {width} x {height} pixels, batch 1")
     rows = measure(checkpoint, options)

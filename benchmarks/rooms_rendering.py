@@ -11,18 +11,17 @@ turns on the same frames. `all options` is of one clip. The step is that of conf
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import multiprocessing
 import os
 import statistics
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
+from subject import tiny_configuration
 
 from logvggt_jax import LogVGGT
 from logvggt_jax.data import Rooms
@@ -91,17 +90,13 @@ def measure(name: str, rooms: Rooms, clips: int, clip_length: int, rounds: int, 
 
 def training_step(clips: int, clip_length: int, rounds: int) -> None:
     """Prints the speed of the step of configs/tiny.py with such batches."""
-    path = Path(__file__).parents[1] / "configs" / "tiny.py"
-    spec = importlib.util.spec_from_file_location("tiny", path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    config = TrainConfig.from_dict(module.get_config().to_dict())
+    config = TrainConfig.from_dict(tiny_configuration())
+    (height, width), *_ = config.stages[0].sizes
     mesh = data_mesh(1)
     params = initial_parameters(config.model, seed=0, weights=None)
     run = make_program(LogVGGT(config.model), config, params, mesh)
     state = run.initial_state(params)
-    rooms = Rooms("train", height=module.HEIGHT, width=module.WIDTH)
+    rooms = Rooms("train", height=height, width=width)
     scenes = RoomScenes(rooms)
     described = [scenes.describe(sequence, range(clip_length)) for sequence in rooms.sequences[:clips]]
     batch = put_batch({key: np.stack([each[key] for each in described]) for key in described[0]}, mesh)
@@ -114,7 +109,7 @@ def training_step(clips: int, clip_length: int, rounds: int) -> None:
         jax.block_until_ready(metrics)
         speeds.append(clips * clip_length / (time.perf_counter() - started))
     print(
-        f"{module.HEIGHT} x {module.WIDTH} training step of configs/tiny.py, {clips} clips of {clip_length}: "
+        f"{height} x {width} training step of configs/tiny.py, {clips} clips of {clip_length}: "
         f"{statistics.median(speeds[1:]):,.0f} frames/s"
     )
 

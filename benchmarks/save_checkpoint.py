@@ -11,15 +11,14 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import importlib
 import math
-import sys
 import tempfile
 import time
 from pathlib import Path
 
 import jax
 import numpy as np
+from subject import tiny_configuration
 
 from logvggt_jax import LogVGGT
 from logvggt_jax.training.checkpoint_files import Position
@@ -36,8 +35,7 @@ _WIDTHS = range(56, 2241, 56)
 
 def sized_config(megabytes: float) -> TrainConfig:
     """`configs/tiny.py` with the widest model whose parameters and two moments have at most so many megabytes."""
-    sys.path.insert(0, str(Path(__file__).parents[1]))
-    config = TrainConfig.from_dict(importlib.import_module("configs.tiny").get_config().to_dict())
+    config = TrainConfig.from_dict(tiny_configuration())
     chosen = config
     for width in _WIDTHS:
         model = dataclasses.replace(

@@ -17,14 +17,11 @@ the mean field of view, with a weight of 10 in the loss. Camera paths are closed
 that most of the longest clips return to where they began.
 """
 
-import math
-
 from ml_collections import ConfigDict
 
 from configs import tiny
 
-HEIGHT, WIDTH = 168, 224
-FIELD_OF_VIEW = (2 * math.atan(HEIGHT / WIDTH / 2 / tiny.FOCAL), 2 * math.atan(1 / 2 / tiny.FOCAL))
+HEIGHT, WIDTH = SIZE = 168, 224
 
 
 def get_config(initial_weights: str = "") -> ConfigDict:
@@ -33,14 +30,14 @@ def get_config(initial_weights: str = "") -> ConfigDict:
     # 12 x 16 patches.
     config.model.encoder.update(embed_dim=128, position_grid=16)
     config.model.aggregator.update(depth=8, key_layers=(1, 3, 5, 7))
-    config.model.camera_head.initial_pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, *FIELD_OF_VIEW)
+    config.model.camera_head.initial_pose = tiny.initial_pose(HEIGHT, WIDTH)
     config.model.depth_head = {"features": 32, "out_channels": (32, 64, 64, 64)}
     config.model.dtype = "bfloat16"
     config.stages = ConfigDict(
         {
-            "stage_1": _stage(steps=8000, clip_length=4, batch_size=32, strides=(1, 6)),
-            "stage_2": _stage(steps=4000, clip_length=12, batch_size=16, strides=(1, 6)),
-            "stage_3": _stage(steps=2000, clip_length=32, batch_size=8, strides=(1, 6)),
+            "stage_1": tiny.stage(steps=8000, clip_length=4, batch_size=32, strides=(1, 6), size=SIZE),
+            "stage_2": tiny.stage(steps=4000, clip_length=12, batch_size=16, strides=(1, 6), size=SIZE),
+            "stage_3": tiny.stage(steps=2000, clip_length=32, batch_size=8, strides=(1, 6), size=SIZE),
         },
         sort_keys=False,
     )
@@ -48,7 +45,7 @@ def get_config(initial_weights: str = "") -> ConfigDict:
     # As many rooms as are kept laid out in memory.
     config.data.sources.rooms.options.update(rooms, num_rooms=2000, renderer="device")
     config.validation.sources.rooms.options.update(rooms)
-    config.validation.size = (HEIGHT, WIDTH)
+    config.validation.size = SIZE
     config.validation.every = 1000
     config.save_every = 1000
     config.max_minutes = 8.0
@@ -58,14 +55,3 @@ def get_config(initial_weights: str = "") -> ConfigDict:
             del config.stages[name]
         config.optimizer.learning_rate = 3e-4
     return config
-
-
-def _stage(*, steps: int, clip_length: int, batch_size: int, strides: tuple[int, int]) -> dict:
-    return {
-        "steps": steps,
-        "clip_length": clip_length,
-        "batch_size": batch_size,
-        "min_stride": strides[0],
-        "max_stride": strides[1],
-        "sizes": ((HEIGHT, WIDTH),),
-    }

@@ -16,7 +16,11 @@ HEIGHT, WIDTH = 56, 70
 # Focal lengths of `compass` rooms in units of the image width, and their middle.
 FOCAL_RANGE = (0.55, 0.75)
 FOCAL = sum(FOCAL_RANGE) / 2
-FIELD_OF_VIEW = (2 * math.atan(HEIGHT / WIDTH / 2 / FOCAL), 2 * math.atan(1 / 2 / FOCAL))
+
+
+def initial_pose(height: int, width: int) -> tuple[float, ...]:
+    """No motion, the mean field of view of the rooms: what is right before anything is learned."""
+    return (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 2 * math.atan(height / width / 2 / FOCAL), 2 * math.atan(1 / 2 / FOCAL))
 
 
 def get_config() -> ConfigDict:
@@ -38,8 +42,7 @@ def get_config() -> ConfigDict:
             "depth": 1,
             "num_heads": 4,
             "layer_scale": 1.0,
-            # No motion, the mean field of view: what is right before anything is learned.
-            "initial_pose": (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, *FIELD_OF_VIEW),
+            "initial_pose": initial_pose(HEIGHT, WIDTH),
         },
         "depth_head": {"features": 16, "out_channels": (16, 16, 16, 16)},
         "windows": {"size": 4, "stride": 2},
@@ -59,8 +62,8 @@ def get_config() -> ConfigDict:
     # In the order written: unless told so, a ConfigDict sorts its keys.
     config.stages = ConfigDict(
         {
-            "stage_1": _stage(steps=2900, clip_length=4, batch_size=8, strides=(1, 6)),
-            "stage_2": _stage(steps=2200, clip_length=12, batch_size=4, strides=(1, 4)),
+            "stage_1": stage(steps=2900, clip_length=4, batch_size=8, strides=(1, 6)),
+            "stage_2": stage(steps=2200, clip_length=12, batch_size=4, strides=(1, 4)),
         },
         sort_keys=False,
     )
@@ -112,12 +115,15 @@ def get_config() -> ConfigDict:
     return config
 
 
-def _stage(*, steps: int, clip_length: int, batch_size: int, strides: tuple[int, int]) -> dict:
+def stage(
+    *, steps: int, clip_length: int, batch_size: int, strides: tuple[int, int], size: tuple[int, int] = (HEIGHT, WIDTH)
+) -> dict:
+    """A stage of the curriculum, of images of one `size`."""
     return {
         "steps": steps,
         "clip_length": clip_length,
         "batch_size": batch_size,
         "min_stride": strides[0],
         "max_stride": strides[1],
-        "sizes": ((HEIGHT, WIDTH),),
+        "sizes": (size,),
     }

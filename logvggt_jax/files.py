@@ -1,5 +1,6 @@
-"""Results appear whole or not at all: files and folders written under another name and renamed at the end."""
+"""Files that may be damaged, and results that appear whole or not at all: written under another name and renamed."""
 
+import json
 import os
 import platform
 import secrets
@@ -9,11 +10,11 @@ import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from filelock import FileLock, Timeout
 
-from logvggt_jax.errors import DiskError, InputError, OutputExists, disk_errors
+from logvggt_jax.errors import DiskError, InputError, OutputExists, disk_errors, one_line
 
 
 @contextmanager
@@ -28,6 +29,16 @@ def open_regular(path: str | Path) -> Iterator[BinaryIO]:
             raise InputError(f"{path} is no file but a folder, a pipe or a device")
         with Path(path).open("rb") as stream:
             yield stream
+
+
+def read_json(path: str | Path, mend: str) -> Any:
+    """What a JSON file holds. Raises InputError ending in `mend` where it is no JSON, others as `open_regular`."""
+    with open_regular(path) as stream:
+        content = stream.read()
+    try:
+        return json.loads(content.decode())
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not valid JSON ({one_line(error):.200}); {mend}") from error
 
 
 def check_regular_files(folder: Path) -> None:

@@ -1,4 +1,4 @@
-"""Frames of a data set, the one value that crosses package borders without JAX."""
+"""Frames of a data set, the one value that crosses package borders without JAX, and a choice among them."""
 
 from typing import NamedTuple
 
@@ -21,3 +21,8 @@ class Frames(NamedTuple):
     intrinsics: np.ndarray
     extrinsics: np.ndarray
     metric: bool
+
+
+def evenly_spaced(count: int, most: int) -> list[int]:
+    """At most so many different numbers below `count`, evenly spaced from 0 to `count - 1`."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()

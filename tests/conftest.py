@@ -22,15 +22,8 @@ os.environ.setdefault("XLA_FLAGS", QUICK + SIMPLE)
 jax.config.update("jax_platforms", "cpu")
 jax.config.update("jax_num_cpu_devices", 16)
 
-from logvggt_jax import (  # noqa: E402
-    AggregatorConfig,
-    CameraHeadConfig,
-    DPTConfig,
-    EncoderConfig,
-    LogVGGT,
-    ModelConfig,
-    RefinementConfig,
-)
+from logvggt_jax import LogVGGT, ModelConfig  # noqa: E402
+from logvggt_jax.doctor.subject import tiny_config  # noqa: E402
 
 # Grain reads absl flags, which only `app.run` parses.
 if not flags.FLAGS.is_parsed():
@@ -150,13 +143,7 @@ def cases_dir() -> Path:
 @pytest.fixture(scope="session")
 def small_config() -> ModelConfig:
     """A model of about 0.2 M parameters that has every part; images of 28 x 42 give it 2 x 3 patches."""
-    return ModelConfig(
-        encoder=EncoderConfig(embed_dim=32, depth=1, num_heads=2, position_grid=4),
-        aggregator=AggregatorConfig(depth=4, num_heads=2, key_layers=(0, 1, 2, 3), layer_scale=0.5),
-        camera_head=CameraHeadConfig(depth=1, num_heads=2, layer_scale=0.5),
-        depth_head=DPTConfig(features=8, out_channels=(8, 8, 8, 8)),
-        refinement=RefinementConfig(num_heads=2),
-    )
+    return tiny_config()
 
 
 @pytest.fixture(scope="session")

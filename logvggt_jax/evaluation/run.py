@@ -7,8 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from logvggt_jax.evaluation.costs.by_length import measured_costs
-from logvggt_jax.evaluation.costs.throughput import measured_timings
+from logvggt_jax.evaluation.costs.throughput import measured_costs, measured_timings
 from logvggt_jax.evaluation.datasets import open_run
 from logvggt_jax.evaluation.methods.method import Checkpoint, Method, model_row
 from logvggt_jax.evaluation.methods.variants import variant_methods

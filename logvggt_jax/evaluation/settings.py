@@ -6,7 +6,7 @@ from typing import Any
 
 from logvggt_jax.config import from_mapping, require_counts
 from logvggt_jax.errors import InputError
-from logvggt_jax.evaluation.costs.throughput import TimingConfig
+from logvggt_jax.evaluation.costs.streams import TimingConfig
 from logvggt_jax.evaluation.protocols import ProtocolSettings
 from logvggt_jax.evaluation.protocols.clips import ClipSettings
 from logvggt_jax.streaming import METHODS

@@ -84,11 +84,20 @@ def unproject_pixels(
     for t in range(len(depth)):
         chosen = slice(borders[t], borders[t + 1])
         v, u = np.divmod(indices[chosen] - t * height * width, width)
-        matrix, z = np.asarray(intrinsics[t], np.float64), depth[t][v, u].astype(np.float64)
-        rays = [(u - matrix[0, 2]) / matrix[0, 0], (v - matrix[1, 2]) / matrix[1, 1], np.ones_like(z)]
-        in_camera = np.stack(rays, axis=-1) * z[:, None]
-        points[chosen] = transform_points(invert(np.asarray(extrinsics[t], np.float64)), in_camera)
+        pixels, z = np.stack([u, v], axis=-1), depth[t][v, u].astype(np.float64)
+        cameras = (np.asarray(each[t], np.float64) for each in (intrinsics, extrinsics))
+        points[chosen] = points_at(pixels, z, *cameras)
     return points
+
+
+def points_at(pixels: np.ndarray, depth: np.ndarray, intrinsics: np.ndarray, extrinsics: np.ndarray) -> np.ndarray:
+    """World points [N, 3] at pixels [N, 2] (u, v) of one camera (numpy), of z-depth [N]; the inverse of `project`.
+
+    Intrinsics are [3, 3] in pixels, extrinsics [3|4, 4] world-to-camera.
+    """
+    rays = (pixels - intrinsics[:2, 2]) / intrinsics[(0, 1), (0, 1)]
+    in_camera = np.concatenate([rays, np.ones((len(rays), 1))], axis=1) * depth[:, None]
+    return transform_points(invert(extrinsics), in_camera)
 
 
 def project(points: Any, intrinsics: Any, extrinsics: Any | None = None) -> tuple[Any, Any]:

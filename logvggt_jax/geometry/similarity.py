@@ -4,8 +4,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from logvggt_jax.frames import evenly_spaced
 from logvggt_jax.geometry.cameras import camera_centres
 from logvggt_jax.geometry.rotations import nearest_rotation, rotation_angle
+
+# Of reweighting cameras.
+_ROUNDS = 20
 
 
 class Similarity(NamedTuple):
@@ -87,7 +91,7 @@ def robust_similarity(
     return similarity
 
 
-def pose_similarity(source: np.ndarray, target: np.ndarray, *, iterations: int = 20) -> Similarity:
+def pose_similarity(source: np.ndarray, target: np.ndarray) -> Similarity:
     """The similarity that moves the world so that cameras `source` come to lie where cameras `target` are.
 
     Robust: a minority of wrong poses loses its weight. Rotations give the rotation and centres the rest, so that a
@@ -96,7 +100,6 @@ def pose_similarity(source: np.ndarray, target: np.ndarray, *, iterations: int =
     Args:
       source: [N, 3|4, 4] world-to-camera.
       target: [N, 3|4, 4] of the same cameras in another world.
-      iterations: of the reweighting.
 
     Raises:
       ValueError: fewer than two cameras, or centres that coincide, which have no scale.
@@ -104,7 +107,7 @@ def pose_similarity(source: np.ndarray, target: np.ndarray, *, iterations: int =
     source, target = np.asarray(source, np.float64), np.asarray(target, np.float64)
     if len(source) < 2:
         raise ValueError(f"a similarity of cameras needs at least 2, got {len(source)}")
-    rotation = _central_rotation(np.swapaxes(target[:, :3, :3], -1, -2) @ source[:, :3, :3], iterations)
+    rotation = _central_rotation(np.swapaxes(target[:, :3, :3], -1, -2) @ source[:, :3, :3])
     turned, centres = camera_centres(source) @ rotation.T, camera_centres(target)
     # Of camera i and the one half the sequence on: long ways, of which most are right.
     partner = np.roll(np.arange(len(source)), len(source) // 2)
@@ -114,7 +117,7 @@ def pose_similarity(source: np.ndarray, target: np.ndarray, *, iterations: int =
         raise ValueError("no similarity: the cameras are all at one place, which leaves the scale open")
     scale = float(np.median(np.linalg.norm(centres - centres[partner], axis=1)[moved] / lengths[moved]))
     translation = np.median(centres - scale * turned, axis=0)
-    for _ in range(iterations):
+    for _ in range(_ROUNDS):
         residual = np.linalg.norm(scale * turned + translation - centres, axis=1)
         # Where most fit exactly, the others have no weight worth the name.
         limit = max(1.5 * float(np.median(residual)), 1e-12 * float(np.abs(centres).max()), np.finfo(np.float64).tiny)
@@ -131,12 +134,12 @@ def pose_similarity(source: np.ndarray, target: np.ndarray, *, iterations: int =
     return Similarity(scale, rotation, translation)
 
 
-def _central_rotation(rotations: np.ndarray, iterations: int) -> np.ndarray:
+def _central_rotation(rotations: np.ndarray) -> np.ndarray:
     """The rotation [3, 3] that is nearest to most of `rotations` [N, 3, 3]: a mean with weights one over the angle."""
-    candidates = rotations[np.unique(np.linspace(0, len(rotations) - 1, 64).round().astype(int))]
+    candidates = rotations[evenly_spaced(len(rotations), 64)]
     between = rotation_angle(candidates[:, None], rotations[None])
     centre = candidates[np.median(between, axis=1).argmin()]
-    for _ in range(iterations):
+    for _ in range(_ROUNDS):
         weights = 1 / np.maximum(rotation_angle(centre[None], rotations), 1e-6)
         centre = nearest_rotation((weights[:, None, None] * rotations).sum(0) / weights.sum())
     return centre

@@ -167,8 +167,8 @@ def _blocks(*columns: np.ndarray) -> Iterator[tuple[np.ndarray, ...]]:
         yield tuple(np.asarray(column[start : start + _BLOCK]) for column in columns)
 
 
-def _least_absolute_scale(prediction: np.ndarray, target: np.ndarray, iterations: int = 10) -> float:
-    """The scale that minimises Σ |scale · prediction − target| over pixels [N], by reweighted least squares."""
+def _least_absolute_scale(prediction: np.ndarray, target: np.ndarray) -> float:
+    """The scale that minimises Σ |scale · prediction − target| over pixels [N], by ten reweighted least squares."""
 
     def sums(terms: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]) -> tuple[np.float64, np.float64]:
         above, below = np.float64(0.0), np.float64(0.0)
@@ -184,7 +184,7 @@ def _least_absolute_scale(prediction: np.ndarray, target: np.ndarray, iterations
     # A residual near zero weighs up to 1e8, so that the result depends on how these expressions round.
     true_sum, predicted_sum = sums(lambda predicted, true: (true, predicted))
     scale = (true_sum / target.size) / (predicted_sum / target.size)
-    for _ in range(iterations):
+    for _ in range(10):
         above, below = sums(reweighted)
         scale = above / below
     return float(np.maximum(scale, _SMALLEST_SCALE))

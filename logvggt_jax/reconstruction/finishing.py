@@ -5,8 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable
 
-import numpy as np
-
+from logvggt_jax.frames import evenly_spaced
 from logvggt_jax.reconstruction.exporters.ply import write_cloud
 from logvggt_jax.reconstruction.exporters.tum import export_tum
 from logvggt_jax.reconstruction.frame_pool import FramePool
@@ -40,8 +39,7 @@ def finish(
     """
     for name in (PREVIEW_FOLDER, EXPORT_FOLDER):  # of an incomplete result
         shutil.rmtree(result.folder / name, ignore_errors=True)
-    chosen = np.unique(np.linspace(0, result.num_frames - 1, num_previews).round().astype(int)).tolist()
-    write_previews(result, chosen, pool)
+    write_previews(result, evenly_spaced(result.num_frames, num_previews), pool)
     export_tum(result, result.folder / TRAJECTORY_FILE)
     write_cloud(result, result.folder / POINTS_FILE, selection, pool, advance=advance)
     pool.finish()

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from logvggt_jax.colours import depth_picture
+from logvggt_jax.frames import evenly_spaced
 from logvggt_jax.reconstruction.depth_files import write_picture
 from logvggt_jax.reconstruction.frame_pool import FramePool
 from logvggt_jax.reconstruction.result import PREVIEW_FOLDER, Reconstruction, preview_file
@@ -38,7 +39,7 @@ def write_previews(result: Reconstruction, frames: Sequence[int], pool: FramePoo
 def depth_range(result: Reconstruction) -> tuple[float, float]:
     """The depths between which nearly all pixels of a sequence lie: its 2nd and 98th percentile, from a sample."""
     samples = []
-    for index in np.unique(np.linspace(0, result.num_frames - 1, _RANGE_FRAMES).round().astype(int)).tolist():
+    for index in evenly_spaced(result.num_frames, _RANGE_FRAMES):
         depth = result.depth(index).reshape(-1)
         depth = depth[:: max(1, len(depth) // _RANGE_PIXELS)]
         samples.append(depth[np.isfinite(depth) & (depth > 0)])

@@ -10,9 +10,7 @@ import dataclasses
 
 from logvggt_jax.config import ModelConfig, require_counts
 from logvggt_jax.model.key_value_cache import AnchoredCache, Caches, empty
-from logvggt_jax.model.logvggt import LogVGGT, Variables
-from logvggt_jax.streaming.frame_session import FrameSession, StreamMemory, block_shape, camera_memory, frame_program
-from logvggt_jax.streaming.program import Program
+from logvggt_jax.streaming.frame_session import StreamMemory, block_shape, camera_memory
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,15 +48,3 @@ class KeepWindow:
         """The same: a new frame takes the place of an old one."""
         del tokens, received
         return memory
-
-
-def open_anchored_window(model: LogVGGT, variables: Variables, settings: AnchoredWindowSettings) -> FrameSession:
-    """A stream that keeps the first frame and the newest."""
-    return FrameSession(model, variables, KeepWindow(settings.window), ahead=settings.ahead)
-
-
-def anchored_window_program(
-    model: LogVGGT, image_size: tuple[int, int], settings: AnchoredWindowSettings, num_frames: int | None
-) -> Program:
-    """A frame's step; all cost the same."""
-    return frame_program(model, image_size, KeepWindow(settings.window), num_frames)

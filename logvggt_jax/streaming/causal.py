@@ -10,19 +10,15 @@ from typing import Literal
 
 from logvggt_jax.config import ModelConfig, require_counts, require_one_of
 from logvggt_jax.model.key_value_cache import Caches, GrowingCache, empty
-from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.streaming.frame_session import (
     CAMERA_CAPACITY,
-    FrameSession,
     StreamMemory,
     block_shape,
     camera_memory,
     camera_with_room,
     doubled,
-    frame_program,
     with_room,
 )
-from logvggt_jax.streaming.program import Program
 
 CAMERA_CACHES = ("per_round", "single")
 
@@ -67,17 +63,3 @@ class KeepAll:
         """Room for one more frame."""
         blocks = with_room(memory.blocks, (received + 1) * tokens)
         return StreamMemory(blocks, camera_with_room(memory.camera, received, self.rounds))
-
-
-def open_causal(model: LogVGGT, variables: Variables, settings: CausalSettings) -> FrameSession:
-    """A stream that keeps everything."""
-    keeping = KeepAll(settings, model.config.camera_head.iterations)
-    return FrameSession(model, variables, keeping, ahead=settings.ahead)
-
-
-def causal_program(
-    model: LogVGGT, image_size: tuple[int, int], settings: CausalSettings, num_frames: int | None
-) -> Program:
-    """The step of a sequence's last frame, the costliest."""
-    keeping = KeepAll(settings, model.config.camera_head.iterations)
-    return frame_program(model, image_size, keeping, num_frames)

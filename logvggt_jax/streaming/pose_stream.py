@@ -7,7 +7,7 @@ import dataclasses
 import functools
 import warnings
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -32,8 +32,7 @@ def _project(model: LogVGGT, variables: Variables, register_tokens: jax.Array) -
     return model.refinement.project_registers(variables, register_tokens)
 
 
-@functools.partial(jax.jit, static_argnums=0, static_argnames="size", donate_argnums=4)
-def _fire(
+def _fire_once(
     model: LogVGGT,
     variables: Variables,
     camera_tokens: jax.Array,
@@ -50,20 +49,13 @@ def _fire(
     return refined, encodings[0, :, -1], relative_change(before, after)
 
 
+_fire = jax.jit(_fire_once, static_argnums=0, static_argnames="size", donate_argnums=4)
+
+
 @functools.partial(jax.jit, static_argnums=0, static_argnames="size")
-def _look_ahead(
-    model: LogVGGT,
-    variables: Variables,
-    camera_tokens: jax.Array,
-    registers: RegisterKeys | None,
-    refined: jax.Array,
-    span: Span,
-    *,
-    size: int,
-) -> jax.Array:
+def _look_ahead(model: LogVGGT, *arguments: Any, size: int) -> jax.Array:
     """The pose encodings [size, 9] of a trigger that changes nothing."""
-    _, encodings = model.refinement.fire(variables, camera_tokens, registers, refined, span, size=size)
-    return encodings[0, :, -1]
+    return _fire_once(model, *arguments, size=size)[1]
 
 
 @functools.partial(jax.jit, static_argnums=0)

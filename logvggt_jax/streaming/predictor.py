@@ -14,19 +14,16 @@ import numpy as np
 
 from logvggt_jax.errors import InputError
 from logvggt_jax.model.logvggt import LogVGGT, Variables
-from logvggt_jax.streaming.anchored_window import (
-    AnchoredWindowSettings,
-    anchored_window_program,
-    open_anchored_window,
-)
-from logvggt_jax.streaming.causal import CausalSettings, causal_program, open_causal
+from logvggt_jax.streaming.anchored_window import AnchoredWindowSettings, KeepWindow
+from logvggt_jax.streaming.causal import CausalSettings, KeepAll
 from logvggt_jax.streaming.chunks import ChunkPlan, ChunkSession, chunk_program
+from logvggt_jax.streaming.frame_session import FrameSession, Keeping, frame_program
 from logvggt_jax.streaming.merged import MergedSession, MergedSettings, merged_program
 from logvggt_jax.streaming.offline import OfflineSession, OfflineSettings, offline_program
 from logvggt_jax.streaming.program import Program
-from logvggt_jax.streaming.pruned import PrunedSettings, open_pruned, pruned_program
+from logvggt_jax.streaming.pruned import KeepWanted, PrunedSettings
 from logvggt_jax.streaming.results import Cameras, FrameResult, Progress, Signals
-from logvggt_jax.streaming.rolling import RollingSettings, open_rolling, rolling_program
+from logvggt_jax.streaming.rolling import KeepWithinBudget, RollingSettings
 from logvggt_jax.streaming.windows import StreamSession, WindowSettings, window_program
 
 
@@ -117,6 +114,25 @@ class Method(NamedTuple):
     takes_masks: bool = False
 
 
+def _frame_by_frame(title: str, settings: type, keeping: Callable[[Any, int], Keeping], summary: str) -> Method:
+    """A method whose frames pass one by one through what it keeps, made of its settings and the camera head's rounds.
+
+    Its program is the step of the sequence's last frame, the costliest.
+    """
+
+    def kept(model: LogVGGT, chosen: Any) -> Keeping:
+        return keeping(chosen, model.config.camera_head.iterations)
+
+    return Method(
+        title,
+        lambda model, variables, chosen: FrameSession(model, variables, kept(model, chosen), ahead=chosen.ahead),
+        settings,
+        "causal",
+        summary,
+        lambda model, size, chosen, num_frames: frame_program(model, size, kept(model, chosen), num_frames),
+    )
+
+
 METHODS: dict[str, Method] = {
     "windows": Method(
         "LoG-VGGT",
@@ -153,37 +169,29 @@ METHODS: dict[str, Method] = {
         "all frames at once, merged tokens in the global attention",
         merged_program,
     ),
-    "causal": Method(
+    "causal": _frame_by_frame(
         "StreamVGGT",
-        open_causal,
         CausalSettings,
-        "causal",
+        KeepAll,
         "each frame sees all before it through a cache of their keys and values",
-        causal_program,
     ),
-    "anchored-window": Method(
+    "anchored-window": _frame_by_frame(
         "STream3R's window",
-        open_anchored_window,
         AnchoredWindowSettings,
-        "causal",
+        lambda settings, _: KeepWindow(settings.window),
         "each frame sees the first and the newest few through a cache",
-        anchored_window_program,
     ),
-    "rolling": Method(
+    "rolling": _frame_by_frame(
         "InfiniteVGGT",
-        open_rolling,
         RollingSettings,
-        "causal",
+        KeepWithinBudget,
         "a cache within a budget, which drops the keys that are most like the others",
-        rolling_program,
     ),
-    "pruned": Method(
+    "pruned": _frame_by_frame(
         "XStreamVGGT",
-        open_pruned,
         PrunedSettings,
-        "causal",
+        KeepWanted,
         "a cache in four bits of the first frame, the newest, and what the newest looks for",
-        pruned_program,
     ),
 }
 

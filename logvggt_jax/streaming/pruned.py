@@ -9,20 +9,16 @@ from typing import Literal
 from logvggt_jax.config import ModelConfig, require_counts, require_one_of
 from logvggt_jax.errors import InputError
 from logvggt_jax.model.key_value_cache import AnchoredCache, Caches, CameraMemory, empty
-from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.model.memory import RoundMemory
 from logvggt_jax.model.pruned_cache import PrunedCache, empty_packed, empty_pruned
 from logvggt_jax.streaming.causal import CAMERA_CACHES
 from logvggt_jax.streaming.frame_session import (
     CAMERA_CAPACITY,
-    FrameSession,
     StreamMemory,
     block_shape,
     doubled,
-    frame_program,
     with_room,
 )
-from logvggt_jax.streaming.program import Program
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,19 +102,3 @@ class KeepWanted:
             frames = min(CAMERA_CAPACITY, self._most(tokens) // tokens)
             registers = empty(AnchoredCache, (1, frames, config.aggregator.num_registers, width), config.dtype)
         return CameraMemory(RoundMemory(each=trunk) if per_round else RoundMemory(shared=trunk), registers)
-
-
-def open_pruned(model: LogVGGT, variables: Variables, settings: PrunedSettings) -> FrameSession:
-    """A stream that keeps what the cap allows."""
-    return FrameSession(model, variables, _keeping(model, settings), ahead=settings.ahead)
-
-
-def pruned_program(
-    model: LogVGGT, image_size: tuple[int, int], settings: PrunedSettings, num_frames: int | None
-) -> Program:
-    """A frame's step with caches that hold so many frames, or are as they are at first."""
-    return frame_program(model, image_size, _keeping(model, settings), num_frames)
-
-
-def _keeping(model: LogVGGT, settings: PrunedSettings) -> KeepWanted:
-    return KeepWanted(settings, model.config.camera_head.iterations)

@@ -17,22 +17,18 @@ import numpy as np
 from logvggt_jax.config import ModelConfig, require_counts, require_one_of, require_within
 from logvggt_jax.errors import InputError
 from logvggt_jax.model.key_value_cache import GrowingCache, empty
-from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.model.memory import Memory
 from logvggt_jax.model.rolling_cache import RollingCache, RollingMemory
 from logvggt_jax.streaming.causal import CAMERA_CACHES
 from logvggt_jax.streaming.frame_session import (
     CAMERA_CAPACITY,
-    FrameSession,
     StreamMemory,
     block_shape,
     camera_memory,
     camera_with_room,
     doubled,
-    frame_program,
     with_room,
 )
-from logvggt_jax.streaming.program import Program
 
 # Places of a layer's cache over its equal share of the budget: layers that resemble themselves less get more, in the
 # extreme e^(1 / temperature) times as much as others, for which few would make room.
@@ -119,19 +115,3 @@ class KeepWithinBudget:
     def _largest(self, depth: int) -> int:
         """The largest budget that a layer can get: with a score of 0 where all others have 1."""
         return int(self._settings.budget / (1 + (depth - 1) * math.exp(-1 / self._settings.temperature))) + 1
-
-
-def open_rolling(model: LogVGGT, variables: Variables, settings: RollingSettings) -> FrameSession:
-    """A stream that keeps what the budget allows."""
-    return FrameSession(model, variables, _keeping(model, settings), ahead=settings.ahead)
-
-
-def rolling_program(
-    model: LogVGGT, image_size: tuple[int, int], settings: RollingSettings, num_frames: int | None
-) -> Program:
-    """A frame's step with caches that are as full as the budget lets them be."""
-    return frame_program(model, image_size, _keeping(model, settings), num_frames)
-
-
-def _keeping(model: LogVGGT, settings: RollingSettings) -> KeepWithinBudget:
-    return KeepWithinBudget(settings, model.config.camera_head.iterations)

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 from logvggt_jax.colours import coloured, depth_picture
-from logvggt_jax.frames import Frames
+from logvggt_jax.frames import Frames, evenly_spaced
 from logvggt_jax.geometry import camera_centres, relative_to_first
 
 _FRAMES = 4
@@ -47,7 +47,7 @@ def clip_picture(clip: Frames, depth: np.ndarray, confidence: np.ndarray) -> np.
         f"error, 0 to {_LARGEST_ERROR:.0%}",
         f"confidence, 1 to {np.exp(most):.3g}",
     )
-    chosen = np.unique(np.linspace(0, len(depth) - 1, min(_FRAMES, len(depth))).round().astype(int))
+    chosen = evenly_spaced(len(depth), _FRAMES)
     rows = [
         np.concatenate(
             [

@@ -5,9 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from logvggt_jax.errors import InputError, MissingInput
-from logvggt_jax.files import open_regular
+from logvggt_jax.files import open_regular, read_json
 from logvggt_jax.weights.digests import MEND, json_digest
-from logvggt_jax.weights.json_file import read_json
 
 FORMAT = "logvggt-jax model"
 VERSION = 1

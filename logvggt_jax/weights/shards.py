@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 from logvggt_jax.errors import InputError, MissingInput
-from logvggt_jax.weights.json_file import read_json
+from logvggt_jax.files import read_json
 
 INDEX_SUFFIX = ".index.json"
 _SHARD = re.compile(r".*-(\d{5})-of-(\d{5})\.\w+")

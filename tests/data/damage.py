@@ -10,9 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-TEXT_SUFFIXES = frozenset({"", ".txt", ".json", ".csv", ".traj", ".pincam", ".cam", ".npz", ".jgz", ".bin"})
-"""Of calibrations, poses and lists; `metadata` of WildRGB-D has none."""
-
 Damage = Callable[[bytes, np.random.Generator], bytes]
 _STRING = re.compile(rb':\s*("[^"]*")')
 _NUMBER = re.compile(rb"-?\d+\.?\d*(?:[eE][-+]?\d+)?")
@@ -137,11 +134,6 @@ PLACE_DAMAGES: dict[str, Callable[[Path], None]] = {
     "no permission": unreadable,
 }
 """What stands in a file's place, by name."""
-
-
-def text_files(root: Path) -> list[Path]:
-    """Calibrations, poses and lists below `root`, in a fixed order."""
-    return sorted(path for path in root.rglob("*") if path.is_file() and path.suffix in TEXT_SUFFIXES)
 
 
 def damaged_copies(root: Path, files: Iterable[Path], damages: Collection[str], *, seed: int) -> Iterator[str]:

@@ -9,10 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from logvggt_jax import ModelConfig
 from logvggt_jax.config import AggregatorConfig, CameraHeadConfig, DPTConfig, EncoderConfig, RefinementConfig
+from logvggt_jax.model.frame_by_frame import FrameByFrame
+from logvggt_jax.model.windows import Windows
+from logvggt_jax.streaming.frame_session import StreamMemory
 from logvggt_jax.weights import params_from_vggt
 
 TOKENS, POSES = 2e-5, 5e-6
@@ -31,18 +35,25 @@ class Golden:
         return self.arrays[name]
 
 
-def load(golden_dir: Path, name: str, model: str = "") -> Golden:
-    """The file `name`.npz, with weights that are made from their names alone; of two models in it the one that `model`
-    names."""
+def weight_maker(golden_dir: Path) -> Any:
+    """The module that makes the originals' weights from their names and shapes."""
     spec = importlib.util.spec_from_file_location("make_vggt_weights", golden_dir / "make_vggt_weights.py")
     assert spec is not None and spec.loader is not None
     maker = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(maker)
+    return maker
+
+
+def load(golden_dir: Path, name: str, model: str = "") -> Golden:
+    """The file `name`.npz, with weights that are made from their names alone; of two models in it the one that `model`
+    names."""
     with np.load(golden_dir / "methods" / f"{name}.npz") as file:
         arrays = dict(file)
     settings = json.loads(str(arrays["config"]))
     sizes = settings[f"{model}_config"] if model else settings
-    state_dict = dict(maker.weights(json.loads(str(arrays[f"{model}_shapes" if model else "shapes"]))))
+    state_dict = dict(
+        weight_maker(golden_dir).weights(json.loads(str(arrays[f"{model}_shapes" if model else "shapes"])))
+    )
     # Spelt out, since of a model of other depths than VGGT's the weights do not tell the key layers.
     config = ModelConfig(
         encoder=EncoderConfig(
@@ -55,6 +66,22 @@ def load(golden_dir: Path, name: str, model: str = "") -> Golden:
     )
     params, _ = params_from_vggt(state_dict, config)
     return Golden(arrays, settings, config, jax.device_put({"params": params}))
+
+
+def frame_step(
+    config: ModelConfig, variables: dict[str, Any], memory: StreamMemory, image: jax.Array, first: jax.Array
+) -> tuple[StreamMemory, dict[str, jax.Array]]:
+    """One frame [H, W, 3] through a memory: what is kept, and its numbers under a leading axis of 1."""
+    parts, images = FrameByFrame(config), image[None, None]
+    tokens, blocks = parts.tokens(variables, memory.blocks, images, first)
+    out = Windows(config).decode_dense(variables, tokens, jnp.ones((1, 1), bool), images.shape[2:4])
+    camera, poses = parts.locate(variables, memory.camera, out.camera_tokens, out.register_tokens)
+    return StreamMemory(blocks, camera), {
+        "tokens": jnp.moveaxis(tokens.key[0], 1, 0),
+        "depth": out.depth[0],
+        "depth_conf": out.depth_confidence[0],
+        "poses": poses[0],
+    }
 
 
 def assert_depth(found: np.ndarray, expected: np.ndarray) -> None:

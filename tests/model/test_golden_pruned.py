@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import struct
-from golden_methods import POSES, TOKENS, Golden, assert_depth
+from golden_methods import POSES, TOKENS, Golden, assert_depth, frame_step
 
-from logvggt_jax.model.frame_by_frame import FrameByFrame
 from logvggt_jax.model.layers import Attention
 from logvggt_jax.model.memory import OwnTokens
 from logvggt_jax.model.parameters import run
 from logvggt_jax.model.pruned_cache import PackedPrunedCache, PrunedCache, empty_packed, scores_of
 from logvggt_jax.model.quantisation import encoded_keys, encoded_values, packed, unpacked
 from logvggt_jax.model.rope import rope_table
-from logvggt_jax.model.windows import Windows
 from logvggt_jax.streaming.frame_session import StreamMemory
 from logvggt_jax.streaming.pruned import KeepWanted, PrunedSettings
 
@@ -37,19 +34,7 @@ def golden_quantised(golden_dir: Path) -> Golden:
     return golden_methods.load(golden_dir, "pruned", "quant")
 
 
-@functools.partial(jax.jit, static_argnums=0)
-def _step(config: Any, variables: Any, memory: StreamMemory, image: jax.Array, first: jax.Array) -> Any:
-    parts, images = FrameByFrame(config), image[None, None]
-    tokens, blocks = parts.tokens(variables, memory.blocks, images, first)
-    out = Windows(config).decode_dense(variables, tokens, jnp.ones((1, 1), bool), images.shape[2:4])
-    camera, poses = parts.locate(variables, memory.camera, out.camera_tokens, out.register_tokens)
-    numbers = {
-        "tokens": tokens.key[0, :, 0],
-        "depth": out.depth[0, 0],
-        "depth_conf": out.depth_confidence[0, 0],
-        "poses": poses[0, 0],
-    }
-    return StreamMemory(blocks, camera), numbers
+_step = jax.jit(frame_step, static_argnums=0)
 
 
 def _streamed(golden: Golden, settings: PrunedSettings) -> tuple[dict[str, np.ndarray], list[StreamMemory]]:
@@ -63,7 +48,7 @@ def _streamed(golden: Golden, settings: PrunedSettings) -> tuple[dict[str, np.nd
         memory, found = _step(config, golden.variables, memory, image, jnp.array([index == 0]))
         numbers.append(jax.device_get(found))
         kept.append(jax.device_get(memory))
-    return jax.tree.map(lambda *x: np.stack(x), *numbers), kept
+    return jax.tree.map(lambda *x: np.concatenate(x), *numbers), kept
 
 
 def _kept_tokens(caches: list[PrunedCache], tokens: int) -> list[list[int]]:

@@ -9,11 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from golden_methods import POSES, TOKENS, Golden, assert_depth
+from golden_methods import POSES, TOKENS, Golden, assert_depth, frame_step
 
 from logvggt_jax.model import rolling_cache
-from logvggt_jax.model.frame_by_frame import FrameByFrame
-from logvggt_jax.model.windows import Windows
 from logvggt_jax.streaming.frame_session import StreamMemory
 from logvggt_jax.streaming.rolling import KeepWithinBudget, RollingSettings
 
@@ -41,22 +39,15 @@ class Stream:
 
         @jax.jit
         def step(memory: StreamMemory, image: jax.Array, first: jax.Array) -> tuple[StreamMemory, dict[str, Any]]:
-            parts, images = FrameByFrame(golden.config), image[None, None]
-            tokens, blocks = parts.tokens(golden.variables, memory.blocks, images, first)
-            mask = jnp.ones((1, 1), bool)
-            out = Windows(golden.config).decode_dense(golden.variables, tokens, mask, images.shape[2:4])
-            camera, poses = parts.locate(golden.variables, memory.camera, out.camera_tokens, out.register_tokens)
-            layers = blocks.layers
-            return StreamMemory(blocks, camera), {
-                "tokens": jnp.moveaxis(tokens.key[0], 1, 0),
-                "depth": out.depth[0],
-                "depth_conf": out.depth_confidence[0],
-                "poses": poses[0],
+            after, numbers = frame_step(golden.config, golden.variables, memory, image, first)
+            layers, entries = after.blocks.layers, after.camera.trunk.shared.layers
+            return after, {
+                **numbers,
                 "budget": jnp.stack([layer.budget for layer in layers])[None],
                 "cache_len": jnp.stack([layer.length for layer in layers])[None],
                 "score_before": memory.blocks.scores[None],
-                "score_after": blocks.scores[None],
-                "camera_cache_len": jnp.stack([cache.length for cache in camera.trunk.shared.layers])[None],
+                "score_after": after.blocks.scores[None],
+                "camera_cache_len": jnp.stack([cache.length for cache in entries])[None],
             }
 
         self.step, self.recorded = step, recorded

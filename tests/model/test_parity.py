@@ -6,13 +6,13 @@ LayerNorm epsilon or a resampling convention from rounding.
 """
 
 import dataclasses
-import importlib.util
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from golden_methods import weight_maker
 
 from logvggt_jax.config import WindowConfig
 from logvggt_jax.geometry import (
@@ -49,9 +49,7 @@ def golden(golden_dir):
 @pytest.fixture(scope="module")
 def converted(golden_dir):
     """Configuration (one window of all six frames, hence plain VGGT) and parameters."""
-    spec = importlib.util.spec_from_file_location("make_vggt_weights", golden_dir / "make_vggt_weights.py")
-    maker = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(maker)
+    maker = weight_maker(golden_dir)
     state_dict = dict(maker.weights(maker.load_shapes(golden_dir / "vggt_tiny.json")))
     config = dataclasses.replace(config_from_vggt(state_dict, point_head=True), windows=WindowConfig(size=6, stride=2))
     return config, params_from_vggt(state_dict, config)[0]

@@ -18,12 +18,14 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax.sharding import Mesh
+from jax.sharding import PartitionSpec as P
 
 from logvggt_jax import LogVGGT, ModelConfig, Predictions
 from logvggt_jax.model.parameters import whole
-from logvggt_jax.training.config import TrainConfig
+from logvggt_jax.training.config import LossConfig, TrainConfig
 from logvggt_jax.training.program import make_program
-from logvggt_jax.training.sharding import data_mesh, put_batch
+from logvggt_jax.training.sharding import data_mesh, parameter_layout, put_batch
+from logvggt_jax.training.step import loss_and_gradients, make_loss_terms
 from logvggt_jax.weights.digests import whole_array
 
 Clips = dict[str, np.ndarray]
@@ -57,6 +59,23 @@ class Outcome(NamedTuple):
 
     gradient: Any
     losses: list[float]
+
+
+def first_gradient(
+    model: Any, config: LossConfig, params: Any, clips: Clips, mesh: Mesh, *, shard: bool = False, accumulate: int = 1
+) -> Any:
+    """Loss, what is logged, the gradient and its norm, on the host."""
+    terms, layout = make_loss_terms(model, config), parameter_layout(params, mesh, shard=shard)
+    specs = layout.specs(params)
+
+    def run(params: Any, batch: Any) -> Any:
+        total, metrics, found, _ = loss_and_gradients(terms, config, params, batch, layout, accumulate=accumulate)
+        return total, metrics, found, layout.norm(found)
+
+    sharded = jax.shard_map(
+        run, mesh=mesh, in_specs=(specs, P("data")), out_specs=(P(), P(), specs, P()), check_vma=False
+    )
+    return jax.device_get(jax.jit(sharded)(layout.put(params), put_batch(clips, mesh)))
 
 
 def steps(model: Any, config: TrainConfig, params: Any, clips: Clips, mesh: Mesh, count: int) -> Outcome:

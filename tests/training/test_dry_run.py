@@ -42,6 +42,19 @@ def quick(monkeypatch: pytest.MonkeyPatch, layered: Any, layered_params: Any) ->
     return asked
 
 
+@pytest.fixture
+def tried(quick: list[tuple[int, ...]], monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Numbers of clips a device whose steps were asked for; each takes five bytes, and ten a clip."""
+    asked: list[int] = []
+
+    def costs(config: TrainConfig, mesh: object, clips: int, clip_length: int, size: object) -> StepCosts:
+        asked.append(clips)
+        return StepCosts(5, 10 * clips, {}, 0.0)
+
+    monkeypatch.setattr(module, "step_costs", costs)
+    return asked
+
+
 def test_a_step_is_described_and_nothing_is_allocated(
     config: TrainConfig, quick: list[tuple[int, ...]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -83,20 +96,12 @@ def test_operations_grow_with_the_clips_and_what_is_trained(
     assert step_flops(dataclasses.replace(config.model, encoder=trained), (1, 2, *SIZE)) == 3 * forward
 
 
-@pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize(
     ("limit", "answer"), [(45, "4 is the largest of 1, 2, 4, 8 clips"), (5, "none of 1, 2, 4, 8 clips"), (1000, "8 is")]
 )
 def test_the_largest_that_fits_is_searched(
-    config: TrainConfig, limit: int, answer: str, monkeypatch: pytest.MonkeyPatch
+    config: TrainConfig, tried: list[int], limit: int, answer: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    tried: list[int] = []
-
-    def costs(config: TrainConfig, mesh: object, clips: int, clip_length: int, size: object) -> StepCosts:
-        tried.append(clips)
-        return StepCosts(5, 10 * clips, {}, 0.0)
-
-    monkeypatch.setattr(module, "step_costs", costs)
     monkeypatch.setattr(module, "device_bytes", lambda device: limit)
     lines: list[str] = []
     dry_run(config, data_mesh(2), lines.append)
@@ -106,17 +111,9 @@ def test_the_largest_that_fits_is_searched(
     assert ("which do not fit" in lines[1]) == (limit < 25)
 
 
-@pytest.mark.usefixtures("quick")
 def test_clips_that_are_accumulated_are_tried_in_whole_parts(
-    config: TrainConfig, monkeypatch: pytest.MonkeyPatch
+    config: TrainConfig, tried: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    tried: list[int] = []
-
-    def costs(config: TrainConfig, mesh: object, clips: int, clip_length: int, size: object) -> StepCosts:
-        tried.append(clips)
-        return StepCosts(5, 10 * clips, {}, 0.0)
-
-    monkeypatch.setattr(module, "step_costs", costs)
     monkeypatch.setattr(module, "device_bytes", lambda device: 65)
     lines: list[str] = []
     dry_run(dataclasses.replace(config, accumulate=2), data_mesh(2), lines.append)

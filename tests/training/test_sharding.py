@@ -10,7 +10,7 @@ import jax
 import numpy as np
 import pytest
 from jax.sharding import PartitionSpec as P
-from parallel_runs import LayeredModel, Outcome, steps, steps_of_processes
+from parallel_runs import LayeredModel, Outcome, first_gradient, steps, steps_of_processes
 
 from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.model.parameters import stack_layers
@@ -20,7 +20,6 @@ from logvggt_jax.training.config import LossConfig, TrainConfig
 from logvggt_jax.training.loop import train
 from logvggt_jax.training.program import make_program
 from logvggt_jax.training.sharding import Layout, check_batch_size, data_mesh, parameter_layout, put_batch
-from logvggt_jax.training.step import loss_and_gradients, make_loss_terms
 from logvggt_jax.training.watchdog import Watchdog
 
 Clips = dict[str, np.ndarray]
@@ -32,26 +31,9 @@ def sixteen(clips: Clips) -> Clips:
     return {name: np.concatenate([value, value[::-1]]) for name, value in clips.items()}
 
 
-def _gradients(
-    model: Any, config: LossConfig, params: Any, clips: Clips, devices: int, *, shard: bool, accumulate: int
-) -> Any:
-    mesh = data_mesh(devices)
-    terms, layout = make_loss_terms(model, config), parameter_layout(params, mesh, shard=shard)
-    specs = layout.specs(params)
-
-    def run(params: Any, batch: Any) -> Any:
-        total, metrics, gradients, _ = loss_and_gradients(terms, config, params, batch, layout, accumulate=accumulate)
-        return total, metrics, gradients, layout.norm(gradients)
-
-    sharded = jax.shard_map(
-        run, mesh=mesh, in_specs=(specs, P("data")), out_specs=(P(), P(), specs, P()), check_vma=False
-    )
-    return jax.device_get(jax.jit(sharded)(layout.put(params), put_batch(clips, mesh)))
-
-
 @pytest.fixture(scope="module")
 def alone(layered: Any, loss_config: LossConfig, layered_params: Any, sixteen: Clips) -> Any:
-    return _gradients(layered, loss_config, layered_params, sixteen, 1, shard=False, accumulate=1)
+    return first_gradient(layered, loss_config, layered_params, sixteen, data_mesh(1))
 
 
 @pytest.mark.parametrize(
@@ -68,7 +50,8 @@ def test_first_gradient_is_that_of_one_device(
     sixteen: Clips,
     alone: Any,
 ) -> None:
-    found = _gradients(layered, loss_config, layered_params, sixteen, devices, shard=shard, accumulate=accumulate)
+    mesh = data_mesh(devices)
+    found = first_gradient(layered, loss_config, layered_params, sixteen, mesh, shard=shard, accumulate=accumulate)
     _agree(found, alone, rel=1e-5)
 
 
@@ -87,8 +70,9 @@ def test_first_gradient_of_the_real_model_is_that_of_one_device(
     # No gate is zero.
     params = jax.tree.map(lambda x: x + 0.1 * generator.standard_normal(x.shape).astype(np.float32), params)
     short = {name: value[:, :3] for name, value in sixteen.items() if name != "frame_mask"}
-    one = _gradients(model, loss_config, params, short, 1, shard=False, accumulate=1)
-    _agree(_gradients(model, loss_config, params, short, devices, shard=shard, accumulate=accumulate), one, rel=1e-5)
+    one = first_gradient(model, loss_config, params, short, data_mesh(1))
+    found = first_gradient(model, loss_config, params, short, data_mesh(devices), shard=shard, accumulate=accumulate)
+    _agree(found, one, rel=1e-5)
 
 
 def _gentle(config: TrainConfig, **changes: Any) -> TrainConfig:

@@ -8,40 +8,23 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.sharding import Mesh
-from jax.sharding import PartitionSpec as P
+from parallel_runs import first_gradient
 
 from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.training.config import LossConfig, OptimizerConfig, StageConfig
 from logvggt_jax.training.optimizer import learning_rate_schedule, make_optimizer
 from logvggt_jax.training.sharding import check_batch_size, data_mesh, parameter_layout, put_batch, replicated
 from logvggt_jax.training.state import initial_state
-from logvggt_jax.training.step import loss_and_gradients, make_loss_terms, make_train_step
+from logvggt_jax.training.step import make_loss_terms, make_train_step
 
 Clips = dict[str, np.ndarray]
 STAGES = (StageConfig("only", 8, 5, 8, 1, 1, ((28, 42),)),)
 
 
-def _gradients(
-    model: Any,
-    config: LossConfig,
-    mesh: Mesh,
-    params: Any,
-    clips: Clips,
-    *,
-    shard: bool = False,
-    accumulate: int = 1,
-) -> tuple[Any, Any]:
-    terms, layout = make_loss_terms(model, config), parameter_layout(params, mesh, shard=shard)
-    assert bool(layout.axes) == shard
-
-    def logged_and_gradients(params: Any, batch: Any) -> Any:
-        return loss_and_gradients(terms, config, params, batch, layout, accumulate=accumulate)[1:3]
-
-    specs = layout.specs(params)
-    sharded = jax.shard_map(
-        logged_and_gradients, mesh=mesh, in_specs=(specs, P("data")), out_specs=(P(), specs), check_vma=False
-    )
-    return jax.device_get(jax.jit(sharded)(layout.put(params), put_batch(clips, mesh)))
+def _gradients(model: Any, config: LossConfig, mesh: Mesh, params: Any, clips: Clips) -> tuple[Any, Any]:
+    """What is logged, and the gradient."""
+    _, metrics, found, _ = first_gradient(model, config, params, clips, mesh)
+    return metrics, found
 
 
 def test_gradient_on_many_devices_is_that_on_one(

@@ -12,7 +12,7 @@ from logvggt_jax.data.errors import MissingFiles
 from logvggt_jax.data.readers.folder_dataset import FolderDataset
 from logvggt_jax.errors import InputError, MissingPackage, install_line
 from logvggt_jax.files import atomic_file
-from logvggt_jax.frames import Frames
+from logvggt_jax.frames import Frames, evenly_spaced
 from logvggt_jax.geometry import camera_centres, unproject
 
 _ARROWS = 40  # headings along a path
@@ -104,7 +104,7 @@ def _draw_from_above(axis: Any, extrinsics: np.ndarray, views: list[Frames]) -> 
     x, y = plane @ camera_centres(extrinsics.astype(np.float64)).T
     axis.plot(x, y, "-", color="C3", linewidth=1)
     axis.plot(x[:1], y[:1], "s", color="C3", markersize=5)
-    chosen = np.unique(np.linspace(0, len(extrinsics) - 1, _ARROWS).round().astype(int))
+    chosen = evenly_spaced(len(extrinsics), _ARROWS)
     # The optical axis is the third row of a world-to-camera rotation.
     along = plane @ extrinsics[chosen, 2, :3].astype(np.float64).T
     axis.quiver(x[chosen], y[chosen], *along, color="C3", angles="xy", width=0.004, scale=15)

@@ -15,7 +15,7 @@ from typing import Any
 
 from logvggt_jax.data.errors import MissingFiles
 from logvggt_jax.errors import InputError, disk_errors
-from logvggt_jax.files import write_text
+from logvggt_jax.files import read_json, write_text
 
 INDEX, PLAN = "packed.json", "plan.json"
 FORMAT = "logvggt-jax packed data set"
@@ -104,12 +104,7 @@ def read_json_object(path: Path) -> dict[str, Any]:
     """A file's JSON object; MissingFiles or InputError naming it."""
     if not path.is_file():
         raise MissingFiles(f"{path}: no such file; {MEND}")
-    with disk_errors(path):
-        data = path.read_bytes()
-    try:
-        content = json.loads(data)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not JSON ({error}); {MEND}") from error
+    content = read_json(path, MEND)
     if not isinstance(content, dict):
         raise InputError(f"{path}: not a JSON object; {MEND}")
     return content

@@ -17,16 +17,15 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from logvggt_jax.data.dataset import EVALUATION, TRAINING, About
-from logvggt_jax.data.errors import missing_files
 from logvggt_jax.data.formats.calibration import in_pixels, relative
 from logvggt_jax.data.formats.colmap_model import ColmapCamera, read_cameras, read_depth_map, read_images
 from logvggt_jax.data.formats.image import read_rgb
 from logvggt_jax.data.formats.ordering import natural_order
 from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame, read_depth_of
+from logvggt_jax.data.readers.own_recordings import PICTURE_SUFFIXES, file_below, find_recordings, names_beside
 from logvggt_jax.errors import InputError
 
-_PICTURE_SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
 _DEPTH_UNITS = 1000.0
 
 
@@ -53,11 +52,7 @@ class Colmap(FolderDataset):
     )
 
     def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
-        if files.exists(self.root / "sparse"):
-            # A root such as "." has no name of its own.
-            return {self.root.resolve().name: self.root}
-        folders = files.folders(self.root, self.expects)
-        return {name: folder for name, folder in folders.items() if files.exists(folder / "sparse")}
+        return find_recordings(self.root, files, self.expects, lambda folder: files.exists(folder / "sparse"))
 
     def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
         sparse, pictures = folder / "sparse", folder / "images"
@@ -65,16 +60,13 @@ class Colmap(FolderDataset):
         camera_file, cameras = read_cameras(files, model)
         image_file, images = read_images(files, model)
         images = [images[position] for position in natural_order([image.name for image in images])]
-        paths = [_inside(pictures, image.name, image_file) for image in images]
-        names = {each: set(files.names(each, self.expects)) for each in {pictures, *(path.parent for path in paths)}}
-        absent = [path for path in paths if path.name not in names[path.parent]]
-        if absent:
-            raise missing_files(dict.fromkeys(absent, f"but {image_file} names it; copy it there"))
+        paths = [file_below(pictures, image.name, image_file) for image in images]
+        names = {pictures: set(files.names(pictures, self.expects)), **names_beside(files, paths, image_file)}
         intrinsics = {
             number: _intrinsics(cameras, number, camera_file, image_file) for number in {i.camera for i in images}
         }
         there = {each / name for each, held in names.items() for name in held}
-        yield from (Dropped("no pose") for path in there - set(paths) if path.suffix.lower() in _PICTURE_SUFFIXES)
+        yield from (Dropped("no pose") for path in there - set(paths) if path.suffix.lower() in PICTURE_SUFFIXES)
         depths = _depth_files(files, folder, [image.name for image in images])
         for image, path in zip(images, paths, strict=True):
             depth = depths.get(image.name) if depths else path  # a picture in depth's place stands for no depth
@@ -89,14 +81,6 @@ class Colmap(FolderDataset):
         is_map = record.depth.suffix == ".bin"
         depth = read_depth_map(record.depth) if is_map else read_depth_of(record, image, _DEPTH_UNITS)
         return image, depth, in_pixels(record.intrinsics, image.shape[:2], record.image, record.calibration)
-
-
-def _inside(folder: Path, name: str, model_file: Path) -> Path:
-    """The file of a picture; InputError naming `model_file` for a name that leads out of the folder."""
-    relative_name = PurePosixPath(name)
-    if relative_name.is_absolute() or ".." in relative_name.parts or not relative_name.name:
-        raise InputError(f"{model_file}: {name!r} is no picture's name below {folder}: export the model again")
-    return folder / relative_name
 
 
 def _intrinsics(cameras: Mapping[int, ColmapCamera], number: int, path: Path, image_file: Path) -> np.ndarray:

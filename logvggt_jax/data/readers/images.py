@@ -16,8 +16,7 @@ from logvggt_jax.data.formats.image import read_rgb
 from logvggt_jax.data.formats.ordering import natural_order
 from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.data.readers.folder_dataset import NO_POSES, Dropped, FolderDataset, FrameRecord, frame
-
-_SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
+from logvggt_jax.data.readers.own_recordings import PICTURE_SUFFIXES, find_recordings
 
 
 class Images(FolderDataset):
@@ -36,11 +35,7 @@ class Images(FolderDataset):
     about = About(source="film it", licence="your own", size="your own", roles=(TRAINING,))
 
     def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
-        if _pictures(self.root, files):
-            # A root such as "." has no name of its own.
-            return {self.root.resolve().name: self.root}
-        folders = files.folders(self.root, self.expects)
-        return {name: folder for name, folder in folders.items() if _pictures(folder, files)}
+        return find_recordings(self.root, files, self.expects, lambda folder: _pictures(folder, files))
 
     def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
         names = _pictures(folder, files)
@@ -60,4 +55,4 @@ class Images(FolderDataset):
 
 
 def _pictures(folder: Path, files: SourceFiles) -> list[str]:
-    return [name for name in files.names(folder, "pictures") if Path(name).suffix.lower() in _SUFFIXES]
+    return [name for name in files.names(folder, "pictures") if Path(name).suffix.lower() in PICTURE_SUFFIXES]

@@ -11,26 +11,23 @@ Layout: the root is such a recording, or holds folders that are. `transforms.jso
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path, PurePosixPath
+from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from logvggt_jax.data.dataset import EVALUATION, TRAINING, About
-from logvggt_jax.data.errors import missing_files
-from logvggt_jax.data.formats.calibration import OPENGL_AXES, in_pixels, pinhole, relative, world_to_camera
+from logvggt_jax.data.formats.calibration import OPENGL_AXES, in_pixels, relative, world_to_camera
 from logvggt_jax.data.formats.image import read_rgb
 from logvggt_jax.data.formats.json_values import expecting, read_json, text_of
+from logvggt_jax.data.formats.nerfstudio_transforms import CAMERA, TRANSFORMS_FILE, camera_of, is_pinhole
 from logvggt_jax.data.formats.ordering import natural_order
 from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame, read_depth_of
+from logvggt_jax.data.readers.own_recordings import file_below, find_recordings, names_beside
 from logvggt_jax.errors import InputError
 
-_TRANSFORMS = "transforms.json"
-_CAMERA = ("fl_x", "fl_y", "cx", "cy", "w", "h")
-_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-_PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")
 _DEPTH_UNITS = 1000.0
 
 
@@ -44,7 +41,7 @@ class Nerfstudio(FolderDataset):
 
     name = "nerfstudio"
     title = "own recordings in nerfstudio's form"
-    expects = f"{_TRANSFORMS} with cameras and frames, and the pictures and depth that it names, or folders that do"
+    expects = f"{TRANSFORMS_FILE} with cameras and frames, and the pictures and depth that it names, or folders that do"
     metric = False
     splits = ("all",)
     own = True
@@ -56,22 +53,20 @@ class Nerfstudio(FolderDataset):
     )
 
     def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
-        if files.exists(self.root / _TRANSFORMS):
-            # A root such as "." has no name of its own.
-            return {self.root.resolve().name: self.root}
-        folders = files.folders(self.root, self.expects)
-        return {name: folder for name, folder in folders.items() if files.exists(folder / _TRANSFORMS)}
+        return find_recordings(self.root, files, self.expects, lambda folder: files.exists(folder / TRANSFORMS_FILE))
 
     def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
-        path = folder / _TRANSFORMS
+        path = folder / TRANSFORMS_FILE
         content = read_json(files.text(path, "cameras and frames in nerfstudio's form"), path)
         with expecting(path, "an object with a list of frames"):
             entries = [{**content, **entry} for entry in content["frames"]]
-            names = [_inside(path, entry["file_path"]) for entry in entries]
+            images = [file_below(folder, text_of(entry["file_path"]), path) for entry in entries]
             depths = [
-                _inside(path, entry["depth_file_path"]) if entry.get("depth_file_path") else None for entry in entries
+                file_below(folder, text_of(entry["depth_file_path"]), path) if entry.get("depth_file_path") else None
+                for entry in entries
             ]
-        _check_present(files, path, [name for name in (*names, *depths) if name is not None])
+        names_beside(files, [file for file in (*images, *depths) if file is not None], path)
+        names = [str(image.relative_to(folder)) for image in images]
         for place in natural_order(names):
             if depths[place] is None and any(depths):
                 yield Dropped("no depth")
@@ -86,8 +81,8 @@ class Nerfstudio(FolderDataset):
                 pose = pose @ OPENGL_AXES
             extrinsics = world_to_camera(pose, where, stored="camera_to_world")
             # A picture in depth's place stands for no depth.
-            depth = folder / (depths[place] or names[place])
-            yield frame(folder / names[place], depth, intrinsics, extrinsics, name=names[place], calibration=path)
+            depth = depths[place] or images[place]
+            yield frame(images[place], depth, intrinsics, extrinsics, name=names[place], calibration=path)
 
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         image = read_rgb(record.image)
@@ -95,35 +90,16 @@ class Nerfstudio(FolderDataset):
         return image, read_depth_of(record, image, _DEPTH_UNITS), intrinsics
 
 
-def _inside(path: Path, name: Any) -> str:
-    """A file's name below the recording; InputError naming `path` for one that leads out of it."""
-    relative_name = PurePosixPath(text_of(name))
-    if relative_name.is_absolute() or ".." in relative_name.parts or not relative_name.name:
-        raise InputError(f"{path}: {name!r} is no file's name below {path.parent}: export the recording again")
-    return str(relative_name)
-
-
-def _check_present(files: SourceFiles, path: Path, names: Sequence[str]) -> None:
-    paths = [path.parent / name for name in names]
-    held = {
-        folder: set(files.names(folder, f"the files that {path} names")) for folder in {path.parent for path in paths}
-    }
-    absent = [each for each in paths if each.name not in held[each.parent]]
-    if absent:
-        raise missing_files(dict.fromkeys(absent, f"but {path} names it; copy it there"))
-
-
 def _intrinsics(entry: Mapping[str, Any], where: str) -> np.ndarray:
     """Intrinsics [3, 3] of a picture of one pixel; the frame's own values come before those for all."""
-    model = entry.get("camera_model", "PINHOLE")
-    if model not in _PINHOLES or any(float(entry.get(name, 0.0)) for name in _DISTORTION):
+    if not is_pinhole(entry):
         raise InputError(
-            f"{where}: {model} with distortion, frames need a pinhole: undistort the pictures (`colmap "
-            "image_undistorter`; its output folder can be read as `colmap`)"
+            f"{where}: {entry.get('camera_model', 'PINHOLE')} with distortion, frames need a pinhole: undistort the "
+            "pictures (`colmap image_undistorter`; its output folder can be read as `colmap`)"
         )
-    if absent := [name for name in _CAMERA if name not in entry]:
+    if absent := [name for name in CAMERA if name not in entry]:
         raise InputError(f"{where}: no {', '.join(absent)}, neither here nor for all frames: add what is missing")
-    fx, fy, cx, cy, width, height = (float(entry[name]) for name in _CAMERA)
+    intrinsics, height, width = camera_of(entry)
     if not (width >= 1 and height >= 1 and math.isfinite(width * height)):
         raise InputError(f"{where}: pictures of w={width:g} x h={height:g} do not exist: edit the file")
-    return relative(pinhole(fx, fy, cx - 0.5, cy - 0.5), (int(height), int(width)))
+    return relative(intrinsics, (int(height), int(width)))

@@ -29,6 +29,7 @@ from logvggt_jax.data.formats.calibration import in_pixels, numbers, pinhole, re
 from logvggt_jax.data.formats.image import read_rgb
 from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame, read_depth_of
+from logvggt_jax.data.readers.own_recordings import find_recordings
 from logvggt_jax.data.readers.timed_rgbd import (
     UNITS_PER_METRE,
     Trajectory,
@@ -70,11 +71,9 @@ class TUMRecording(FolderDataset):
     )
 
     def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
-        if _is_recording(self.root, files):
-            # A root such as "." has no name of its own.
-            return {self.root.resolve().name: self.root}
-        folders = files.folders(self.root, self.expects)
-        return {name: folder for name, folder in folders.items() if _is_recording(folder, files)}
+        return find_recordings(
+            self.root, files, self.expects, lambda each: files.exists(each / "rgb") or files.exists(each / "rgb.txt")
+        )
 
     def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
         own = folder / _CALIBRATION
@@ -111,10 +110,6 @@ class TUMRecording(FolderDataset):
                 "(`logvggt data check tum_recording` tells more)"
             )
         return image, depth, intrinsics
-
-
-def _is_recording(folder: Path, files: SourceFiles) -> bool:
-    return files.exists(folder / "rgb") or files.exists(folder / "rgb.txt")
 
 
 def _stream(folder: Path, kind: str, files: SourceFiles) -> tuple[np.ndarray, list[Path]]:

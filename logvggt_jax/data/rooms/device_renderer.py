@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from logvggt_jax.data.rooms.intersections import box, chord, slab
 from logvggt_jax.data.rooms.ray_caster import AMBIENT, FADING, SHADOW_BIAS
 from logvggt_jax.data.rooms.textures import WAVES
 
@@ -99,25 +100,24 @@ def _cast(room: Mapping[str, jax.Array], start: Components, rays: Components) ->
     first_sphere = 6 + 6 * len(room["boxes"])
     first_cylinder = first_sphere + len(room["spheres"])
 
-    def box(number: jax.Array, thing: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        near, leave, turned = _through_box(thing, start, rays)
-        enter = jnp.maximum(jnp.maximum(near[0], near[1]), near[2])
+    def meet_box(number: jax.Array, thing: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        near, enter, leave, turned = _through_box(thing, start, rays)
         # A ray enters by the positive face where it runs in the negative direction.
         face = jnp.where(
             enter == near[0], 0 + (turned[0] < 0), jnp.where(enter == near[1], 2 + (turned[1] < 0), 4 + (turned[2] < 0))
         )
         return enter, enter <= leave, 6 + 6 * number + face
 
-    def sphere(number: jax.Array, thing: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def meet_sphere(number: jax.Array, thing: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         enter, leave = _through_sphere(thing, start, rays)
         return enter, enter < leave, first_sphere + number
 
-    def cylinder(number: jax.Array, thing: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def meet_cylinder(number: jax.Array, thing: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         side, cap, leave = _through_cylinder(thing, start, rays)
         enter = jnp.maximum(side, cap)
         return enter, enter <= leave, first_cylinder + 2 * number + (cap > side)
 
-    for things, meet in ((room["boxes"], box), (room["spheres"], sphere), (room["cylinders"], cylinder)):
+    for things, meet in ((room["boxes"], meet_box), (room["spheres"], meet_sphere), (room["cylinders"], meet_cylinder)):
         depth, surface = _nearest(things, meet, depth, surface)
     return depth, surface
 
@@ -134,42 +134,28 @@ def _nearest(
     return jax.lax.scan(one, (depth, surface), (jnp.arange(len(things)), things))[0]
 
 
-def _through_box(thing: jax.Array, start: Components, rays: Components) -> tuple[Components, jax.Array, Components]:
-    """Where rays come between each pair of faces, where they leave the box, and the rays along its axes."""
+def _through_box(
+    thing: jax.Array, start: Components, rays: Components
+) -> tuple[Components, jax.Array, jax.Array, Components]:
+    """As `intersections.box`, and the rays along the box's axes."""
     x, y, z = (start[axis] - thing[axis] for axis in range(3))
     cosine, sine = thing[6], thing[7]
     origin = [cosine * x - sine * z, y, sine * x + cosine * z]
     turned = [cosine * rays[0] - sine * rays[2], rays[1], sine * rays[0] + cosine * rays[2]]
-    near, far = [], []
-    for axis in range(3):
-        inverse = 1.0 / _not_zero(turned[axis])
-        middle, reach = -origin[axis] * inverse, thing[3 + axis] * jnp.abs(inverse)
-        near.append(middle - reach)
-        far.append(middle + reach)
-    return near, jnp.minimum(jnp.minimum(far[0], far[1]), far[2]), turned
+    return *box(origin, [1.0 / _not_zero(each) for each in turned], list(thing[3:6])), turned
 
 
 def _through_sphere(thing: jax.Array, start: Components, rays: Components) -> tuple[jax.Array, jax.Array]:
-    return _chord([start[axis] - thing[axis] for axis in range(3)], rays, thing[3])
+    middle, half = chord([start[axis] - thing[axis] for axis in range(3)], rays, thing[3])
+    return middle - half, middle + half
 
 
 def _through_cylinder(thing: jax.Array, start: Components, rays: Components) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Where rays come within the side, between the caps, and where they leave the cylinder; NaN beside the side."""
     x, y, z = (start[axis] - thing[axis] for axis in range(3))
-    side, side_end = _chord([x, z], [rays[0], rays[2]], thing[3])
-    inverse = 1.0 / _not_zero(rays[1])
-    level, reach = -y * inverse, thing[4] * jnp.abs(inverse)
-    return side, level - reach, jnp.minimum(side_end, level + reach)
-
-
-def _chord(offset: Components, rays: Components, squared_radius: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Where lines `offset` + t `rays` enter and leave a circle or sphere about zero; NaN where they pass it."""
-    squared = sum(ray * ray for ray in rays)
-    middle = -sum(a * ray for a, ray in zip(offset, rays, strict=True)) / squared
-    # Distance of the ray from the centre at its nearest point: no cancellation of large squares.
-    nearest = [a + middle * ray for a, ray in zip(offset, rays, strict=True)]
-    half = jnp.sqrt((squared_radius - sum(each * each for each in nearest)) / squared)
-    return middle - half, middle + half
+    middle, half = chord((x, z), (rays[0], rays[2]), thing[3])
+    cap, end = slab(y, 1.0 / _not_zero(rays[1]), thing[4])
+    return middle - half, cap, jnp.minimum(middle + half, end)
 
 
 def _colours(room: Mapping[str, jax.Array], surface: jax.Array, points: Components, pixel: jax.Array) -> Components:
@@ -213,19 +199,23 @@ def _light(room: Mapping[str, jax.Array], points: Components, normal: Components
 def _hidden(room: Mapping[str, jax.Array], start: Components, way: Components) -> jax.Array:
     """Whether furniture lies between points `start` and `start` + `way`."""
 
-    def box(thing: jax.Array) -> tuple[jax.Array, jax.Array]:
-        near, leave, _ = _through_box(thing, start, way)
-        return jnp.maximum(jnp.maximum(near[0], near[1]), near[2]), leave
+    def hide_box(thing: jax.Array) -> tuple[jax.Array, jax.Array]:
+        _, enter, leave, _ = _through_box(thing, start, way)
+        return enter, leave
 
-    def sphere(thing: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def hide_sphere(thing: jax.Array) -> tuple[jax.Array, jax.Array]:
         return _through_sphere(thing, start, way)
 
-    def cylinder(thing: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def hide_cylinder(thing: jax.Array) -> tuple[jax.Array, jax.Array]:
         side, cap, leave = _through_cylinder(thing, start, way)
         return jnp.maximum(side, cap), leave
 
     hidden = jnp.zeros(start[0].shape, bool)
-    for things, through in ((room["boxes"], box), (room["spheres"], sphere), (room["cylinders"], cylinder)):
+    for things, through in (
+        (room["boxes"], hide_box),
+        (room["spheres"], hide_sphere),
+        (room["cylinders"], hide_cylinder),
+    ):
 
         def add(known: jax.Array, thing: jax.Array, through: Any = through) -> tuple[jax.Array, None]:
             enter, leave = through(thing)

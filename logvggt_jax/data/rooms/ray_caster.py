@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from logvggt_jax.data.rooms.intersections import box, chord, slab
 from logvggt_jax.data.rooms.layout import Room
 from logvggt_jax.data.rooms.textures import WAVES
 
@@ -115,14 +116,7 @@ def _cast_boxes(view: _View, room: Room) -> None:
         half, cosine, sine = half_size.astype(np.float32), np.float32(cosine), np.float32(sine)
         dx, dy, dz = (view.rays[a][where] for a in range(3))
         rays = (cosine * dx - sine * dz, dy, sine * dx + cosine * dz)
-        near, far = [], []
-        for axis in range(3):
-            inverse = view.inverse[1][where] if axis == 1 else 1.0 / rays[axis]
-            middle, reach = -origin[axis] * inverse, half[axis] * np.abs(inverse)
-            near.append(middle - reach)
-            far.append(middle + reach)
-        enter = np.maximum(np.maximum(near[0], near[1]), near[2])
-        leave = np.minimum(np.minimum(far[0], far[1]), far[2])
+        near, enter, leave = box(origin, (1.0 / rays[0], view.inverse[1][where], 1.0 / rays[2]), half)
         entered = np.where(enter == near[0], 0, np.where(enter == near[1], 1, 2))
         # A ray enters by the positive face where it runs in the negative direction.
         positive = np.where(entered == 0, rays[0] < 0, np.where(entered == 1, rays[1] < 0, rays[2] < 0))
@@ -135,14 +129,9 @@ def _cast_spheres(view: _View, room: Room) -> None:
         where = view.rectangle(centre + _CORNERS * radius)
         if where is None:
             continue
-        ox, oy, oz = (view.origin - centre).astype(np.float32)
-        dx, dy, dz = (view.rays[a][where] for a in range(3))
-        squared = dx * dx + dy * dy + dz * dz
-        middle = -(dx * ox + dy * oy + dz * oz) / squared
-        # Distance of the ray from the centre at its nearest point: no cancellation of large squares.
-        mx, my, mz = ox + middle * dx, oy + middle * dy, oz + middle * dz
-        chord = (np.float32(radius * radius) - (mx * mx + my * my + mz * mz)) / squared
-        view.keep_nearest(where, middle - np.sqrt(chord), chord > 0, first + index)
+        origin = (view.origin - centre).astype(np.float32)
+        middle, half = chord(origin, [rays[where] for rays in view.rays], np.float32(radius * radius))
+        view.keep_nearest(where, middle - half, half > 0, first + index)
 
 
 def _cast_cylinders(view: _View, room: Room) -> None:
@@ -152,19 +141,13 @@ def _cast_cylinders(view: _View, room: Room) -> None:
         where = view.rectangle(centre + _CORNERS * [radius, half_height, radius])
         if where is None:
             continue
-        ox, oy, oz = (view.origin - centre).astype(np.float32)
-        dx, dz = view.rays[0][where], view.rays[2][where]
-        squared = dx * dx + dz * dz
-        middle = -(dx * ox + dz * oz) / squared
-        mx, mz = ox + middle * dx, oz + middle * dz
-        chord = (np.float32(radius * radius) - (mx * mx + mz * mz)) / squared
-        half_chord = np.sqrt(chord)
-        inverse = view.inverse[1][where]
-        level, reach = -oy * inverse, np.float32(half_height) * np.abs(inverse)
-        side, cap = middle - half_chord, level - reach
-        enter, leave = np.maximum(side, cap), np.minimum(middle + half_chord, level + reach)
+        x, y, z = (view.origin - centre).astype(np.float32)
+        middle, half = chord((x, z), (view.rays[0][where], view.rays[2][where]), np.float32(radius * radius))
+        cap, end = slab(y, view.inverse[1][where], np.float32(half_height))
+        side = middle - half
+        enter, leave = np.maximum(side, cap), np.minimum(middle + half, end)
         surface = first + 2 * index + (cap > side)
-        view.keep_nearest(where, enter, (chord > 0) & (enter <= leave), surface)
+        view.keep_nearest(where, enter, (half > 0) & (enter <= leave), surface)
 
 
 def _colours(view: _View, room: Room) -> np.ndarray:
@@ -226,32 +209,21 @@ def _hidden(room: Room, start: list[np.ndarray], way: list[np.ndarray]) -> np.nd
             x, y, z = (start[axis] - np.float32(centre[axis]) for axis in range(3))
             origin = (cosine * x - sine * z, y, sine * x + cosine * z)
             rays = (cosine * way[0] - sine * way[2], way[1], sine * way[0] + cosine * way[2])
-            near, far = [], []
-            for axis in range(3):
-                inverse = 1.0 / np.where(rays[axis] == 0, np.float32(1e-12), rays[axis])
-                middle, reach = -origin[axis] * inverse, np.float32(half_size[axis]) * np.abs(inverse)
-                near.append(middle - reach)
-                far.append(middle + reach)
-            add(np.maximum(np.maximum(near[0], near[1]), near[2]), np.minimum(np.minimum(far[0], far[1]), far[2]))
+            _, enter, leave = box(origin, [_inverse(each) for each in rays], half_size.astype(np.float32))
+            add(enter, leave)
         for centre, radius in zip(room.sphere_centres, room.sphere_radii, strict=True):
             offset = [start[axis] - np.float32(centre[axis]) for axis in range(3)]
-            add(*_chord(offset, way, (0, 1, 2), radius))
+            middle, half = chord(offset, way, np.float32(radius * radius))
+            add(middle - half, middle + half)
         cylinders = zip(room.cylinder_centres, room.cylinder_radii, room.cylinder_half_heights, strict=True)
         for centre, radius, half_height in cylinders:
-            offset = [start[axis] - np.float32(centre[axis]) for axis in range(3)]
-            enter, leave = _chord(offset, way, (0, 2), radius)
-            inverse = 1.0 / np.where(way[1] == 0, np.float32(1e-12), way[1])
-            level, reach = -offset[1] * inverse, np.float32(half_height) * np.abs(inverse)
-            add(np.maximum(enter, level - reach), np.minimum(leave, level + reach))
+            x, y, z = (start[axis] - np.float32(centre[axis]) for axis in range(3))
+            middle, half = chord((x, z), (way[0], way[2]), np.float32(radius * radius))
+            cap, end = slab(y, _inverse(way[1]), np.float32(half_height))
+            add(np.maximum(middle - half, cap), np.minimum(middle + half, end))
     return hidden
 
 
-def _chord(
-    offset: list[np.ndarray], way: list[np.ndarray], axes: tuple[int, ...], radius: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Where lines `offset` + t `way` enter and leave the circle or sphere of `radius` in `axes`; NaN if they do not."""
-    squared = sum(way[axis] * way[axis] for axis in axes)
-    middle = -sum(offset[axis] * way[axis] for axis in axes) / squared
-    nearest = [offset[axis] + middle * way[axis] for axis in axes]
-    half = np.sqrt((np.float32(radius * radius) - sum(each * each for each in nearest)) / squared)
-    return middle - half, middle + half
+def _inverse(way: np.ndarray) -> np.ndarray:
+    """1 / way; a way of zero, which would make 0 * inf, is next to nothing."""
+    return 1.0 / np.where(way == 0, np.float32(1e-12), way)

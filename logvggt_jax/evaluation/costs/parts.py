@@ -35,7 +35,7 @@ class Part:
 
 @dataclasses.dataclass(frozen=True)
 class PartTime:
-    """Seconds of a part: to compile it, and of one call (median and extremes of the rounds).
+    """Seconds of a part: to compile it, and of one call (median of the rounds).
 
     `temporary_bytes` is None where the compiler does not say.
     """
@@ -44,8 +44,6 @@ class PartTime:
     calls: int
     compilation: float
     median: float
-    fastest: float
-    slowest: float
     temporary_bytes: int | None
 
 
@@ -151,8 +149,6 @@ def time_part(part: Part, variables: Any, *, rounds: int = 3, least_seconds: flo
         calls=part.calls,
         compilation=compilation,
         median=statistics.median(seconds),
-        fastest=min(seconds),
-        slowest=max(seconds),
         temporary_bytes=None if memory is None else int(memory.temp_size_in_bytes),
     )
 

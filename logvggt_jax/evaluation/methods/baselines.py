@@ -10,7 +10,10 @@ from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.data.feeding.transforms import fit
 from logvggt_jax.errors import InputError
 from logvggt_jax.evaluation.methods.method import Checkpoint, ClipPrediction, Method, model_row
+from logvggt_jax.frames import evenly_spaced
 from logvggt_jax.model.logvggt import LogVGGT
+
+_SEQUENCES = 64  # of a data set whose depth is looked at, at most
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,20 +27,20 @@ class DepthStatistics:
 
 
 def depth_statistics(
-    dataset: Dataset, image_size: tuple[int, int], *, source: str, max_sequences: int = 64, max_frames: int = 256
+    dataset: Dataset, image_size: tuple[int, int], *, source: str, max_frames: int = 256
 ) -> DepthStatistics:
     """Mean depth, mean depth map and mean intrinsics of evenly spaced frames, fitted to `image_size` (H, W).
 
-    They are of `max_sequences` sequences and `max_frames` frames at most, the same number from each; `source` is their
+    They are of some sequences and `max_frames` frames at most, the same number from each; `source` is their
     name in the table. Raises InputError where no frame has a valid depth.
     """
     depth_sum, valid_count = np.zeros(image_size), np.zeros(image_size)
     intrinsics: list[np.ndarray] = []
     sequences = list(dataset.sequences)
-    chosen = _evenly(len(sequences), max_sequences)
+    chosen = evenly_spaced(len(sequences), _SEQUENCES)
     for s in chosen:
         # One frame at a time: hundreds at a data set's own size are gigabytes.
-        for index in _evenly(dataset.num_frames(sequences[s]), max(1, max_frames // len(chosen))):
+        for index in evenly_spaced(dataset.num_frames(sequences[s]), max(1, max_frames // len(chosen))):
             frames = fit(dataset.read(sequences[s], [index]), image_size)
             valid = frames.depth[0] > 0
             depth_sum += np.where(valid, frames.depth[0], 0.0)
@@ -115,10 +118,3 @@ def _fixed_depth(name: str, knows: str, depth: np.ndarray, statistics: DepthStat
 def _identities(count: int) -> np.ndarray:
     """[count, 4, 4]."""
     return np.tile(np.eye(4), (count, 1, 1))
-
-
-def _evenly(count: int, at_most: int) -> list[int]:
-    """At most so many evenly spaced numbers below `count`, the first and the last among them."""
-    if count <= at_most:
-        return list(range(count))
-    return [int(i) for i in np.linspace(0, count - 1, at_most).round()]

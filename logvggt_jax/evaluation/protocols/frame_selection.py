@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from logvggt_jax.errors import InputError
+from logvggt_jax.frames import evenly_spaced
 
 Indices = tuple[int, ...]
 
@@ -42,8 +43,8 @@ class Clips:
         span = (self.wanted - 1) * self.stride + 1
         if num_frames < span:
             raise InputError(f"has {num_frames} frames, {self.wanted} at stride {self.stride} need {span}")
-        starts = np.unique(np.linspace(0, num_frames - span, self.clips_per_sequence).round().astype(int))
-        return [tuple(range(int(start), int(start) + span, self.stride)) for start in starts]
+        starts = evenly_spaced(num_frames - span + 1, self.clips_per_sequence)
+        return [tuple(range(start, start + span, self.stride)) for start in starts]
 
     def describe(self) -> str:
         return f"{self.wanted} frames, stride {self.stride}, {self.clips_per_sequence} clip(s) a sequence"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-from logvggt_jax.evaluation.costs.by_length import median_rate
+from logvggt_jax.evaluation.costs.streams import median_rate
 from logvggt_jax.evaluation.report.tables import MARK, Table
 
 LENGTH_FIGURE = "figures/by_length.png"

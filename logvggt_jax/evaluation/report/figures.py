@@ -9,6 +9,7 @@ import numpy as np
 from logvggt_jax.colours import DEPTHS_IN_MATPLOTLIB
 from logvggt_jax.errors import MissingPackage, install_line
 from logvggt_jax.files import atomic_file
+from logvggt_jax.frames import evenly_spaced
 from logvggt_jax.geometry import camera_centres, invert
 from logvggt_jax.metrics import NotMeasurable
 from logvggt_jax.metrics.depth import align_depth, resize_depth
@@ -61,7 +62,7 @@ def depth_panel(
     resized to the target where its size is another. `max_frames` evenly spaced frames are drawn; the medians are
     theirs.
     """
-    chosen = np.unique(np.linspace(0, len(images) - 1, max_frames).round().astype(int))
+    chosen = evenly_spaced(len(images), max_frames)
     images, target, prediction = images[chosen], target[chosen], prediction[chosen]
     if prediction.shape != target.shape:
         prediction = resize_depth(prediction, (target.shape[1], target.shape[2]))

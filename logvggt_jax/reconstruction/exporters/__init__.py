@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Protocol
 
+from logvggt_jax.data.formats.nerfstudio_transforms import TRANSFORMS_FILE
 from logvggt_jax.errors import InputError, OutputExists, disk_errors
 from logvggt_jax.files import atomic_folder, check_output, check_writable
 from logvggt_jax.reconstruction.exporters.colmap import export_colmap, export_colmap_text
@@ -22,7 +23,7 @@ from logvggt_jax.reconstruction.exporters.euroc import export_euroc
 from logvggt_jax.reconstruction.exporters.glb import export_glb
 from logvggt_jax.reconstruction.exporters.kitti import export_kitti
 from logvggt_jax.reconstruction.exporters.libraries import check_library
-from logvggt_jax.reconstruction.exporters.nerfstudio import TRANSFORMS_FILE, export_nerfstudio
+from logvggt_jax.reconstruction.exporters.nerfstudio import export_nerfstudio
 from logvggt_jax.reconstruction.exporters.original_depth import DEPTH_INDEX
 from logvggt_jax.reconstruction.exporters.ply import export_ply
 from logvggt_jax.reconstruction.exporters.rosbag import export_rosbag

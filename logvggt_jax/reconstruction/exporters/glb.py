@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from logvggt_jax.data.formats.calibration import OPENGL_AXES
 from logvggt_jax.files import atomic_file
+from logvggt_jax.frames import evenly_spaced
 from logvggt_jax.geometry import invert, matrix_to_quaternion
 from logvggt_jax.reconstruction.exporters.cloud import frame_cloud, select_points
 from logvggt_jax.reconstruction.exporters.libraries import library
-from logvggt_jax.reconstruction.exporters.nerfstudio import OPENGL_FROM_OPENCV
 from logvggt_jax.reconstruction.frame_pool import FramePool
 from logvggt_jax.reconstruction.point_cloud import PointFilter
 from logvggt_jax.reconstruction.result import Reconstruction
@@ -54,15 +55,15 @@ def export_glb(
         selection = select_points(result, chosen, pool, progress=progress)
         clouds = pool.map(lambda index: frame_cloud(result, selection, index), iter(range(result.num_frames)))
         vertices = np.concatenate(list(clouds))
-    turn = OPENGL_FROM_OPENCV.diagonal()[:3]
+    turn = OPENGL_AXES.diagonal()[:3]
     points = np.stack([vertices[axis] for axis in "xyz"], axis=-1) * turn
     colours = _LINEAR[np.stack([vertices[channel] for channel in ("red", "green", "blue")], axis=-1)]
-    poses = OPENGL_FROM_OPENCV @ np.asarray(invert(result.extrinsics)) @ OPENGL_FROM_OPENCV
+    poses = OPENGL_AXES @ np.asarray(invert(result.extrinsics)) @ OPENGL_AXES
     scene = trimesh.Scene()
     if len(points):
         scene.add_geometry(trimesh.PointCloud(points, colours), node_name="points", geom_name="points")
     span = float(np.ptp(np.concatenate([points, poses[:, :3, 3]]), axis=0).max()) or 1.0
-    shown = np.unique(np.linspace(0, result.num_frames - 1, _MOST_FRUSTA).round().astype(int))
+    shown = evenly_spaced(result.num_frames, _MOST_FRUSTA)
     lines = np.concatenate([_frustum(result, index, poses[index], span * _FRUSTUM_SIZE) for index in shown])
     scene.add_geometry(trimesh.load_path(lines), node_name="cameras", geom_name="cameras")
 
@@ -80,7 +81,7 @@ def _frustum(result: Reconstruction, index: int, pose: np.ndarray, depth: float)
     matrix = result.intrinsics[index]
     corners = [(u, v) for u, v in ((0, 0), (width, 0), (width, height), (0, height))]
     rays = [((u - 0.5 - matrix[0, 2]) / matrix[0, 0], (v - 0.5 - matrix[1, 2]) / matrix[1, 1], 1.0) for u, v in corners]
-    ends = pose[:3, 3] + depth * (np.array(rays) * OPENGL_FROM_OPENCV.diagonal()[:3]) @ pose[:3, :3].T
+    ends = pose[:3, 3] + depth * (np.array(rays) * OPENGL_AXES.diagonal()[:3]) @ pose[:3, :3].T
     apex = np.broadcast_to(pose[:3, 3], ends.shape)
     return np.concatenate([np.stack([apex, ends], 1), np.stack([ends, np.roll(ends, -1, 0)], 1)])
 

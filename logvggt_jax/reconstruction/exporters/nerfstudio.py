@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from logvggt_jax.data.formats.calibration import OPENGL_AXES
+from logvggt_jax.data.formats.nerfstudio_transforms import TRANSFORMS_FILE
 from logvggt_jax.files import write_text
 from logvggt_jax.geometry import invert
 from logvggt_jax.reconstruction.exporters.frame_names import file_stems
@@ -16,10 +18,7 @@ from logvggt_jax.reconstruction.exporters.tracks import NUM_POINTS
 from logvggt_jax.reconstruction.point_cloud import PointFilter
 from logvggt_jax.reconstruction.result import Reconstruction
 
-TRANSFORMS_FILE = "transforms.json"
 _POINTS = "points.ply"
-OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Turns x right, y down, z forward into x right, y up, z backward, and back."""
 
 
 def export_nerfstudio(
@@ -33,7 +32,7 @@ def export_nerfstudio(
     pictures = Pictures.of(result)
     height, width = pictures.size
     files = pictures.write(path / "images", file_stems(result.names), progress=progress)
-    poses = np.asarray(invert(result.extrinsics)) @ OPENGL_FROM_OPENCV
+    poses = np.asarray(invert(result.extrinsics)) @ OPENGL_AXES
     frames = [
         {
             "file_path": f"images/{file}",

@@ -9,8 +9,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.linalg import spsolve
 
-from logvggt_jax.geometry import project, transform_points
-from logvggt_jax.geometry.cameras import invert
+from logvggt_jax.geometry import points_at, project
 from logvggt_jax.reconstruction.frame_pool import FramePool
 from logvggt_jax.reconstruction.result import Reconstruction
 
@@ -102,10 +101,8 @@ def _ratios(
     points = []
     for index, sample in enumerate(samples):
         depth = scales[index] * sample.depth.reshape(-1).astype(np.float64)
-        matrix = intrinsics[index]
-        rays = (sample.pixels - matrix[:2, 2]) / matrix[(0, 1), (0, 1)]
-        camera = np.concatenate([rays, np.ones((len(rays), 1))], axis=1) * depth[:, None]
-        points.append(transform_points(np.asarray(invert(extrinsics[index])), camera[np.isfinite(depth) & (depth > 0)]))
+        valid = np.isfinite(depth) & (depth > 0)
+        points.append(points_at(sample.pixels[valid], depth[valid], intrinsics[index], extrinsics[index]))
     for i, j in pairs:
         pixels, depth = project(points[i], intrinsics[j], extrinsics[j])
         other = samples[j]

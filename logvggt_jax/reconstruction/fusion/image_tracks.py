@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from logvggt_jax.geometry import project, transform_points
-from logvggt_jax.geometry.cameras import invert
+from logvggt_jax.geometry import points_at, project
 from logvggt_jax.reconstruction.exporters.cloud import tracked
 from logvggt_jax.reconstruction.exporters.tracks import Tracks
 from logvggt_jax.reconstruction.frame_pool import FramePool
@@ -80,18 +79,8 @@ def follow_corners(
     """Points and where the images show them; each is seen by at least three frames.
 
     A corner's depth and the cameras say where another frame should show it; there Lucas and Kanade's method finds it to
-    a fraction of a pixel. It counts if the way back leads to where it began.
-
-    Args:
-      result: of images and depth.
-      frames: [n] numbers of the frames.
-      extrinsics: [n, 3|4, 4] world-to-camera.
-      intrinsics: [n, 3, 3] in pixels of the depth maps.
-      scales: [n] of the depth.
-      progress: show a progress bar.
-
-    Returns:
-      Tracks whose frames are places in `frames`, and whose points are black.
+    a fraction of a pixel. It counts if the way back leads to where it began. Arguments are those of `bundle_adjust`;
+    the tracks' frames are places in `frames`, their points are black.
     """
     views = _Frames(result, frames, extrinsics, intrinsics, scales)
     count = len(frames)
@@ -143,9 +132,7 @@ def _corners(views: _Frames, place: int) -> _Corners:
     least, most = (change(surface, around)[v, u] for change in (cv2.erode, cv2.dilate))
     valid = np.isfinite(depth) & (least > 0) & (most < _SURFACE * least)
     pixels, depth = pixels[valid], depth[valid]
-    matrix = views.intrinsics[place]
-    rays = np.concatenate([(pixels - matrix[:2, 2]) / matrix[(0, 1), (0, 1)], np.ones((len(pixels), 1))], axis=1)
-    return _Corners(pixels, transform_points(np.asarray(invert(views.extrinsics[place])), rays * depth[:, None]))
+    return _Corners(pixels, points_at(pixels, depth, views.intrinsics[place], views.extrinsics[place]))
 
 
 def _find(views: _Frames, start: int, corners: _Corners, place: int) -> tuple[np.ndarray, np.ndarray]:

@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from logvggt_jax.data.formats.calibration import check_intrinsics, world_to_camera
+from logvggt_jax.data.formats.calibration import OPENGL_AXES, check_intrinsics, world_to_camera
 from logvggt_jax.data.formats.colmap_model import read_cameras, read_images
+from logvggt_jax.data.formats.nerfstudio_transforms import CAMERA, TRANSFORMS_FILE, camera_of, is_pinhole
 from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.errors import InputError, MissingInput, disk_errors
 from logvggt_jax.files import open_regular
-from logvggt_jax.reconstruction.exporters.nerfstudio import OPENGL_FROM_OPENCV, TRANSFORMS_FILE
 from logvggt_jax.reconstruction.exporters.tum import read_trajectory
 
 # The squares of larger numbers are infinite in float32.
@@ -110,13 +110,10 @@ def _nerfstudio_frame(document: dict[str, Any], frame: dict[str, Any], path: Pat
     pose = np.array(frame["transform_matrix"], np.float64)
     if pose.shape not in ((3, 4), (4, 4)) or not (np.abs(pose) < _LARGEST).all():
         raise InputError(f"{path}: transform_matrix of {name!r} must be [4, 4] finite numbers, got shape {pose.shape}")
-    extrinsics = world_to_camera(pose @ OPENGL_FROM_OPENCV, f"{path}, {name!r}", stored="camera_to_world")
+    extrinsics = world_to_camera(pose @ OPENGL_AXES, f"{path}, {name!r}", stored="camera_to_world")
     assert extrinsics is not None  # it is finite
     values = {**document, **frame}
-    distorted = any(values.get(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
-    distorted |= values.get("camera_model", "PINHOLE") not in ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")
-    if distorted or not all(key in values for key in ("fl_x", "fl_y", "cx", "cy", "w", "h")):
+    if not is_pinhole(values) or any(key not in values for key in CAMERA):
         return ExternalPose(name, None, extrinsics)
-    fx, fy, cx, cy = (float(values[key]) for key in ("fl_x", "fl_y", "cx", "cy"))
-    intrinsics = np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]])
-    return ExternalPose(name, None, extrinsics, intrinsics, (int(values["h"]), int(values["w"])))
+    intrinsics, height, width = camera_of(values)
+    return ExternalPose(name, None, extrinsics, intrinsics, (int(height), int(width)))

@@ -158,9 +158,9 @@ def test_an_index_that_was_changed_is_refused(packed: Path, tmp_path: Path) -> N
     path.write_text(path.read_text().replace('"frames": 4', '"frames": 5', 1))
     with pytest.raises(InputError, match=r"packed\.json: differs from its digest"):
         open_dataset(NAME, output)
-    for content in ("{", "[" * 100_000):
-        path.write_text(content)
-        with pytest.raises(InputError, match=r"packed\.json: not JSON"):
+    for text in ("{", "[" * 100_000):
+        path.write_text(text)
+        with pytest.raises(InputError, match=r"packed\.json: not valid JSON"):
             open_dataset(NAME, output)
 
 

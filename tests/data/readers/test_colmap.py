@@ -111,7 +111,7 @@ def test_distorted_cameras_are_refused_by_name_with_the_mend(tmp_path: Path, cam
         ("cameras", " 48 ", " 0 ", r"cameras\.txt, line 2: expected a width and height from 1"),
         ("cameras", "3 PIN", "4 PIN", r"cameras\.txt: no camera 3, which .*images\.txt names"),
         ("images", " 3 view10.png", "", r"images\.txt, line 5: expected a picture's number"),
-        ("images", "view10.png", "/view10.png", r"images\.txt: '/view10\.png' is no picture's name"),
+        ("images", "view10.png", "/view10.png", r"images\.txt: '/view10\.png' is no file's name"),
         ("images", "view10.png", "view12.png", r"view12\.png: no such file, but .*images\.txt names it"),
     ],
 )

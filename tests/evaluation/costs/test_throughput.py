@@ -9,9 +9,10 @@ from typing import Any
 import pytest
 
 from logvggt_jax import LogVGGT, ModelConfig
-from logvggt_jax.evaluation.costs import throughput
+from logvggt_jax.evaluation.costs import streams
 from logvggt_jax.evaluation.costs.parts import PARTS
-from logvggt_jax.evaluation.costs.throughput import TimingConfig, measured_timings, random_pictures, time_stream
+from logvggt_jax.evaluation.costs.streams import TimingConfig, random_pictures, time_stream
+from logvggt_jax.evaluation.costs.throughput import measured_timings
 from logvggt_jax.evaluation.methods.method import Checkpoint, model_row
 from logvggt_jax.streaming import OfflineSettings, StreamSession
 
@@ -39,11 +40,11 @@ def test_every_row_is_timed_once_and_kept(
     assert all(part["seconds"] > 0 for part in report["parts"])
     assert json.loads((tmp_path / "timings.json").read_text()) == report
 
-    def again(*_: object) -> None:
+    def again(*_: object, **__: object) -> None:
         raise AssertionError("measured again")
 
     with monkeypatch.context() as patch:
-        patch.setattr(throughput, "time_stream", again)
+        patch.setattr(streams, "time_stream", again)
         assert measure() == report
         others = dataclasses.replace(checkpoint, digest="others")
         for changed in ({"longer_edge": 56}, {"checkpoint": others}, {"fresh": True}):

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from logvggt_jax.evaluation.costs import by_length
-from logvggt_jax.evaluation.costs.by_length import cost_of_length, measured_costs, median_rate
-from logvggt_jax.evaluation.costs.throughput import TimingConfig, random_pictures
+from logvggt_jax.evaluation.costs import streams
+from logvggt_jax.evaluation.costs.streams import TimingConfig, cost_of_length, median_rate, random_pictures
+from logvggt_jax.evaluation.costs.throughput import measured_costs
 from logvggt_jax.evaluation.methods.method import Method
 from logvggt_jax.streaming import PredictionError
 
@@ -79,7 +79,7 @@ def test_costs_are_measured_once_and_kept(tmp_path: Path, monkeypatch: pytest.Mo
     def again(*_: object) -> None:
         raise AssertionError("measured again")
 
-    monkeypatch.setattr(by_length, "cost_of_length", again)
+    monkeypatch.setattr(streams, "cost_of_length", again)
     assert measure() == report
     for changed in (
         {"fresh": True},

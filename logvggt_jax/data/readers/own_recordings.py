@@ -1,0 +1,39 @@
+"""What readers of people's own recordings share: which folders are one, and the files that a list in it names."""
+
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path, PurePosixPath
+
+from logvggt_jax.data.errors import missing_files
+from logvggt_jax.data.formats.source_files import SourceFiles
+from logvggt_jax.errors import InputError
+
+PICTURE_SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
+
+
+def find_recordings(
+    root: Path, files: SourceFiles, expects: str, is_recording: Callable[[Path], object]
+) -> Mapping[str, Path]:
+    """The root, where it is a recording itself, else the folders in it that are; named as their folders."""
+    if is_recording(root):
+        # A root such as "." has no name of its own.
+        return {root.resolve().name: root}
+    return {name: folder for name, folder in files.folders(root, expects).items() if is_recording(folder)}
+
+
+def file_below(folder: Path, name: str, named_by: Path) -> Path:
+    """The file of a name in the list `named_by`; InputError for a name that leads out of the folder."""
+    relative = PurePosixPath(name)
+    if relative.is_absolute() or ".." in relative.parts or not relative.name:
+        raise InputError(f"{named_by}: {name!r} is no file's name below {folder}: export it again")
+    return folder / relative
+
+
+def names_beside(files: SourceFiles, paths: Iterable[Path], named_by: Path) -> dict[Path, set[str]]:
+    """The names in each folder of the files that the list `named_by` names; MissingFiles for those not there."""
+    paths = list(paths)
+    names = {
+        folder: set(files.names(folder, f"the files that {named_by} names")) for folder in {p.parent for p in paths}
+    }
+    if absent := [path for path in paths if path.name not in names[path.parent]]:
+        raise missing_files(dict.fromkeys(absent, f"but {named_by} names it; copy it there"))
+    return names
