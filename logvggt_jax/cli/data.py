@@ -71,7 +71,10 @@ def _size(text: str) -> tuple[int, int]:
     return int(height), int(width)
 
 
-def _split_option(parser: argparse.ArgumentParser) -> None:
+def _copy_arguments(parser: argparse.ArgumentParser) -> None:
+    """Which copy of a data set, and which part of it."""
+    parser.add_argument("name", help="data set, as `logvggt data list` names it")
+    parser.add_argument("root", type=Path, help="folder of the copy")
     parser.add_argument(
         "--split", choices=("train", "val", "test", "all"), default="all", help="only this split's sequences"
     )
@@ -107,9 +110,7 @@ def add_to(commands: Any) -> None:
         details=" Prints sequences, frames, frames without pose, depth ranges, how well depth and poses of different "
         "frames agree, and every problem with its file and mend. Exit code 0: clean, 1: problems found, 2: bad input.",
     )
-    sub.add_argument("name", help="data set, as `logvggt data list` names it")
-    sub.add_argument("root", type=Path, help="folder of the copy")
-    _split_option(sub)
+    _copy_arguments(sub)
     sub.add_argument(
         "--max-sequences", type=int, default=None, metavar="N", help="look at N sequences, evenly spread over the set"
     )
@@ -136,10 +137,8 @@ def add_to(commands: Any) -> None:
         "same command goes on after an interruption, and writes anew what is damaged. What cannot be read is named and "
         "fails in training as it did before.",
     )
-    sub.add_argument("name", help="data set, as `logvggt data list` names it")
-    sub.add_argument("root", type=Path, help="folder of the copy")
+    _copy_arguments(sub)
     sub.add_argument("--output", type=Path, required=True, metavar="FOLDER", help="folder to write the shards to")
-    _split_option(sub)
     sub.add_argument(
         "--frames-per-shard", type=int, default=2000, metavar="N", help="a sequence is never divided between shards"
     )
