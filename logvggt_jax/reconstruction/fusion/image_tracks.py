@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
+from logvggt_jax.frames import evenly_spaced
 from logvggt_jax.geometry import points_at, project
 from logvggt_jax.reconstruction.exporters.cloud import tracked
 from logvggt_jax.reconstruction.exporters.tracks import Tracks
@@ -85,7 +86,7 @@ def follow_corners(
     views = _Frames(result, frames, extrinsics, intrinsics, scales)
     count = len(frames)
     starts = range(0, count, _EVERY)
-    spread = set(np.linspace(0, count - 1, min(_SPREAD, count)).round().astype(int).tolist())
+    spread = set(evenly_spaced(count, _SPREAD))
     points, places, indices, pixels = [], [], [], []
     total = 0
     with FramePool() as pool:

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from logvggt_jax.errors import InputError, MissingInput, disk_errors
+from logvggt_jax.frames import evenly_spaced
 from logvggt_jax.reconstruction.sources.headers import read_header
 from logvggt_jax.reconstruction.sources.listing import some, stem
 from logvggt_jax.reconstruction.sources.pictures import IMAGE_SUFFIXES, read_not_black, upright
@@ -171,8 +172,7 @@ class Masks:
         for frame in frames:
             file = self.file(frame.name)
             _check_size(file, self._header_size(file), frame)
-        places = np.linspace(0, len(frames) - 1, 1 if self._for_all else min(len(frames), _LOOKED_AT))
-        chosen = [frames[place] for place in np.unique(places.round().astype(int))]
+        chosen = [frames[place] for place in evenly_spaced(len(frames), 1 if self._for_all else _LOOKED_AT)]
         shares = [1 - float(self.read(frame).mean()) for frame in chosen]
         if min(shares) == 1:
             raise InputError(f"{self.path}: everything is masked; {_INVERTED}")

@@ -15,6 +15,7 @@ import numpy as np
 from logvggt_jax.colours import depth_picture
 from logvggt_jax.errors import InputError, OutputExists, disk_errors, printable
 from logvggt_jax.files import check_writable, write_text
+from logvggt_jax.frames import evenly_spaced
 from logvggt_jax.geometry import camera_centres
 from logvggt_jax.reconstruction.depth_files import encode_picture
 from logvggt_jax.reconstruction.point_cloud import Cloud
@@ -65,7 +66,7 @@ def save_page(
             raise OutputExists(f"{path} exists: choose another name or pass --overwrite to replace it")
     check_writable(path.absolute())
     cloud = result.cloud()
-    steps = np.unique(np.linspace(0, result.num_frames - 1, _MOST_STEPS).round().astype(int))
+    steps = np.array(evenly_spaced(result.num_frames, _MOST_STEPS))
     scene = _scene(result, cloud, steps) | {"pictures": _pictures(result, steps, min(_PICTURE_BYTES, most_bytes // 3))}
     template = resources.files("logvggt_jax.reconstruction.viewer").joinpath("page.html").read_text("utf-8")
     template = template.replace("{{title}}", html.escape(printable(result.folder.resolve().name)))

@@ -12,6 +12,7 @@ import numpy as np
 
 from logvggt_jax.colours import depth_picture
 from logvggt_jax.errors import one_line, printable
+from logvggt_jax.frames import evenly_spaced
 from logvggt_jax.geometry import camera_centres
 from logvggt_jax.reconstruction.result import Reconstruction
 from logvggt_jax.reconstruction.viewer.drawing import (
@@ -147,9 +148,9 @@ class RunWindow:
             draw_points(server, scene.points, scene.colours, size)
             if len(centres) > 1:
                 draw_path(server, centres)
-            cameras = np.unique(np.linspace(0, len(centres) - 1, _CAMERAS).round().astype(int))
+            cameras = evenly_spaced(len(centres), _CAMERAS)
             frustum = camera_size(centres[cameras], span)
-            for place, index in enumerate(cameras.tolist()):
+            for place, index in enumerate(cameras):
                 camera = scene.extrinsics[index], scene.intrinsics[index]
                 draw_camera(server, f"/cameras/{place:02d}", *camera, scene.image_size, size=frustum)
             newest = scene.extrinsics[-1], scene.intrinsics[-1]

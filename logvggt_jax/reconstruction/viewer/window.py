@@ -11,6 +11,7 @@ import numpy as np
 from PIL import Image
 
 from logvggt_jax.colours import depth_picture
+from logvggt_jax.frames import evenly_spaced
 from logvggt_jax.geometry import camera_centres
 from logvggt_jax.reconstruction.previews import depth_range
 from logvggt_jax.reconstruction.result import IMAGE_FOLDER, Reconstruction
@@ -140,9 +141,9 @@ class Window:
 
     def _draw_cameras(self) -> None:
         self._frusta = []
-        drawn = np.unique(np.linspace(0, self._result.num_frames - 1, MOST_FRUSTA).round().astype(int))
+        drawn = evenly_spaced(self._result.num_frames, MOST_FRUSTA)
         self._frustum_size = camera_size(self._centres[drawn], self._span)
-        for index in drawn.tolist():
+        for index in drawn:
             frustum = self._frustum(f"/cameras/{index:06d}", index, size=self._frustum_size)
             frustum.on_click(lambda event, index=index: self._look_through(event.client, index))
             self._frusta.append(frustum)
