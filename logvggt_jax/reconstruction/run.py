@@ -7,8 +7,10 @@ import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import jax
 import numpy as np
 
+from logvggt_jax.compile import out_of_device_memory
 from logvggt_jax.data.feeding.transforms import ResizeTransform, resize
 from logvggt_jax.errors import InputError, one_line
 from logvggt_jax.interruption import Interrupted, StopRequest
@@ -162,13 +164,16 @@ class Run:
         self._files += self._frames.write(results)
 
     def _show_poses(self, watcher: Watcher) -> None:
-        """Shows poses that are not final, seldom enough to cost a share of the time alone; an error ends that alone."""
+        """Shows poses that are not final, seldom enough to cost a share of the time alone; too little memory ends
+        that alone."""
         began = time.monotonic()
         if self._next_look is None or began < self._next_look:
             return
         try:
             watcher.place(self._predictor.cameras(provisional=True).pose_encoding)
-        except Exception as error:  # of the device's memory above all
+        except (MemoryError, jax.errors.JaxRuntimeError) as error:
+            if not (isinstance(error, MemoryError) or out_of_device_memory(error)):
+                raise
             warnings.warn(f"poses are shown at the end alone, the run goes on: {one_line(error)}", stacklevel=2)
             self._next_look = None
             return
