@@ -51,7 +51,7 @@ def write_page(folder: Path) -> Path:
         page.paragraph(
             "LoG-VGGT saw the frames of a walk through a room, nothing else, and gave a depth map and a camera pose "
             "for each of them. It had never seen this room, which a program has drawn, so that the truth is known. "
-            "The model is the one that ships with the package as `rooms`; `logvggt info rooms` says how it was trained."
+            "The model is the one that ships with the package under the name rooms."
         ),
         *_room_pictures(room, result, folder / "figures"),
         *_evaluation(folder / "evaluation"),
@@ -59,6 +59,8 @@ def write_page(folder: Path) -> Path:
         page.heading("Walk through it"),
         page.paragraph("The same point cloud and cameras in a viewer, in the browser, until Ctrl-C:"),
         page.command(f".venv/bin/logvggt view {result.folder}"),
+        page.paragraph("How the model was trained:"),
+        page.command(".venv/bin/logvggt info rooms"),
     ]
     path = folder / "index.html"
     write_text(path, page.document("LoG-VGGT: a room from a walk through it", parts))

@@ -220,7 +220,7 @@ def _timings(paper: Mapping[str, Any], measured: Mapping[str, Any] | None) -> It
     speeds = [[f"{name} (paper)", *(f"{values[length]:.1f}" for length in lengths)] for name, values in fps.items()]
     notes: tuple[str, ...] = ("The paper does not name the hardware behind its times.",)
     if measured is None:
-        notes += ("This run timed nothing: its configuration has no `timings`.",)
+        notes += ("This run timed nothing: its configuration has no field timings.",)
     else:
         notes += (_timing_setting(measured),)
         total = sum(part["seconds"] for part in measured["parts"])
