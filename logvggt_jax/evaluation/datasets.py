@@ -9,10 +9,10 @@ from logvggt_jax.data.registry import READERS, check_options, open_dataset
 from logvggt_jax.errors import InputError
 from logvggt_jax.evaluation.methods.baselines import all_baselines, static_camera, unit_depth
 from logvggt_jax.evaluation.methods.method import Method
+from logvggt_jax.evaluation.plan import Benchmark
 from logvggt_jax.evaluation.protocols import Protocol, ProtocolSettings, chosen_protocols
 from logvggt_jax.evaluation.protocols.clips import clip_protocols
 from logvggt_jax.evaluation.protocols.images import PrincipalPointCrop
-from logvggt_jax.evaluation.runner import Benchmark
 from logvggt_jax.evaluation.settings import ClipRun, PaperRun
 from logvggt_jax.model.logvggt import LogVGGT
 

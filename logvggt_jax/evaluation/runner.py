@@ -1,7 +1,6 @@
 """Runs methods over the clips of benchmarks, one clip at a time, and writes results as they come."""
 
 import contextlib
-import dataclasses
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -12,45 +11,26 @@ import numpy as np
 from rich.console import Console
 
 from logvggt_jax.compile import out_of_device_memory
-from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.errors import InputError, disk_errors, printable
 from logvggt_jax.evaluation.clips import load_clip
-from logvggt_jax.evaluation.environment import code_version, environment
+from logvggt_jax.evaluation.environment import environment
 from logvggt_jax.evaluation.methods.method import ClipPrediction, Method
+from logvggt_jax.evaluation.plan import Benchmark, Clip, plan_clips
 from logvggt_jax.evaluation.progress import progress_display
 from logvggt_jax.evaluation.protocols.protocol import Protocol
-from logvggt_jax.evaluation.records import FIGURES_FOLDER, PREDICTION, RECORDS_FILE, ClipRecords, plain, record_key
+from logvggt_jax.evaluation.records import FIGURES_FOLDER, PREDICTION, RECORDS_FILE, ClipRecords, plain
 from logvggt_jax.evaluation.scores import (
     ClipScore,
     ClipTruth,
     aligned_points,
-    benchmark_score,
     clip_score,
     is_measured,
     prepare_truth,
 )
+from logvggt_jax.evaluation.summary import summarize
 from logvggt_jax.files import write_text
 from logvggt_jax.metrics import NotMeasurable
 from logvggt_jax.streaming import PredictionError
-
-
-@dataclasses.dataclass(frozen=True)
-class Benchmark:
-    """A protocol and the data it finds."""
-
-    protocol: Protocol  # frames, images, metrics
-    dataset: Dataset | None  # None where the data set is missing
-    split: str  # the one that is evaluated
-    missing: str = ""  # why `dataset` is None
-
-
-@dataclasses.dataclass(frozen=True)
-class Clip:
-    """Frames `indices` of `sequence` of a benchmark."""
-
-    benchmark: Benchmark
-    sequence: str
-    indices: tuple[int, ...]
 
 
 def evaluate(
@@ -109,7 +89,7 @@ def evaluate(
         raise ValueError(f"methods must have unique names, got {', '.join(names)}")
     plan, skipped = plan_clips(benchmarks, max_sequences)
     keys = {
-        (clip, method.name): _key(clip, method)
+        (clip, method.name): clip.key(method)
         for clip in plan
         for method in methods
         if is_measured(method, clip.benchmark.protocol)
@@ -132,7 +112,7 @@ def evaluate(
             if pending:
                 reason = _run_clip(clip, pending, methods[0], records, keys, output / FIGURES_FOLDER if draws else None)
                 if reason:
-                    skipped.append({**_where(clip), "reason": reason})
+                    skipped.append({**clip.address, "reason": reason})
             progress.advance(task)
     if not len(records):
         reasons = "; ".join(f"{entry['sequence']}: {entry['reason']}" for entry in skipped[:3])
@@ -147,7 +127,7 @@ def evaluate(
             "config": dict(configuration),
             "checkpoint": checkpoint,
             "methods": [{"name": m.name, "knows": m.knows, "static": m.static} for m in methods],
-            **_collected(benchmarks, methods, plan, skipped, records, keys),
+            **summarize(benchmarks, methods, plan, skipped, records, keys),
             "skipped": skipped,
             "environments": records.environments,
             **({} if timings is None else {"timings": timings()}),
@@ -168,32 +148,6 @@ def _replace_results(results: Mapping[str, Any], records: ClipRecords, output: P
         if str(path.relative_to(output)) not in results["figures"]:
             with disk_errors(path):
                 path.unlink(missing_ok=True)
-
-
-def plan_clips(
-    benchmarks: Sequence[Benchmark], max_sequences: int | None = None
-) -> tuple[list[Clip], list[dict[str, Any]]]:
-    """Clips in order of benchmark, then sequence; and the sequences that give none, with the reason."""
-    clips: list[Clip] = []
-    skipped: list[dict[str, Any]] = []
-    for benchmark in benchmarks:
-        for sequence in _sequences(benchmark)[:max_sequences]:
-            assert benchmark.dataset is not None  # it has sequences
-            try:
-                count = benchmark.dataset.num_frames(sequence)
-                chosen = benchmark.protocol.frames(sequence, count)
-            except (InputError, OSError) as error:
-                skipped.append({**_where(Clip(benchmark, sequence, ())), "reason": str(error)})
-                continue
-            clips += [Clip(benchmark, sequence, indices) for indices in chosen]
-    return clips, skipped
-
-
-def _sequences(benchmark: Benchmark) -> list[str]:
-    """Names of the sequences that belong to the benchmark."""
-    if benchmark.dataset is None:
-        return []
-    return [name for name in benchmark.dataset.sequences if benchmark.protocol.takes(name)]
 
 
 def _run_clip(
@@ -221,7 +175,7 @@ def _run_clip(
             records.claim()
             pictures = _draw(figures, clip, keys[clip, method.name], method, prediction, truth)
         record = {
-            **_where(clip),
+            **clip.address,
             "method": method.name,
             "frames_used": len(clip.indices),
             "indices": clip.indices,
@@ -257,89 +211,10 @@ def _predicted(method: Method, truth: ClipTruth, protocol: Protocol) -> tuple[Cl
     return prediction, clip_score(method, prediction, truth, protocol)
 
 
-def _collected(
-    benchmarks: Sequence[Benchmark],
-    methods: Sequence[Method],
-    plan: Sequence[Clip],
-    skipped: Sequence[Mapping[str, Any]],
-    records: ClipRecords,
-    keys: Mapping[tuple[Clip, str], str],
-) -> dict[str, Any]:
-    """`benchmarks`, `summary`, `failures` and `figures` of results.json, from the records of this run's clips."""
-    summary: list[dict[str, Any]] = []
-    failures: list[dict[str, Any]] = []
-    described: list[dict[str, Any]] = []
-    figures: list[str] = []
-    for benchmark in benchmarks:
-        protocol = benchmark.protocol
-        clips = [clip for clip in plan if clip.benchmark is benchmark]
-        left_out = {entry["sequence"] for entry in skipped if entry["benchmark"] == protocol.name}
-        planned = len(clips) + len(left_out - {clip.sequence for clip in clips})
-        lengths = sorted({len(clip.indices) for clip in clips})
-        described.append(
-            {
-                "name": protocol.name,
-                "title": protocol.title,
-                "dataset": protocol.dataset,
-                "split": benchmark.split,
-                "missing": benchmark.missing,
-                "sequences": len(_sequences(benchmark)),
-                "expected": protocol.expected,
-                "planned": planned,
-                "frames": protocol.frames.describe(),
-                "images": protocol.images.describe(),
-                "wanted": protocol.frames.wanted,
-                "frames_used": [lengths[0], lengths[-1]] if lengths else None,
-                "decisions": list(protocol.decisions),
-                "settings": protocol.describe(),
-            }
-        )
-        for method in methods:
-            asked = [keys[clip, method.name] for clip in clips if (clip, method.name) in keys]
-            done = [records[key] for key in asked if key in records]
-            scores = [(each["sequence"], ClipScore(each["metrics"], each["failures"])) for each in done]
-            if done:
-                score = benchmark_score(protocol, method, scores, planned)
-                spread = {"spread": _spread(benchmark, method, scores)} if protocol.sets > 1 else {}
-                asked_of = {"benchmark": protocol.name, "frames": protocol.frames.wanted, "method": method.name}
-                summary.append({**asked_of, **score, **spread})
-            for record in done:
-                where = {key: record[key] for key in ("benchmark", "sequence", "frames", "method")}
-                failures += [{**where, "metric": group, "reason": why} for group, why in record["failures"].items()]
-                figures += record["figures"] or []
-    return {"benchmarks": described, "summary": summary, "failures": failures, "figures": figures}
-
-
-def _spread(benchmark: Benchmark, method: Method, scores: Sequence[tuple[str, ClipScore]]) -> dict[str, float]:
-    """Standard deviation over the protocol's sets of sequences, of each mean that two sets or more have."""
-    number = {name: position % benchmark.protocol.sets for position, name in enumerate(_sequences(benchmark))}
-    sets = [[each for each in scores if number[each[0]] == chosen] for chosen in range(benchmark.protocol.sets)]
-    means = [benchmark_score(benchmark.protocol, method, part, len(part)) for part in sets if part]
-    keys = dict.fromkeys(key for mean in means for key in mean)
-    values = {key: [mean[key] for mean in means if key in mean] for key in keys}
-    return {key: float(np.std(found, ddof=1)) for key, found in values.items() if len(found) > 1}
-
-
 def _all_failed(records: ClipRecords, keys: Iterable[str]) -> str:
     """The first method's reason where nothing was predicted at all, else nothing."""
     reasons = [records[key]["failures"].get(PREDICTION, "") for key in keys if key in records]
     return reasons[0] if all(reasons) else ""
-
-
-def _where(clip: Clip) -> dict[str, Any]:
-    """A clip's address in results."""
-    protocol = clip.benchmark.protocol
-    return {"benchmark": protocol.name, "sequence": clip.sequence, "frames": protocol.frames.wanted}
-
-
-def _key(clip: Clip, method: Method) -> str:
-    """Digest of what decides the clip's numbers, and of the names under which they stand in the file."""
-    protocol, dataset = clip.benchmark.protocol, clip.benchmark.dataset
-    assert dataset is not None  # the plan has only clips of data sets that are there
-    names = [protocol.name, method.name]
-    data = [protocol.dataset, dataset.identity, clip.sequence, clip.indices]
-    claims = [method.depth, method.pose, method.points, method.static]
-    return record_key(code_version(), names, data, protocol.measures(), claims, method.identity)
 
 
 def _draw(

@@ -13,8 +13,9 @@ from logvggt_jax.data.rooms.rooms import Rooms
 from logvggt_jax.evaluation.clips import ClipData
 from logvggt_jax.evaluation.methods.baselines import static_camera
 from logvggt_jax.evaluation.methods.method import ClipPrediction, Method
+from logvggt_jax.evaluation.plan import Benchmark
 from logvggt_jax.evaluation.protocols.clips import ClipSettings, clip_protocols
-from logvggt_jax.evaluation.runner import Benchmark, evaluate
+from logvggt_jax.evaluation.runner import evaluate
 from logvggt_jax.geometry import compose
 from logvggt_jax.types import Frames
 

@@ -14,10 +14,10 @@ from layouts import co3dv2
 from logvggt_jax.data.readers.co3dv2 import Co3Dv2
 from logvggt_jax.data.rooms.rooms import Rooms
 from logvggt_jax.errors import InputError
-from logvggt_jax.evaluation import environment, runner
+from logvggt_jax.evaluation import environment, plan, runner
 from logvggt_jax.evaluation.environment import code_version
 from logvggt_jax.evaluation.methods.baselines import static_camera
-from logvggt_jax.evaluation.runner import Benchmark
+from logvggt_jax.evaluation.plan import Benchmark
 from logvggt_jax.streaming import PredictionError
 
 
@@ -129,7 +129,7 @@ def test_rooms_measured_among_fewer_are_taken_over_by_a_run_over_more(tmp_path: 
 def test_other_code_measures_again(rooms: Rooms, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     method, calls = failing("", at_call=-1)
     run(rooms, [method], tmp_path)
-    monkeypatch.setattr(runner, "code_version", lambda: "other")
+    monkeypatch.setattr(plan, "code_version", lambda: "other")
     run(rooms, [method], tmp_path)
     assert len(calls) == 8
 

@@ -14,9 +14,9 @@ from logvggt_jax.data.rooms.rooms import Rooms
 from logvggt_jax.errors import InputError
 from logvggt_jax.evaluation.methods.baselines import static_camera
 from logvggt_jax.evaluation.methods.method import ClipPrediction
+from logvggt_jax.evaluation.plan import Clip, plan_clips
 from logvggt_jax.evaluation.protocols.clips import ClipSettings
 from logvggt_jax.evaluation.report.report import tables, write_report
-from logvggt_jax.evaluation.runner import Clip, plan_clips
 from logvggt_jax.streaming import PredictionError
 from logvggt_jax.types import Frames
 
