@@ -264,5 +264,8 @@ def test_a_real_student_comes_nearer_to_a_real_teacher(
         save_every=150,
     )
     loop.train(config, tmp_path / "run", mesh=data_mesh(1))
-    first, last = (entry for entry in read_metrics(tmp_path / "run" / "metrics.jsonl") if "validation/abs_rel" in entry)
-    assert last["validation/abs_rel"] < 0.7 * first["validation/abs_rel"]
+    entries = read_metrics(tmp_path / "run" / "metrics.jsonl")
+    # Not the relative error: the depth of random weights comes near zero.
+    for name in ("loss/depth_error", "validation/rotation"):
+        first, *_, last = (entry[name] for entry in entries if name in entry)
+        assert last < 0.5 * first, name

@@ -18,6 +18,7 @@ from jax.sharding import Mesh
 from logvggt_jax.data.feeding.clips import ClipReader
 from logvggt_jax.errors import InputError
 from logvggt_jax.interruption import StopRequest
+from logvggt_jax.model.parameters import stack_layers
 from logvggt_jax.training import loop
 from logvggt_jax.training.checkpoint_files import Position
 from logvggt_jax.training.checkpoints import RunCheckpoints
@@ -495,7 +496,7 @@ def test_real_model_trains_and_leaves_a_model_folder(run_config: TrainConfig, tm
     assert model.config == run_config.model
     provenance = read_provenance(tmp_path / "model")
     assert provenance.trained_for == "windows" and provenance.longer_edge == 42
-    jax.tree.map(np.testing.assert_array_equal, variables["params"], jax.device_get(state.params))
+    jax.tree.map(np.testing.assert_array_equal, stack_layers(variables["params"]), jax.device_get(state.params))
     losses = [entry["loss/total"] for entry in _numbers(tmp_path)]
     assert losses[-1] < losses[0]
 
