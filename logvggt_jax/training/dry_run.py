@@ -23,8 +23,8 @@ from logvggt_jax.errors import InputError, MissingPackage, one_line
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.operations import count_flops
 from logvggt_jax.training.config import StageConfig, TrainConfig
-from logvggt_jax.training.program import abstract_parameters, make_program
-from logvggt_jax.training.sharding import DATA_AXIS, check_batch_size, split
+from logvggt_jax.training.parallel.sharding import DATA_AXIS, check_batch_size, split
+from logvggt_jax.training.step.program import abstract_parameters, make_program
 
 _GIB = 2**30
 # Numbers of clips that a device takes at once, tried for the largest that fits: each is a compilation of minutes.

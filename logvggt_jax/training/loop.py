@@ -21,27 +21,27 @@ from logvggt_jax.errors import InputError, one_line
 from logvggt_jax.interruption import StopRequest
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.operations import matmul_flops_per_second
-from logvggt_jax.training.batches import stage_batches
-from logvggt_jax.training.checkpoint_files import Position
-from logvggt_jax.training.checkpoints import RunCheckpoints
-from logvggt_jax.training.compilation import compiled_steps
+from logvggt_jax.training.checkpoints.checkpoint_files import Position
+from logvggt_jax.training.checkpoints.run_checkpoints import RunCheckpoints
 from logvggt_jax.training.config import VALIDATION_METRICS, StageConfig, TrainConfig
-from logvggt_jax.training.device_batches import DeviceBatches
-from logvggt_jax.training.distillation import open_data
 from logvggt_jax.training.dry_run import step_flops
-from logvggt_jax.training.initialization import initial_parameters
-from logvggt_jax.training.metrics_log import MetricsLog, read_metrics
-from logvggt_jax.training.processes import Vote, any_process, check_agreement, check_shared
-from logvggt_jax.training.profile import ProfiledSteps, Profiler
-from logvggt_jax.training.program import abstract_parameters, make_program
-from logvggt_jax.training.progress import IntervalMeans, RunTimes, duration, goodput, progress_line
-from logvggt_jax.training.sharding import check_batch_size
-from logvggt_jax.training.skipped import clips_to_blame, described
-from logvggt_jax.training.state import TrainState
-from logvggt_jax.training.step import Metrics
-from logvggt_jax.training.validation import Validation
-from logvggt_jax.training.wandb_run import WandbRun, load_wandb
-from logvggt_jax.training.watchdog import Watchdog
+from logvggt_jax.training.feeding.device_batches import DeviceBatches
+from logvggt_jax.training.feeding.sources import stage_batches
+from logvggt_jax.training.parallel.joining import Vote, any_process, check_agreement, check_shared
+from logvggt_jax.training.parallel.sharding import check_batch_size
+from logvggt_jax.training.parallel.watchdog import Watchdog
+from logvggt_jax.training.reporting.metrics_log import MetricsLog, read_metrics
+from logvggt_jax.training.reporting.profile import ProfiledSteps, Profiler
+from logvggt_jax.training.reporting.progress import IntervalMeans, RunTimes, duration, goodput, progress_line
+from logvggt_jax.training.reporting.skipped import clips_to_blame, described
+from logvggt_jax.training.reporting.wandb_run import WandbRun, load_wandb
+from logvggt_jax.training.step.compilation import compiled_steps
+from logvggt_jax.training.step.initialization import initial_parameters
+from logvggt_jax.training.step.program import abstract_parameters, make_program
+from logvggt_jax.training.step.state import TrainState
+from logvggt_jax.training.step.train_step import Metrics
+from logvggt_jax.training.teaching.run_data import open_data
+from logvggt_jax.training.validation.validation import Validation
 
 # Steps handed to the device before the oldest has to be finished: enough to hide the host's work.
 STEPS_IN_FLIGHT = 2

@@ -21,16 +21,16 @@ from logvggt_jax.data.feeding.batches import training_batches
 from logvggt_jax.errors import InputError, one_line, printable
 from logvggt_jax.files import check_writable
 from logvggt_jax.model.logvggt import LogVGGT
-from logvggt_jax.training.batches import open_sources, stage_batches
-from logvggt_jax.training.checkpoint_files import Position
-from logvggt_jax.training.checkpoints import RunCheckpoints
+from logvggt_jax.training.checkpoints.checkpoint_files import Position
+from logvggt_jax.training.checkpoints.run_checkpoints import RunCheckpoints
 from logvggt_jax.training.config import SourceConfig, StageConfig, TeacherConfig, TrainConfig
-from logvggt_jax.training.distillation import label
 from logvggt_jax.training.dry_run import step_costs
-from logvggt_jax.training.processes import any_process, check_shared
-from logvggt_jax.training.program import abstract_parameters, make_program
-from logvggt_jax.training.sharding import DATA_AXIS, check_batch_size, split
-from logvggt_jax.training.teacher import PlainVGGT, Teacher
+from logvggt_jax.training.feeding.sources import open_sources, stage_batches
+from logvggt_jax.training.parallel.joining import any_process, check_shared
+from logvggt_jax.training.parallel.sharding import DATA_AXIS, check_batch_size, split
+from logvggt_jax.training.step.program import abstract_parameters, make_program
+from logvggt_jax.training.teaching.run_data import label
+from logvggt_jax.training.teaching.teacher import PlainVGGT, Teacher
 
 CLIPS = 20
 _EXCHANGED_BYTES = 2**26

@@ -12,8 +12,8 @@ from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.data.errors import EmptySplit
 from logvggt_jax.data.feeding.holdouts import HoldOut
 from logvggt_jax.errors import InputError
-from logvggt_jax.training.batches import open_source, open_sources, stage_batches
 from logvggt_jax.training.config import DataConfig, SourceConfig, TrainConfig
+from logvggt_jax.training.feeding.sources import open_source, open_sources, stage_batches
 
 OPTIONS = {"height": 28, "width": 42, "num_frames": 8, "num_rooms": 8}
 
@@ -44,7 +44,7 @@ def test_a_copy_without_the_sequences_of_a_held_out_split_can_be_trained_on(monk
             raise EmptySplit("the lists name no sequence here for split 'val'")
         return open_source(source)
 
-    monkeypatch.setattr("logvggt_jax.training.batches.open_source", open_partial)
+    monkeypatch.setattr("logvggt_jax.training.feeding.sources.open_source", open_partial)
     assert "rooms" in open_sources(data(hold_out=(("rooms", HoldOut(split="val")),)))
 
 

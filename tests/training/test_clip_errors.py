@@ -7,7 +7,7 @@ import pytest
 
 from logvggt_jax.geometry import quaternion_to_matrix
 from logvggt_jax.metrics import depth_metrics, relative_pose_errors
-from logvggt_jax.training import clip_errors
+from logvggt_jax.training.losses import clip_errors
 
 # As programs, which training runs: one by one each operation would compile by itself.
 depth_errors, pose_errors = jax.jit(clip_errors.depth_errors), jax.jit(clip_errors.pose_errors)

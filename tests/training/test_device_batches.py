@@ -6,8 +6,8 @@ import pytest
 
 from logvggt_jax.data.feeding.batches import BatchIterator, training_batches
 from logvggt_jax.data.rooms.rooms import Rooms
-from logvggt_jax.training.device_batches import DeviceBatches
-from logvggt_jax.training.sharding import data_mesh, split
+from logvggt_jax.training.feeding.device_batches import DeviceBatches
+from logvggt_jax.training.parallel.sharding import data_mesh, split
 
 
 class Failing(Rooms):

@@ -16,7 +16,7 @@ from logvggt_jax.operations import count_flops
 from logvggt_jax.training import dry_run as module
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.dry_run import StepCosts, abstract_clips, collectives, dry_run, step_costs, step_flops
-from logvggt_jax.training.sharding import data_mesh
+from logvggt_jax.training.parallel.sharding import data_mesh
 
 ROOT = Path(__file__).parents[2]
 SIZE = (28, 42)

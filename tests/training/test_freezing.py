@@ -10,11 +10,11 @@ import pytest
 
 from logvggt_jax.errors import InputError
 from logvggt_jax.training.config import LossConfig, OptimizerConfig
-from logvggt_jax.training.freezing import frozen_leaves, without_gradient
-from logvggt_jax.training.optimizer import make_optimizer
-from logvggt_jax.training.sharding import data_mesh, parameter_layout, put_batch
-from logvggt_jax.training.state import initial_state
-from logvggt_jax.training.step import make_loss_terms, make_train_step
+from logvggt_jax.training.parallel.sharding import data_mesh, parameter_layout, put_batch
+from logvggt_jax.training.step.freezing import frozen_leaves, without_gradient
+from logvggt_jax.training.step.optimizer import make_optimizer
+from logvggt_jax.training.step.state import initial_state
+from logvggt_jax.training.step.train_step import make_loss_terms, make_train_step
 
 PARAMS = {
     "aggregator": {"frame_blocks": {"mlp": {"kernel": jnp.ones((3, 2)), "bias": jnp.ones(3)}}, "token": jnp.ones(2)},

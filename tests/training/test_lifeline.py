@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from logvggt_jax.training.lifeline import Lifeline, accept, connect, listen
+from logvggt_jax.training.parallel.lifeline import Lifeline, accept, connect, listen
 
 Heard = dict[int, "queue.Queue[str]"]
 

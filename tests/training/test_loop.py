@@ -19,17 +19,17 @@ from logvggt_jax.data.feeding.clips import ClipReader
 from logvggt_jax.errors import InputError
 from logvggt_jax.interruption import StopRequest
 from logvggt_jax.training import loop
-from logvggt_jax.training.checkpoint_files import Position
-from logvggt_jax.training.checkpoints import RunCheckpoints
+from logvggt_jax.training.checkpoints.checkpoint_files import Position
+from logvggt_jax.training.checkpoints.run_checkpoints import RunCheckpoints
 from logvggt_jax.training.config import VALIDATION_METRICS, SourceConfig, TrainConfig, ValidationConfig
-from logvggt_jax.training.device_batches import DeviceBatches
+from logvggt_jax.training.feeding.device_batches import DeviceBatches
 from logvggt_jax.training.loop import NonFiniteTraining, train
-from logvggt_jax.training.metrics_log import MetricsLog, read_metrics
-from logvggt_jax.training.profile import ProfiledSteps
-from logvggt_jax.training.program import Program, make_program
-from logvggt_jax.training.sharding import data_mesh
-from logvggt_jax.training.state import TrainState
-from logvggt_jax.training.validation import Judgement
+from logvggt_jax.training.parallel.sharding import data_mesh
+from logvggt_jax.training.reporting.metrics_log import MetricsLog, read_metrics
+from logvggt_jax.training.reporting.profile import ProfiledSteps
+from logvggt_jax.training.step.program import Program, make_program
+from logvggt_jax.training.step.state import TrainState
+from logvggt_jax.training.validation.validation import Judgement
 from logvggt_jax.weights.checkpoints import digests, load_model, read_provenance
 
 UNTIMED = ("time", "frames_per_second")
@@ -208,7 +208,7 @@ def test_changed_leaf_is_refused_by_its_digest(
     true = digests(state.params)
     with RunCheckpoints(tmp_path, run_config) as checkpoints, pytest.MonkeyPatch.context() as patch:
         # What Orbax stores differs from what was digested, as after a flipped byte.
-        patch.setattr("logvggt_jax.training.checkpoint_files.digests", lambda tree: true)
+        patch.setattr("logvggt_jax.training.checkpoints.checkpoint_files.digests", lambda tree: true)
         wrong = {**state.params, "camera_head": jax.tree.map(lambda x: x + 1, state.params["camera_head"])}
         checkpoints.save(state._replace(params=wrong), Position(1, {}))
         checkpoints.wait()
@@ -455,7 +455,7 @@ def test_a_save_or_a_validation_that_fails_says_so_before_the_first_step(
         raise OSError("cannot be done")
 
     if failing == "save":
-        monkeypatch.setattr("logvggt_jax.training.checkpoints.write_checkpoint", fail)
+        monkeypatch.setattr("logvggt_jax.training.checkpoints.run_checkpoints.write_checkpoint", fail)
     else:
         monkeypatch.setattr(loop.Validation, "__call__", fail)
     monkeypatch.setattr(loop._Run, "_compile", lambda *_: pytest.fail("no step is to be compiled"))

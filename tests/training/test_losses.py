@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from logvggt_jax.training import losses
+from logvggt_jax.training.losses import log_vggt as losses
 
 WEIGHTS = {"translation_weight": 1.0, "rotation_weight": 1.0, "field_of_view_weight": 0.5, "gamma": 0.6}
 # As programs, which training runs: one by one each operation would compile by itself.

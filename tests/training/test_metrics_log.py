@@ -9,7 +9,7 @@ from PIL import Image
 from rich.console import Console
 from tensorboardX.proto.event_pb2 import Event
 
-from logvggt_jax.training.metrics_log import FILE_NAME, MetricsLog, read_metrics
+from logvggt_jax.training.reporting.metrics_log import FILE_NAME, MetricsLog, read_metrics
 
 
 def _log(workdir: Path, first_step: int) -> MetricsLog:

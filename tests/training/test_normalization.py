@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from logvggt_jax import geometry
-from logvggt_jax.training.normalization import Targets, normalize_clips
+from logvggt_jax.training.losses.normalization import Targets, normalize_clips
 
 NORMALIZE, unproject = jax.jit(normalize_clips), jax.jit(geometry.unproject)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from logvggt_jax.training.config import OptimizerConfig, StageConfig
-from logvggt_jax.training.optimizer import learning_rate_schedule, make_optimizer
+from logvggt_jax.training.step.optimizer import learning_rate_schedule, make_optimizer
 
 PARAMS = {
     "encoder": {"kernel": jnp.ones((4, 4))},

@@ -12,9 +12,9 @@ import jax
 import numpy as np
 import pytest
 
-from logvggt_jax.training import processes
-from logvggt_jax.training.metrics_log import read_metrics
-from logvggt_jax.training.processes import any_process, check_agreement, check_processes, join_processes
+from logvggt_jax.training.parallel import joining as processes
+from logvggt_jax.training.parallel.joining import any_process, check_agreement, check_processes, join_processes
+from logvggt_jax.training.reporting.metrics_log import read_metrics
 from logvggt_jax.weights.checkpoints import load_model
 
 ROOT = Path(__file__).parents[2]

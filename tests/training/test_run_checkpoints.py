@@ -20,13 +20,13 @@ import pytest
 
 from logvggt_jax.config import from_mapping
 from logvggt_jax.errors import DiskError, InputError, OutputExists
-from logvggt_jax.training import checkpoint_files
-from logvggt_jax.training import checkpoints as module
-from logvggt_jax.training.checkpoint_files import Position
-from logvggt_jax.training.checkpoints import RunCheckpoints
+from logvggt_jax.training.checkpoints import checkpoint_files
+from logvggt_jax.training.checkpoints import run_checkpoints as module
+from logvggt_jax.training.checkpoints.checkpoint_files import Position
+from logvggt_jax.training.checkpoints.run_checkpoints import RunCheckpoints
 from logvggt_jax.training.config import OptimizerConfig, TeacherConfig, TrainConfig
-from logvggt_jax.training.optimizer import make_optimizer
-from logvggt_jax.training.state import TrainState, initial_state
+from logvggt_jax.training.step.optimizer import make_optimizer
+from logvggt_jax.training.step.state import TrainState, initial_state
 from logvggt_jax.weights import Provenance, save_model
 from logvggt_jax.weights.folder import write_description
 
@@ -146,8 +146,10 @@ def test_the_model_folder_says_how_it_was_trained(
     run_config: TrainConfig, state: TrainState, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     written: list[Provenance] = []
-    monkeypatch.setattr("logvggt_jax.training.checkpoints.save_model", lambda *saved: written.append(saved[3]))
-    monkeypatch.setattr("logvggt_jax.training.checkpoints.unstack_layers", lambda tree, *_: tree)
+    monkeypatch.setattr(
+        "logvggt_jax.training.checkpoints.run_checkpoints.save_model", lambda *saved: written.append(saved[3])
+    )
+    monkeypatch.setattr("logvggt_jax.training.checkpoints.run_checkpoints.unstack_layers", lambda tree, *_: tree)
     with RunCheckpoints(tmp_path / "run", run_config) as checkpoints:
         checkpoints.save(state, POSITION)
     training = from_mapping(Provenance, json.loads(json.dumps(written[0].to_dict())), "provenance").training

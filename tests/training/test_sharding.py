@@ -15,12 +15,12 @@ from parallel_runs import LayeredModel, Outcome, first_gradient, steps, steps_of
 from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.model.parameters import stack_layers
 from logvggt_jax.training import loop
-from logvggt_jax.training.checkpoint_files import Position, StoredCheckpoint
+from logvggt_jax.training.checkpoints.checkpoint_files import Position, StoredCheckpoint
 from logvggt_jax.training.config import LossConfig, TrainConfig
 from logvggt_jax.training.loop import train
-from logvggt_jax.training.program import make_program
-from logvggt_jax.training.sharding import Layout, check_batch_size, data_mesh, parameter_layout, put_batch
-from logvggt_jax.training.watchdog import Watchdog
+from logvggt_jax.training.parallel.sharding import Layout, check_batch_size, data_mesh, parameter_layout, put_batch
+from logvggt_jax.training.parallel.watchdog import Watchdog
+from logvggt_jax.training.step.program import make_program
 
 Clips = dict[str, np.ndarray]
 
@@ -185,7 +185,7 @@ def test_no_device_ever_holds_a_second_copy_when_a_run_starts_or_goes_on(
     """Shapes, then places, then values: each goes to where it stays, from the host or from the disk."""
     monkeypatch.setattr(loop, "LogVGGT", lambda _: layered)
     monkeypatch.setattr(loop, "abstract_parameters", lambda _: jax.eval_shape(lambda: layered_params))
-    monkeypatch.setattr("logvggt_jax.training.checkpoints.save_model", lambda *_: None)
+    monkeypatch.setattr("logvggt_jax.training.checkpoints.run_checkpoints.save_model", lambda *_: None)
     config, mesh = dataclasses.replace(run_config, shard_parameters=shard, average=0.5), data_mesh(4)
     before, held = {id(x) for x in jax.live_arrays()}, []
 
@@ -274,7 +274,7 @@ def test_a_sharded_run_is_saved_on_sixteen_devices_and_goes_on_with_eight(
     monkeypatch.setattr(loop, "LogVGGT", lambda _: layered)
     monkeypatch.setattr(loop, "initial_parameters", lambda *_, **__: layered_params)
     monkeypatch.setattr(loop, "abstract_parameters", lambda _: jax.eval_shape(lambda: layered_params))
-    monkeypatch.setattr("logvggt_jax.training.checkpoints.save_model", lambda *_: None)
+    monkeypatch.setattr("logvggt_jax.training.checkpoints.run_checkpoints.save_model", lambda *_: None)
     stage = dataclasses.replace(run_config.stages[0], batch_size=16, steps=3)
     config = dataclasses.replace(run_config, stages=(stage,), average=0.5)
     sharded = dataclasses.replace(config, shard_parameters=True)

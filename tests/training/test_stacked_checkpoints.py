@@ -9,11 +9,11 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from logvggt_jax.model.parameters import stack_layers
-from logvggt_jax.training.checkpoint_files import Position
-from logvggt_jax.training.checkpoints import RunCheckpoints
+from logvggt_jax.training.checkpoints.checkpoint_files import Position
+from logvggt_jax.training.checkpoints.run_checkpoints import RunCheckpoints
 from logvggt_jax.training.config import OptimizerConfig, TrainConfig
-from logvggt_jax.training.optimizer import make_optimizer
-from logvggt_jax.training.state import TrainState, initial_state
+from logvggt_jax.training.step.optimizer import make_optimizer
+from logvggt_jax.training.step.state import TrainState, initial_state
 from logvggt_jax.weights.checkpoints import digests
 
 

@@ -12,10 +12,10 @@ from parallel_runs import first_gradient
 
 from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.training.config import LossConfig, OptimizerConfig, StageConfig
-from logvggt_jax.training.optimizer import learning_rate_schedule, make_optimizer
-from logvggt_jax.training.sharding import check_batch_size, data_mesh, parameter_layout, put_batch, replicated
-from logvggt_jax.training.state import initial_state
-from logvggt_jax.training.step import make_loss_terms, make_train_step
+from logvggt_jax.training.parallel.sharding import check_batch_size, data_mesh, parameter_layout, put_batch, replicated
+from logvggt_jax.training.step.optimizer import learning_rate_schedule, make_optimizer
+from logvggt_jax.training.step.state import initial_state
+from logvggt_jax.training.step.train_step import make_loss_terms, make_train_step
 
 Clips = dict[str, np.ndarray]
 STAGES = (StageConfig("only", 8, 5, 8, 1, 1, ((28, 42),)),)

@@ -10,13 +10,14 @@ import jax
 import pytest
 
 from logvggt_jax.errors import InputError
-from logvggt_jax.training import compilation, loop
-from logvggt_jax.training.batches import open_sources, stage_batches
-from logvggt_jax.training.compilation import compiled_steps
+from logvggt_jax.training import loop
 from logvggt_jax.training.config import TeacherConfig, TrainConfig
+from logvggt_jax.training.feeding.sources import open_sources, stage_batches
 from logvggt_jax.training.loop import train
-from logvggt_jax.training.program import make_program
-from logvggt_jax.training.sharding import data_mesh, put_batch
+from logvggt_jax.training.parallel.sharding import data_mesh, put_batch
+from logvggt_jax.training.step import compilation
+from logvggt_jax.training.step.compilation import compiled_steps
+from logvggt_jax.training.step.program import make_program
 
 SIZES = ((28, 42), (42, 28), (28, 28))
 

@@ -6,9 +6,9 @@ import time
 
 import pytest
 
-from logvggt_jax.training import progress
 from logvggt_jax.training.config import SourceConfig, TrainConfig, ValidationConfig
-from logvggt_jax.training.progress import IntervalMeans, RunTimes, Speed, progress_line
+from logvggt_jax.training.reporting import progress
+from logvggt_jax.training.reporting.progress import IntervalMeans, RunTimes, Speed, progress_line
 
 
 class Clock:

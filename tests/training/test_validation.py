@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from logvggt_jax.errors import InputError
-from logvggt_jax.training import validation as module
-from logvggt_jax.training.batches import open_source
 from logvggt_jax.training.config import SourceConfig, ValidationConfig
-from logvggt_jax.training.sharding import data_mesh, parameter_layout
-from logvggt_jax.training.validation import Validation
+from logvggt_jax.training.feeding.sources import open_source
+from logvggt_jax.training.parallel.sharding import data_mesh, parameter_layout
+from logvggt_jax.training.validation import validation as module
+from logvggt_jax.training.validation.validation import Validation
 
 ROOMS = (("height", 28), ("num_frames", 8), ("num_rooms", 2), ("width", 42))
 

@@ -5,7 +5,7 @@ import pytest
 
 from logvggt_jax.colours import coloured, depth_picture
 from logvggt_jax.frames import Frames
-from logvggt_jax.training.pictures import clip_picture, trajectory_picture
+from logvggt_jax.training.validation.pictures import clip_picture, trajectory_picture
 
 COLUMNS = ("input", "true", "predicted", "error", "confidence")
 WIDTH, HEADER = 168, 18  # 42 pixels four times

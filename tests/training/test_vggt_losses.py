@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from logvggt_jax.training import vggt_losses
-from logvggt_jax.training.normalization import Targets, normalize_clips
+from logvggt_jax.training.losses import vggt as vggt_losses
+from logvggt_jax.training.losses.normalization import Targets, normalize_clips
 
 # As programs, which training runs: one by one each operation would compile by itself.
 camera_losses = jax.jit(vggt_losses.camera_losses, static_argnames="gamma")

@@ -11,8 +11,8 @@ import pytest
 from rich.console import Console
 
 from logvggt_jax.errors import InputError, MissingPackage
-from logvggt_jax.training.metrics_log import MetricsLog
-from logvggt_jax.training.wandb_run import WandbRun
+from logvggt_jax.training.reporting.metrics_log import MetricsLog
+from logvggt_jax.training.reporting.wandb_run import WandbRun
 
 
 class Library(ModuleType):

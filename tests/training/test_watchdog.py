@@ -7,7 +7,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 RUN = """
 import time
-from logvggt_jax.training.watchdog import Watchdog
+from logvggt_jax.training.parallel.watchdog import Watchdog
 with Watchdog(3, least=0.1, other={other}) as watched:
     for _ in range(20):
         time.sleep(0.02)

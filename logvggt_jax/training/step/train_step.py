@@ -9,15 +9,15 @@ import optax
 from jax.sharding import PartitionSpec as P
 
 from logvggt_jax.model.logvggt import LogVGGT
-from logvggt_jax.training.clip_errors import clip_errors
 from logvggt_jax.training.config import LossConfig
-from logvggt_jax.training.freezing import without_gradient
-from logvggt_jax.training.losses import Mean
-from logvggt_jax.training.normalization import Targets, normalize_clips
-from logvggt_jax.training.objective import loss_terms, total_loss
-from logvggt_jax.training.optimizer import apply_updates, module_norms, moving_average
-from logvggt_jax.training.sharding import DATA_AXIS, Layout
-from logvggt_jax.training.state import TrainState
+from logvggt_jax.training.losses.clip_errors import clip_errors
+from logvggt_jax.training.losses.log_vggt import Mean
+from logvggt_jax.training.losses.normalization import Targets, normalize_clips
+from logvggt_jax.training.losses.objective import loss_terms, total_loss
+from logvggt_jax.training.parallel.sharding import DATA_AXIS, Layout
+from logvggt_jax.training.step.freezing import without_gradient
+from logvggt_jax.training.step.optimizer import apply_updates, module_norms, moving_average
+from logvggt_jax.training.step.state import TrainState
 from logvggt_jax.types import Predictions
 
 Batch = dict[str, jax.Array]

@@ -7,10 +7,10 @@ from typing import Any
 import jax
 
 from logvggt_jax.data.dataset import Dataset
-from logvggt_jax.training.batches import open_source, open_sources
 from logvggt_jax.training.config import TeacherConfig, TrainConfig
-from logvggt_jax.training.taught import taught
-from logvggt_jax.training.teacher import PlainVGGT, Teacher
+from logvggt_jax.training.feeding.sources import open_source, open_sources
+from logvggt_jax.training.teaching.taught import taught
+from logvggt_jax.training.teaching.teacher import PlainVGGT, Teacher
 
 
 def open_data(config: TrainConfig) -> tuple[Mapping[str, Dataset], Sequence[Dataset]]:

@@ -18,11 +18,16 @@ from absl import logging
 from logvggt_jax.errors import DiskError, InputError, OutputExists, disk_errors, one_line
 from logvggt_jax.files import FolderLock, check_space, write_text
 from logvggt_jax.model.parameters import unstack_layers
-from logvggt_jax.training.checkpoint_files import DamagedCheckpoint, Position, StoredCheckpoint, write_checkpoint
+from logvggt_jax.training.checkpoints.checkpoint_files import (
+    DamagedCheckpoint,
+    Position,
+    StoredCheckpoint,
+    write_checkpoint,
+)
+from logvggt_jax.training.checkpoints.work_folder import remove_scratch
 from logvggt_jax.training.config import TrainConfig
-from logvggt_jax.training.processes import any_process
-from logvggt_jax.training.state import TrainState
-from logvggt_jax.training.work_folder import remove_scratch
+from logvggt_jax.training.parallel.joining import any_process
+from logvggt_jax.training.step.state import TrainState
 from logvggt_jax.weights.checkpoints import check_destination, read_licence, read_provenance, save_model
 from logvggt_jax.weights.digests import whole_array
 from logvggt_jax.weights.folder import is_model_folder

@@ -12,9 +12,9 @@ import jax
 
 from logvggt_jax.training.config import StageConfig
 from logvggt_jax.training.dry_run import abstract_clips
-from logvggt_jax.training.program import Program
-from logvggt_jax.training.sharding import split
-from logvggt_jax.training.state import TrainState
+from logvggt_jax.training.parallel.sharding import split
+from logvggt_jax.training.step.program import Program
+from logvggt_jax.training.step.state import TrainState
 
 # Each compilation of a billion parameters takes several GB of the host.
 _AT_ONCE = 4

@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from logvggt_jax.geometry import compose, decode_poses, invert, rotation_angle
-from logvggt_jax.training.losses import Mean
-from logvggt_jax.training.normalization import Targets
+from logvggt_jax.training.losses.log_vggt import Mean
+from logvggt_jax.training.losses.normalization import Targets
 from logvggt_jax.types import Predictions
 
 SMALLEST_DEPTH = 1e-5

@@ -22,9 +22,9 @@ from jax.sharding import Mesh
 
 from logvggt_jax.errors import InputError, one_line
 from logvggt_jax.files import write_text
-from logvggt_jax.training import lifeline
-from logvggt_jax.training.lifeline import Lifeline
-from logvggt_jax.training.sharding import replicated, split
+from logvggt_jax.training.parallel import lifeline
+from logvggt_jax.training.parallel.lifeline import Lifeline
+from logvggt_jax.training.parallel.sharding import replicated, split
 
 JOIN_SECONDS = 120.0
 # The lifeline notices a loss first; these are for where it could not be laid, and for the end of a run.

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 from jax.sharding import Mesh
 
 from logvggt_jax.data.feeding.batches import BatchIterator
-from logvggt_jax.training.sharding import on_each_device, put_batch
-from logvggt_jax.training.step import Batch
+from logvggt_jax.training.parallel.sharding import on_each_device, put_batch
+from logvggt_jax.training.step.train_step import Batch
 
 
 class _Ready(NamedTuple):

@@ -13,10 +13,10 @@ from logvggt_jax.errors import InputError
 from logvggt_jax.metrics.depth import depth_metrics
 from logvggt_jax.metrics.pose import pose_accuracy, relative_pose_errors
 from logvggt_jax.model.logvggt import LogVGGT
-from logvggt_jax.training.batches import open_source
 from logvggt_jax.training.config import ValidationConfig
-from logvggt_jax.training.pictures import clip_picture, trajectory_picture
-from logvggt_jax.training.sharding import DATA_AXIS, Layout, replicated, split
+from logvggt_jax.training.feeding.sources import open_source
+from logvggt_jax.training.parallel.sharding import DATA_AXIS, Layout, replicated, split
+from logvggt_jax.training.validation.pictures import clip_picture, trajectory_picture
 from logvggt_jax.types import Frames
 
 

@@ -11,11 +11,11 @@ from logvggt_jax.config import ModelConfig
 from logvggt_jax.model.logvggt import LogVGGT, variable_shapes
 from logvggt_jax.model.parameters import stack_layers
 from logvggt_jax.training.config import TrainConfig
-from logvggt_jax.training.freezing import ENCODER, frozen_leaves
-from logvggt_jax.training.optimizer import learning_rate_schedule, make_optimizer
-from logvggt_jax.training.sharding import Layout, parameter_layout
-from logvggt_jax.training.state import TrainState, initial_state
-from logvggt_jax.training.step import make_loss_terms, make_train_step
+from logvggt_jax.training.parallel.sharding import Layout, parameter_layout
+from logvggt_jax.training.step.freezing import ENCODER, frozen_leaves
+from logvggt_jax.training.step.optimizer import learning_rate_schedule, make_optimizer
+from logvggt_jax.training.step.state import TrainState, initial_state
+from logvggt_jax.training.step.train_step import make_loss_terms, make_train_step
 
 
 def abstract_parameters(config: ModelConfig) -> Any:

@@ -24,7 +24,7 @@ from logvggt_jax.errors import InputError, one_line
 from logvggt_jax.files import atomic_folder, to_disk
 from logvggt_jax.model.parameters import stack_layers, unstack_layers
 from logvggt_jax.training.config import TrainConfig
-from logvggt_jax.training.state import TrainState
+from logvggt_jax.training.step.state import TrainState
 from logvggt_jax.weights.checkpoints import read_arrays, write_arrays, writing_with_orbax
 from logvggt_jax.weights.digests import digests, json_digest, verify_digests
 

@@ -26,8 +26,8 @@ from logvggt_jax.errors import InputError, OutputExists
 from logvggt_jax.files import atomic_folder
 from logvggt_jax.frames import Frames
 from logvggt_jax.training.config import TeacherConfig
-from logvggt_jax.training.processes import any_process, check_agreement, from_all
-from logvggt_jax.training.teacher import Labels, Teacher
+from logvggt_jax.training.parallel.joining import any_process, check_agreement, from_all
+from logvggt_jax.training.teaching.teacher import Labels, Teacher
 
 Size = tuple[int, int]
 _DIGEST_BYTES = 16

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import optax
 
 from logvggt_jax.training.config import OptimizerConfig, StageConfig
-from logvggt_jax.training.freezing import frozen_leaves
+from logvggt_jax.training.step.freezing import frozen_leaves
 
 Norm = Callable[[Any], jax.Array]
 # Group of the parameters that are frozen in a module of which others are trained.

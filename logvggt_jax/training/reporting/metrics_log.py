@@ -14,7 +14,7 @@ from rich.console import Console
 from tensorboardX import SummaryWriter
 
 from logvggt_jax.files import write_text
-from logvggt_jax.training.wandb_run import WandbRun
+from logvggt_jax.training.reporting.wandb_run import WandbRun
 
 FILE_NAME = "metrics.jsonl"
 # Beside the metrics, which are the same however often a run was interrupted.

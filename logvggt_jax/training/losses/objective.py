@@ -4,10 +4,11 @@ import jax
 import jax.numpy as jnp
 
 from logvggt_jax.errors import InputError
-from logvggt_jax.training import losses, vggt_losses
 from logvggt_jax.training.config import LossConfig
-from logvggt_jax.training.losses import Mean
-from logvggt_jax.training.normalization import Targets
+from logvggt_jax.training.losses import log_vggt as losses
+from logvggt_jax.training.losses import vggt as vggt_losses
+from logvggt_jax.training.losses.log_vggt import Mean
+from logvggt_jax.training.losses.normalization import Targets
 from logvggt_jax.types import Predictions
 
 
