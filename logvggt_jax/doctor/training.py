@@ -16,8 +16,8 @@ from logvggt_jax.doctor.subject import Subject, random_variables
 from logvggt_jax.model.parameters import stack_layers
 from logvggt_jax.operations import matmul_flops_per_second
 from logvggt_jax.training.config import LossConfig, OptimizerConfig
-from logvggt_jax.training.dry_run import step_flops
 from logvggt_jax.training.parallel.sharding import data_mesh, parameter_layout, replicated, split
+from logvggt_jax.training.step.costs import step_flops
 from logvggt_jax.training.step.freezing import ENCODER
 from logvggt_jax.training.step.optimizer import make_optimizer
 from logvggt_jax.training.step.state import TrainState, initial_state

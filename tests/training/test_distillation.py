@@ -27,15 +27,16 @@ from logvggt_jax.training.config import (
     TrainConfig,
     ValidationConfig,
 )
-from logvggt_jax.training.losses.log_vggt import distilled_depth_losses
+from logvggt_jax.training.losses.distillation import distilled_depth_losses
 from logvggt_jax.training.parallel.sharding import data_mesh, parameter_layout, put_batch
 from logvggt_jax.training.reporting.metrics_log import read_metrics
 from logvggt_jax.training.step.optimizer import make_optimizer
 from logvggt_jax.training.step.state import initial_state
 from logvggt_jax.training.step.train_step import make_loss_terms, make_train_step
-from logvggt_jax.training.teaching import taught as module
+from logvggt_jax.training.teaching import labelling as module
+from logvggt_jax.training.teaching.labelling import taught
 from logvggt_jax.training.teaching.run_data import label
-from logvggt_jax.training.teaching.taught import TaughtDataset, taught
+from logvggt_jax.training.teaching.taught import TaughtDataset
 from logvggt_jax.training.teaching.teacher import PlainVGGT
 from logvggt_jax.weights.checkpoints import save_model
 from logvggt_jax.weights.folder import write_description

@@ -15,8 +15,9 @@ from logvggt_jax.errors import InputError, MissingPackage
 from logvggt_jax.operations import count_flops
 from logvggt_jax.training import dry_run as module
 from logvggt_jax.training.config import TrainConfig
-from logvggt_jax.training.dry_run import StepCosts, abstract_clips, collectives, dry_run, step_costs, step_flops
+from logvggt_jax.training.dry_run import dry_run
 from logvggt_jax.training.parallel.sharding import data_mesh
+from logvggt_jax.training.step.costs import StepCosts, abstract_clips, collectives, step_costs, step_flops
 
 ROOT = Path(__file__).parents[2]
 SIZE = (28, 42)

@@ -1,8 +1,8 @@
-"""The data of a run: data sets opened once, one stream of batches for each stage."""
+"""The data sets of a run, opened once, with what must not be trained on left out of them."""
 
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import jax
@@ -10,13 +10,12 @@ from absl import logging
 
 from logvggt_jax.data.dataset import Dataset, Reader
 from logvggt_jax.data.errors import EmptySplit
-from logvggt_jax.data.feeding.batches import BatchIterator, training_batches
 from logvggt_jax.data.feeding.holdouts import check_disjoint, check_held_out
 from logvggt_jax.data.frame_range import FrameRange
 from logvggt_jax.data.packed.index import is_packed
 from logvggt_jax.data.registry import DATASETS, READERS, open_dataset
 from logvggt_jax.errors import InputError
-from logvggt_jax.training.config import DataConfig, SourceConfig, StageConfig
+from logvggt_jax.training.config import DataConfig, SourceConfig
 
 
 def open_source(source: SourceConfig) -> Dataset:
@@ -108,28 +107,3 @@ def _without_folder(sources: Sequence[SourceConfig]) -> list[SourceConfig]:
 
 def _named(sources: Sequence[SourceConfig]) -> str:
     return ", ".join(f"{source.name} ({source.root})" for source in sources)
-
-
-def stage_batches(
-    datasets: Mapping[str, Dataset], config: DataConfig, stage: StageConfig, *, seed: int
-) -> BatchIterator:
-    """This process's share of the batches of a stage; `seed` is the stage's own."""
-    sources = [source for source in config.sources if source.name in datasets]
-    return training_batches(
-        datasets,
-        clip_length=stage.clip_length,
-        batch_size=stage.batch_size,
-        sizes=stage.sizes,
-        seed=seed,
-        stride=(stage.min_stride, stage.max_stride),
-        strides={source.name: source.stride for source in sources if source.stride is not None},
-        reverse=config.reverse,
-        weights={source.name: source.weight for source in sources},
-        augmentation=config.augmentation,
-        min_valid_depth=config.min_valid_depth,
-        max_broken=config.max_broken,
-        process_index=jax.process_index(),
-        process_count=jax.process_count(),
-        worker_count=config.worker_count,
-        num_threads=config.num_threads,
-    )

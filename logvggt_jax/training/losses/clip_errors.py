@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from logvggt_jax.geometry import compose, decode_poses, invert, rotation_angle
-from logvggt_jax.training.losses.log_vggt import Mean
+from logvggt_jax.training.losses.mean import Mean
 from logvggt_jax.training.losses.normalization import Targets
 from logvggt_jax.types import Predictions
 

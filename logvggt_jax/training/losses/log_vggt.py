@@ -1,23 +1,9 @@
-"""The paper's training objective as sums and counts, so that devices can add theirs before dividing."""
-
-from typing import NamedTuple
+"""The paper's training objective, each term a `Mean` over what is valid."""
 
 import jax
 import jax.numpy as jnp
 
-
-class Mean(NamedTuple):
-    """A mean that is not divided yet: `numerator` and `denominator`, float32 scalars.
-
-    Means over different numbers of valid pixels cannot be averaged; their numerators and denominators can be added.
-    """
-
-    numerator: jax.Array
-    denominator: jax.Array
-
-    def value(self) -> jax.Array:
-        """numerator / denominator, 0 (with zero gradient) where nothing was counted."""
-        return self.numerator / jnp.maximum(self.denominator, 1.0)
+from logvggt_jax.training.losses.mean import Mean
 
 
 def camera_loss(
@@ -57,7 +43,7 @@ def depth_losses(
     """
     weight = jnp.where(valid, confidence, 1.0)
     count = valid.sum().astype(jnp.float32)
-    error, gradient = _weighted_errors(depth, target, valid, weight)
+    error, gradient = weighted_errors(depth, target, valid, weight)
     return {
         "depth_error": Mean(error, count),
         "depth_gradient": Mean(gradient, count),
@@ -65,35 +51,7 @@ def depth_losses(
     }
 
 
-def distilled_depth_losses(
-    depth: jax.Array,
-    confidence: jax.Array,
-    target: jax.Array,
-    valid: jax.Array,
-    target_confidence: jax.Array,
-    *,
-    alpha: float,
-) -> dict[str, Mean]:
-    """Distances to a teacher's depth and confidence, each a mean over the pixels where `valid` bool [B, T, H, W].
-
-    `depth_error` and `depth_gradient` are those of `depth_losses` with another weight: the teacher's confidence over
-    its mean in the clip, so that what it is unsure of counts less, and clips weigh alike. `depth_confidence` is
-    alpha |log S - log S_teacher| of the student's confidence S. All arrays are [B, T, H, W], float32.
-    """
-    count = valid.sum().astype(jnp.float32)
-    known = jnp.where(valid, target_confidence, 0.0)
-    mean = known.sum((1, 2, 3)) / jnp.maximum(valid.sum((1, 2, 3)), 1)
-    weight = known / jnp.maximum(mean, 1.0)[:, None, None, None]
-    error, gradient = _weighted_errors(depth, target, valid, weight)
-    distance = jnp.log(jnp.where(valid, confidence, 1.0)) - jnp.log(jnp.where(valid, target_confidence, 1.0))
-    return {
-        "depth_error": Mean(error, count),
-        "depth_gradient": Mean(gradient, count),
-        "depth_confidence": Mean(alpha * jnp.abs(distance).sum(), count),
-    }
-
-
-def _weighted_errors(
+def weighted_errors(
     depth: jax.Array, target: jax.Array, valid: jax.Array, weight: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Sums over valid pixels of weighted absolute errors, and of their differences between neighbours."""

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 
 from logvggt_jax.errors import InputError
 from logvggt_jax.training.config import LossConfig
-from logvggt_jax.training.losses import log_vggt as losses
-from logvggt_jax.training.losses import vggt as vggt_losses
-from logvggt_jax.training.losses.log_vggt import Mean
+from logvggt_jax.training.losses import log_vggt, vggt
+from logvggt_jax.training.losses.distillation import distilled_depth_losses
+from logvggt_jax.training.losses.mean import Mean
 from logvggt_jax.training.losses.normalization import Targets
 from logvggt_jax.types import Predictions
 
@@ -21,7 +21,7 @@ def loss_terms(
     """
     dense = (predictions.depth, predictions.depth_confidence, targets.depth, targets.depth_valid)
     if config.name in ("log_vggt", "distillation"):
-        camera = losses.camera_loss(
+        camera = log_vggt.camera_loss(
             predictions.pose_encodings,
             targets.pose_encoding,
             targets.frame_valid,
@@ -31,19 +31,19 @@ def loss_terms(
             gamma=config.gamma,
         )
         if config.name == "log_vggt":
-            return {"camera": camera, **losses.depth_losses(*dense, alpha=config.alpha)}
+            return {"camera": camera, **log_vggt.depth_losses(*dense, alpha=config.alpha)}
         if confidence is None:
             raise InputError("loss.name='distillation' learns from a teacher's confidence, which these clips lack")
-        return {"camera": camera, **losses.distilled_depth_losses(*dense, confidence, alpha=config.alpha)}
+        return {"camera": camera, **distilled_depth_losses(*dense, confidence, alpha=config.alpha)}
     return {
-        **vggt_losses.camera_losses(
+        **vggt.camera_losses(
             predictions.pose_encodings,
             targets.pose_encoding,
             targets.frame_valid,
             targets.depth_valid,
             gamma=config.gamma,
         ),
-        **vggt_losses.depth_losses(*dense, alpha=config.alpha, quantile=config.quantile),
+        **vggt.depth_losses(*dense, alpha=config.alpha, quantile=config.quantile),
     }
 
 

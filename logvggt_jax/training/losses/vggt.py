@@ -7,7 +7,7 @@ averaged over devices as they are, which is what the trainer's data parallelism 
 import jax
 import jax.numpy as jnp
 
-from logvggt_jax.training.losses.log_vggt import Mean
+from logvggt_jax.training.losses.mean import Mean
 
 LIMIT = 100.0
 MIN_PIXELS = 100

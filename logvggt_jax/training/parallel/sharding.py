@@ -27,12 +27,14 @@ def data_mesh(num_devices: int | None = None) -> Mesh:
 
 
 def use_cpu_cores(config: TrainConfig, *, num_processes: int = 1) -> None:
-    """Makes devices of a CPU's cores, as many as the batches of all stages split over; before JAX's first use.
+    """Makes devices of a CPU's cores, as many as the batches of all stages split over, there in
+    `config.accumulate` parts; before JAX's first use.
 
     One core computes a step of a small model; data parallelism puts the others to work. Accelerators are not
     affected.
     """
-    common = math.gcd(*(stage.batch_size for stage in config.stages)) // num_processes
+    clips = math.gcd(*(stage.batch_size for stage in config.stages))
+    common = max(clips // (num_processes * config.accumulate), 1)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     jax.config.update("jax_num_cpu_devices", max((n for n in range(1, cores + 1) if common % n == 0), default=1))
 

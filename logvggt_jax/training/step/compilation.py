@@ -11,8 +11,8 @@ from typing import NamedTuple
 import jax
 
 from logvggt_jax.training.config import StageConfig
-from logvggt_jax.training.dry_run import abstract_clips
 from logvggt_jax.training.parallel.sharding import split
+from logvggt_jax.training.step.costs import abstract_clips
 from logvggt_jax.training.step.program import Program
 from logvggt_jax.training.step.state import TrainState
 

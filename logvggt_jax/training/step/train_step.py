@@ -11,7 +11,7 @@ from jax.sharding import PartitionSpec as P
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.training.config import LossConfig
 from logvggt_jax.training.losses.clip_errors import clip_errors
-from logvggt_jax.training.losses.log_vggt import Mean
+from logvggt_jax.training.losses.mean import Mean
 from logvggt_jax.training.losses.normalization import Targets, normalize_clips
 from logvggt_jax.training.losses.objective import loss_terms, total_loss
 from logvggt_jax.training.parallel.sharding import DATA_AXIS, Layout

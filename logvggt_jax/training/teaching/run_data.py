@@ -9,7 +9,7 @@ import jax
 from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.training.config import TeacherConfig, TrainConfig
 from logvggt_jax.training.feeding.sources import open_source, open_sources
-from logvggt_jax.training.teaching.taught import taught
+from logvggt_jax.training.teaching.labelling import taught
 from logvggt_jax.training.teaching.teacher import PlainVGGT, Teacher
 
 

@@ -1,6 +1,6 @@
 """A teacher: plain VGGT, whose predictions on clips of videos are what a student learns."""
 
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -8,26 +8,11 @@ from logvggt_jax.errors import InputError
 from logvggt_jax.streaming import open_predictor
 from logvggt_jax.streaming.offline import OfflineSettings
 from logvggt_jax.training.config import TeacherConfig
+from logvggt_jax.training.teaching.labels import Labels
 from logvggt_jax.weights.checkpoints import from_pretrained, read_provenance
 from logvggt_jax.weights.digests import digests, json_digest
 
 METHOD = "offline"  # of `streaming`: all frames of a clip see one another
-
-
-class Labels(NamedTuple):
-    """What a teacher says of a clip, float32, in the frame of its first camera and in a unit of its own.
-
-    Attributes:
-      depth: [T, H, W] z-depth.
-      confidence: [T, H, W], at least 1.
-      intrinsics: [T, 3, 3], pixels.
-      extrinsics: [T, 4, 4], world-to-camera (OpenCV).
-    """
-
-    depth: np.ndarray
-    confidence: np.ndarray
-    intrinsics: np.ndarray
-    extrinsics: np.ndarray
 
 
 class Teacher(Protocol):

@@ -1,6 +1,6 @@
 """Accuracy on a few fixed clips that training never sees."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -89,6 +89,16 @@ class Validation:
             pictures[f"validation/{name}/clip"] = clip_picture(clip, depth[first], confidence[number])
             pictures[f"validation/{name}/trajectory"] = trajectory_picture(extrinsics[first], clip.extrinsics)
         return Judgement(values, pictures)
+
+
+def validation_line(values: Mapping[str, float]) -> str:
+    """What a `Judgement` says, on one line beside what learns nothing gets."""
+    return (
+        f"abs_rel {values['validation/abs_rel']:.3f} (constant depth {values['validation/constant_abs_rel']:.3f}), "
+        f"delta<1.25 {values['validation/delta_1.25']:.3f}, "
+        f"rotation {values['validation/rotation']:.2f}° (identity {values['validation/identity_rotation']:.2f}°), "
+        f"direction {values['validation/translation_direction']:.1f}°"
+    )
 
 
 def _means(results: list[dict[str, float]], prefix: str) -> dict[str, float]:

@@ -12,7 +12,8 @@ import pytest
 from logvggt_jax.errors import InputError
 from logvggt_jax.training import loop
 from logvggt_jax.training.config import TeacherConfig, TrainConfig
-from logvggt_jax.training.feeding.sources import open_sources, stage_batches
+from logvggt_jax.training.feeding.batches import stage_batches
+from logvggt_jax.training.feeding.sources import open_sources
 from logvggt_jax.training.loop import train
 from logvggt_jax.training.parallel.sharding import data_mesh, put_batch
 from logvggt_jax.training.step import compilation

@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 
 from logvggt_jax.training.parallel import joining as processes
-from logvggt_jax.training.parallel.joining import any_process, check_agreement, check_processes, join_processes
+from logvggt_jax.training.parallel.agreement import any_process, check_agreement
+from logvggt_jax.training.parallel.joining import check_processes, join_processes
 from logvggt_jax.training.reporting.metrics_log import read_metrics
 from logvggt_jax.weights.checkpoints import load_model
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 # One shape of clip and few steps: nearly all of the time is compilation.
 SETTINGS = (
     "--config=configs/tiny.py",
@@ -183,7 +184,7 @@ def test_a_stop_signal_for_one_process_stops_all_after_the_same_step(tmp_path: P
 
 
 def test_folders_that_are_not_shared_are_an_error_of_the_start(tmp_path: Path) -> None:
-    patch = "from logvggt_jax.training import processes; processes.SHARED_SECONDS = 0.5"
+    patch = "from logvggt_jax.training.parallel import agreement; agreement.SHARED_SECONDS = 0.5"
     with PixelRuns(tmp_path / "a", tmp_path / "b", patches=(patch, patch)) as runs:
         for number in range(2):
             errors = runs.errors(number)
@@ -196,7 +197,7 @@ def test_folders_that_are_not_shared_are_an_error_of_the_start(tmp_path: Path) -
 def test_a_preflight_goes_on_together_when_one_process_fails_a_try(tmp_path: Path) -> None:
     quick = (
         "from logvggt_jax.training import preflight as flight\n"
-        "from logvggt_jax.training.dry_run import StepCosts\n"
+        "from logvggt_jax.training.step.costs import StepCosts\n"
         "flight.step_costs = lambda *_: StepCosts(1, 1, {}, 1.0)\n"
         "flight.abstract_parameters = loop.abstract_parameters\n"
     )

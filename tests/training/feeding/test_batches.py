@@ -13,7 +13,8 @@ from logvggt_jax.data.errors import EmptySplit
 from logvggt_jax.data.feeding.holdouts import HoldOut
 from logvggt_jax.errors import InputError
 from logvggt_jax.training.config import DataConfig, SourceConfig, TrainConfig
-from logvggt_jax.training.feeding.sources import open_source, open_sources, stage_batches
+from logvggt_jax.training.feeding.batches import stage_batches
+from logvggt_jax.training.feeding.sources import open_source, open_sources
 
 OPTIONS = {"height": 28, "width": 42, "num_frames": 8, "num_rooms": 8}
 

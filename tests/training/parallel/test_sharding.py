@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,14 @@ from logvggt_jax.training import loop
 from logvggt_jax.training.checkpoints.checkpoint_files import Position, StoredCheckpoint
 from logvggt_jax.training.config import LossConfig, TrainConfig
 from logvggt_jax.training.loop import train
-from logvggt_jax.training.parallel.sharding import Layout, check_batch_size, data_mesh, parameter_layout, put_batch
+from logvggt_jax.training.parallel.sharding import (
+    Layout,
+    check_batch_size,
+    data_mesh,
+    parameter_layout,
+    put_batch,
+    use_cpu_cores,
+)
 from logvggt_jax.training.parallel.watchdog import Watchdog
 from logvggt_jax.training.step.program import make_program
 
@@ -185,7 +193,7 @@ def test_no_device_ever_holds_a_second_copy_when_a_run_starts_or_goes_on(
     """Shapes, then places, then values: each goes to where it stays, from the host or from the disk."""
     monkeypatch.setattr(loop, "LogVGGT", lambda _: layered)
     monkeypatch.setattr(loop, "abstract_parameters", lambda _: jax.eval_shape(lambda: layered_params))
-    monkeypatch.setattr("logvggt_jax.training.checkpoints.run_checkpoints.save_model", lambda *_: None)
+    monkeypatch.setattr("logvggt_jax.training.checkpoints.run_models.save_model", lambda *_: None)
     config, mesh = dataclasses.replace(run_config, shard_parameters=shard, average=0.5), data_mesh(4)
     before, held = {id(x) for x in jax.live_arrays()}, []
 
@@ -274,7 +282,7 @@ def test_a_sharded_run_is_saved_on_sixteen_devices_and_goes_on_with_eight(
     monkeypatch.setattr(loop, "LogVGGT", lambda _: layered)
     monkeypatch.setattr(loop, "initial_parameters", lambda *_, **__: layered_params)
     monkeypatch.setattr(loop, "abstract_parameters", lambda _: jax.eval_shape(lambda: layered_params))
-    monkeypatch.setattr("logvggt_jax.training.checkpoints.run_checkpoints.save_model", lambda *_: None)
+    monkeypatch.setattr("logvggt_jax.training.checkpoints.run_models.save_model", lambda *_: None)
     stage = dataclasses.replace(run_config.stages[0], batch_size=16, steps=3)
     config = dataclasses.replace(run_config, stages=(stage,), average=0.5)
     sharded = dataclasses.replace(config, shard_parameters=True)
@@ -295,3 +303,24 @@ def test_batches_have_to_split_into_the_parts(run_config: TrainConfig) -> None:
     check_batch_size(stage, data_mesh(4), accumulate=2)
     with pytest.raises(ValueError, match=r"over 4 devices in accumulate=4 parts each; use a multiple of 16"):
         check_batch_size(stage, data_mesh(4), accumulate=4)
+
+
+@pytest.mark.parametrize(
+    ("clips", "accumulate", "processes", "devices"), [(12, 1, 1, 6), (12, 4, 1, 3), (12, 2, 2, 3), (4, 4, 1, 1)]
+)
+def test_as_many_cores_become_devices_as_the_parts_of_a_batch_split_over(
+    clips: int,
+    accumulate: int,
+    processes: int,
+    devices: int,
+    run_config: TrainConfig,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    given: dict[str, int] = {}
+    monkeypatch.setattr(jax.config, "update", given.__setitem__)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(8), raising=False)
+    stages = tuple(dataclasses.replace(stage, batch_size=clips) for stage in run_config.stages)
+    use_cpu_cores(dataclasses.replace(run_config, stages=stages, accumulate=accumulate), num_processes=processes)
+    assert given == {"jax_num_cpu_devices": devices}
+    for stage in stages:
+        check_batch_size(stage, data_mesh(devices * processes), accumulate=accumulate)

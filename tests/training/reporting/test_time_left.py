@@ -8,7 +8,8 @@ import pytest
 
 from logvggt_jax.training.config import SourceConfig, TrainConfig, ValidationConfig
 from logvggt_jax.training.reporting import progress
-from logvggt_jax.training.reporting.progress import IntervalMeans, RunTimes, Speed, progress_line
+from logvggt_jax.training.reporting.progress import IntervalMeans, progress_line
+from logvggt_jax.training.reporting.run_times import RunTimes, Speed
 
 
 class Clock:

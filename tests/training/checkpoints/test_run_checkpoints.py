@@ -21,7 +21,7 @@ import pytest
 from logvggt_jax.config import from_mapping
 from logvggt_jax.errors import DiskError, InputError, OutputExists
 from logvggt_jax.training.checkpoints import checkpoint_files
-from logvggt_jax.training.checkpoints import run_checkpoints as module
+from logvggt_jax.training.checkpoints import run_models as module
 from logvggt_jax.training.checkpoints.checkpoint_files import Position
 from logvggt_jax.training.checkpoints.run_checkpoints import RunCheckpoints
 from logvggt_jax.training.config import OptimizerConfig, TeacherConfig, TrainConfig
@@ -147,9 +147,9 @@ def test_the_model_folder_says_how_it_was_trained(
 ) -> None:
     written: list[Provenance] = []
     monkeypatch.setattr(
-        "logvggt_jax.training.checkpoints.run_checkpoints.save_model", lambda *saved: written.append(saved[3])
+        "logvggt_jax.training.checkpoints.run_models.save_model", lambda *saved: written.append(saved[3])
     )
-    monkeypatch.setattr("logvggt_jax.training.checkpoints.run_checkpoints.unstack_layers", lambda tree, *_: tree)
+    monkeypatch.setattr("logvggt_jax.training.checkpoints.run_models.unstack_layers", lambda tree, *_: tree)
     with RunCheckpoints(tmp_path / "run", run_config) as checkpoints:
         checkpoints.save(state, POSITION)
     training = from_mapping(Provenance, json.loads(json.dumps(written[0].to_dict())), "provenance").training
