@@ -179,13 +179,13 @@ def test_a_model_has_the_licences_of_what_it_was_made_of(
 
     def licence(config: TrainConfig) -> str | None:
         with RunCheckpoints(Path(run), config) as checkpoints:
-            return checkpoints._provenance(0).licence
+            return checkpoints.models._provenance(0).licence
 
     assert licence(run_config) is None
     assert licence(tuned) == "vggt-1b"
     assert licence(distilled) == "vggt-1b and cc-by-nc-4.0"
     with RunCheckpoints(Path(run), tuned) as checkpoints:
-        provenance = checkpoints._provenance(0)
+        provenance = checkpoints.models._provenance(0)
     shutil.rmtree(start)
     assert licence(tuned) is None
     (tmp_path / run / "model").mkdir()
@@ -287,10 +287,10 @@ def test_a_best_model_of_a_later_step_is_moved_aside_when_the_run_goes_back(
 
     monkeypatch.setattr(module, "save_model", keep)
     with RunCheckpoints(saved, run_config) as checkpoints:
-        assert checkpoints.best_step is None
+        assert checkpoints.models.best_step is None
         checkpoints.save_best(_at(state, 2))
         checkpoints.wait()
-        assert checkpoints.best_step == 2
+        assert checkpoints.models.best_step == 2
     assert _restore(saved, run_config, state)[0].step == 3 and (saved / "best").is_dir()
     _restore(saved, run_config, state, step=0)
     assert (saved / "best.aside").is_dir() and not (saved / "best").exists()
