@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from logvggt_jax.errors import InputError
-from logvggt_jax.reconstruction.point_cloud import (
+from logvggt_jax.reconstruction.points.selection import (
     VERTEX,
     FramePoints,
     PointFilter,
