@@ -1,4 +1,4 @@
-"""Coloured point clouds from depth maps, chosen and written frame by frame.
+"""The points of a sequence, chosen frame by frame.
 
 A first look at a frame, while depth and image are at hand, counts its candidates in a histogram of confidences and
 keeps a sample of them. When all frames have been seen, threshold and number of points are known, and most frames
@@ -9,30 +9,14 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import os
-import re
 import threading
-from collections.abc import Callable, Iterable, Mapping
-from pathlib import Path
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
 
-from logvggt_jax.errors import InputError, MissingInput
-from logvggt_jax.files import atomic_file, open_regular
-from logvggt_jax.geometry import unproject_pixels
-
-_COLOURED = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
-VERTEX = np.dtype([*_COLOURED, ("confidence", "<f4"), ("frame", "<i4")])
-# The other one is that of files of earlier versions.
-_VERTICES = (VERTEX, np.dtype(_COLOURED))
-_PLY_TYPES = {np.dtype("<f4"): "float", np.dtype("u1"): "uchar", np.dtype("<i4"): "int"}
-
-
-def _header(vertex: np.dtype, count: str) -> str:
-    properties = "".join(f"property {_PLY_TYPES[vertex[name]]} {name}\n" for name in vertex.names or ())
-    return f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}end_header\n"
-
+from logvggt_jax.reconstruction.points.frame_points import FramePoints, frame_points, stored_confidence
+from logvggt_jax.reconstruction.points.point_filter import PointFilter
 
 # Confidences are counted as float16, as which they are stored: a bin a value, up to infinity.
 _NUM_BINS = int(np.float16(np.inf).view(np.uint16))
@@ -42,84 +26,6 @@ _MOST_SAMPLES, _FEWEST_SAMPLES = 6_000_000, 64
 _LOOK_AHEAD = 4
 # Where a video does not say how long it is.
 _UNKNOWN_FRAMES = 10_000
-
-
-@dataclasses.dataclass(frozen=True)
-class PointFilter:
-    """Which pixels become points.
-
-    Attributes:
-      confidence_percentile: the share (percent) of candidate pixels, least confident first, that is left out.
-      edge_threshold: leave out pixels whose depth differs from a neighbour's by more than this fraction: between
-        foreground and background depth maps interpolate points where nothing is. None keeps them.
-      pixel_stride: take every n-th pixel of every n-th row.
-      max_points: upper bound; more are thinned at random, evenly over all frames. None for no bound.
-    """
-
-    confidence_percentile: float = 25.0
-    edge_threshold: float | None = 0.1
-    pixel_stride: int = 1
-    max_points: int | None = 2_000_000
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.confidence_percentile < 100:
-            raise InputError(f"confidence_percentile must be in [0, 100), got {self.confidence_percentile}")
-        if self.edge_threshold is not None and not self.edge_threshold > 0:
-            raise InputError(f"edge_threshold must be above 0, got {self.edge_threshold}")
-        if self.pixel_stride < 1:
-            raise InputError(f"pixel_stride must be at least 1 pixel, got {self.pixel_stride}")
-        if self.max_points is not None and self.max_points < 1:
-            raise InputError(f"max_points must be at least 1, got {self.max_points}")
-
-    def candidates(self, depth: np.ndarray, confidence: np.ndarray) -> np.ndarray:
-        """Pixels of a depth map [H, W] that may become points, whatever the threshold; bool [H, W]."""
-        chosen = np.zeros(depth.shape, bool)
-        chosen[:: self.pixel_stride, :: self.pixel_stride] = True
-        chosen &= np.isfinite(depth) & (depth > 1e-8) & np.isfinite(confidence)
-        if self.edge_threshold is not None:
-            chosen &= ~_edges(depth, self.edge_threshold)
-        return chosen
-
-
-class FramePoints(NamedTuple):
-    """Pixels of one frame and what lies there.
-
-    Attributes:
-      indices: [n] flat pixel indices.
-      depth: [n] float32 z-depth.
-      colours: [n, 3] uint8 RGB.
-      confidence: [n] float16, not negative.
-    """
-
-    indices: np.ndarray
-    depth: np.ndarray
-    colours: np.ndarray
-    confidence: np.ndarray
-
-    @property
-    def bins(self) -> np.ndarray:
-        """Bins [n] uint16 of the confidences."""
-        return self.confidence.view(np.uint16)
-
-    def at(self, places: np.ndarray) -> FramePoints:
-        """The points at these places of the list."""
-        return FramePoints(*(values[places] for values in self))
-
-
-class Cloud(NamedTuple):
-    """A point cloud as it is stored.
-
-    Attributes:
-      points: [M, 3] float32 in the world, all finite.
-      colours: [M, 3] uint8 RGB.
-      confidence: [M] float32; None in files of versions that did not store it.
-      frame: [M] int32, the number of the frame that a point is a pixel of, in rising order; None likewise.
-    """
-
-    points: np.ndarray
-    colours: np.ndarray
-    confidence: np.ndarray | None
-    frame: np.ndarray | None
 
 
 class _Sample(NamedTuple):
@@ -172,11 +78,13 @@ class PointSelection:
           image: [H, W, 3] uint8 RGB.
         """
         candidates = self._filter.candidates(depth, confidence).reshape(-1)
-        counts = np.bincount(_stored(confidence, np.flatnonzero(candidates)).view(np.uint16), minlength=_NUM_BINS)
+        counts = np.bincount(
+            stored_confidence(confidence, np.flatnonzero(candidates)).view(np.uint16), minlength=_NUM_BINS
+        )
         size = self._sample_size
         order = _random_order(frame, depth.size)[: _LOOK_AHEAD * size]
         places = np.flatnonzero(candidates[order])[:size].astype(np.int32)
-        sample = _Sample(_points(depth, confidence, image, order[places]), places, int(counts.sum()))
+        sample = _Sample(frame_points(depth, confidence, image, order[places]), places, int(counts.sum()))
         with self._lock:
             self._histogram += counts
             self._samples[frame] = sample.shortened(self._sample_size)
@@ -266,138 +174,13 @@ class PointSelection:
                 return sample.points.at(places[np.argsort(sample.points.indices[places])])
         depth, confidence, image = read()
         indices = np.flatnonzero(self._filter.candidates(depth, confidence))
-        indices = indices[_stored(confidence, indices).view(np.uint16) >= self.threshold_bin]
+        indices = indices[stored_confidence(confidence, indices).view(np.uint16) >= self.threshold_bin]
         if self.num_points < self.num_qualified:
             qualified = np.zeros(depth.size, bool)
             qualified[indices] = True
             order = _random_order(frame, depth.size)
             indices = np.sort(order[qualified[order]][:quota])
-        return _points(depth, confidence, image, indices)
-
-
-def frame_vertices(
-    points: FramePoints, size: tuple[int, int], intrinsics: np.ndarray, extrinsics: np.ndarray, frame: int
-) -> np.ndarray:
-    """Coloured points [n] of dtype `VERTEX` in the world.
-
-    Args:
-      points: [n] of one frame, in the order of its pixels.
-      size: (H, W) of the frame.
-      intrinsics: [3, 3] in its pixels.
-      extrinsics: [3|4, 4] world-to-camera.
-      frame: its number.
-    """
-    depth = np.zeros(size, np.float32)
-    depth.reshape(-1)[points.indices] = points.depth
-    positions = unproject_pixels(depth[None], intrinsics[None], extrinsics[None], points.indices)
-    vertices = np.empty(len(positions), VERTEX)
-    for axis, name in enumerate("xyz"):
-        vertices[name] = positions[:, axis]
-    for channel, name in enumerate(("red", "green", "blue")):
-        vertices[name] = points.colours[:, channel]
-    vertices["confidence"], vertices["frame"] = points.confidence, frame
-    return vertices
-
-
-def write_points(path: str | Path, most: int, frames: Iterable[np.ndarray]) -> None:
-    """Writes vertices, frame by frame, as a binary PLY file.
-
-    Args:
-      path: the PLY file.
-      most: number of vertices at most.
-      frames: arrays [n] of dtype `VERTEX`; each is written before the next is asked for.
-
-    Raises:
-      ValueError: `frames` hold more vertices.
-    """
-    written = 0
-    with atomic_file(path) as temporary, temporary.open("wb") as stream:
-        stream.write(_header(VERTEX, str(most)).encode())
-        for vertices in frames:
-            stream.write(vertices.data)
-            written += len(vertices)
-        if written > most:
-            raise ValueError(f"{path}: {most} vertices announced, {written} given")
-        stream.seek(0)
-        # As long as before: readers skip blanks.
-        stream.write(_header(VERTEX, str(written).rjust(len(str(most)))).encode())
-
-
-def count_points(path: str | Path) -> int:
-    """The number of vertices of a file that `write_points` has written, read from its header.
-
-    Raises:
-      MissingInput: no such file.
-      InputError: it is another file, or cut off.
-    """
-    return len(_stored_points(Path(path)))
-
-
-def read_points(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
-    """Points [M, 3] float32, all finite, and colours [M, 3] uint8 of such a file; errors as `count_points`."""
-    return read_cloud(path)[:2]
-
-
-def read_cloud(path: str | Path) -> Cloud:
-    """All that such a file holds; errors as `count_points`."""
-    vertices = _stored_points(Path(path))
-    points = np.stack([vertices[name] for name in "xyz"], axis=-1)
-    finite = np.isfinite(points).all(axis=1)
-    if not finite.all():
-        raise InputError(
-            f"{path} is damaged: {np.count_nonzero(~finite):,} of its {len(points):,} points are not finite; "
-            "reconstruct again"
-        )
-    colours = np.stack([vertices[name] for name in ("red", "green", "blue")], axis=-1)
-    if "frame" not in (vertices.dtype.names or ()):
-        return Cloud(points, colours, None, None)
-    confidence, frame = np.array(vertices["confidence"]), np.array(vertices["frame"])
-    if not np.isfinite(confidence).all() or (np.diff(frame) < 0).any() or (frame[:1] < 0).any():
-        raise InputError(f"{path} is damaged: its points' confidences or frames make no sense; reconstruct again")
-    return Cloud(points, colours, confidence, frame)
-
-
-def _stored_points(path: Path) -> np.ndarray:
-    """The vertices [M] of a file, mapped and not read."""
-    try:
-        with open_regular(path) as stream:
-            start, found = stream.read(2 * len(_header(VERTEX, ""))), os.fstat(stream.fileno()).st_size
-            # More digits could not be a size.
-            match = re.search(rb"element vertex ( *\d{1,18})\n", start)
-            count = int(match[1]) if match else 0
-            headers = {each: _header(each, match[1].decode()).encode() for each in _VERTICES} if match else {}
-            vertex = next((each for each, header in headers.items() if start.startswith(header)), None)
-            if vertex is None:
-                raise InputError(f"{path} is {_other_file(start)}: expected the output of `logvggt reconstruct`")
-            size = len(headers[vertex]) + count * vertex.itemsize
-            if found != size:
-                raise InputError(
-                    f"{path} is {'cut off' if found < size else 'longer than its header says'}: {count:,} points need "
-                    f"{size:,} bytes, it has {found:,}; copy it again or reconstruct again"
-                )
-            return np.memmap(stream, vertex, "r", len(headers[vertex]), (count,)) if count else np.empty(0, vertex)
-    except MissingInput:
-        raise MissingInput(f"{path} does not exist: expected the output of `logvggt reconstruct`") from None
-
-
-def _other_file(start: bytes) -> str:
-    """What a file is whose first bytes are not those of a cloud of ours."""
-    if not start:
-        return "empty"
-    if not start.startswith(b"ply"):
-        return "no PLY file"
-    return "cut off in its header" if b"end_header" not in start else "a PLY file of another program, or damaged"
-
-
-def _points(depth: np.ndarray, confidence: np.ndarray, image: np.ndarray, indices: np.ndarray) -> FramePoints:
-    colours = image.reshape(-1, 3)[indices]
-    return FramePoints(indices, depth.reshape(-1)[indices], colours, _stored(confidence, indices))
-
-
-def _stored(confidence: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """The confidences [n] float16 of some pixels, whose bits are their bins."""
-    values = np.clip(confidence.reshape(-1)[indices], 0.0, np.finfo(np.float16).max)
-    return np.abs(values).astype(np.float16)  # -0.0 would be a bin of its own
+        return frame_points(depth, confidence, image, indices)
 
 
 @functools.lru_cache(4)
@@ -408,17 +191,3 @@ def _permutation(count: int) -> np.ndarray:
 def _random_order(frame: int, count: int) -> np.ndarray:
     """All pixels [count] in an order of chance, another for each frame: one permutation, begun anywhere."""
     return np.roll(_permutation(count), np.random.default_rng(frame).integers(count))
-
-
-def _edges(depth: np.ndarray, threshold: float) -> np.ndarray:
-    """Pixels [H, W] next to a relative depth step above `threshold` to the right, left, below or above."""
-    edges = np.zeros(depth.shape, bool)
-    for axis in (0, 1):
-        low = [slice(None), slice(None)]
-        high = [slice(None), slice(None)]
-        low[axis], high[axis] = slice(None, -1), slice(1, None)
-        a, b = depth[tuple(low)], depth[tuple(high)]
-        step = np.abs(a - b) > threshold * np.minimum(np.abs(a), np.abs(b))
-        edges[tuple(low)] |= step
-        edges[tuple(high)] |= step
-    return edges
