@@ -53,10 +53,17 @@ class RunCheckpoints:
             self.models.check_own()
 
     def __enter__(self) -> RunCheckpoints:
-        """Raises InputError where another run uses the folder."""
+        """Raises InputError, on every process, where another run uses the folder or process 0 cannot."""
+        failure: InputError | None = None
         if jax.process_index() == 0:
-            self._lock = FolderLock(self.folder.parent, "start in another --workdir")
-            remove_scratch(self.folder.parent)
+            try:
+                self._lock = FolderLock(self.folder.parent, "start in another --workdir")
+                remove_scratch(self.folder.parent)
+            except InputError as error:
+                failure = error
+        if any_process(failure is not None):
+            self.__exit__()
+            raise failure or InputError(f"process 0 cannot use {self.folder.parent}; its output says why")
         return self
 
     def __exit__(self, *_: Any) -> None:

@@ -115,9 +115,9 @@ def make_train_step(
 
     A batch holds `images` uint8 [B, T, H, W, 3], `depth` [B, T, H, W], `intrinsics` [B, T, 3, 3], `extrinsics`
     [B, T, 4, 4], optionally `frame_mask` bool [B, T], and for a distillation the teacher's `confidence` [B, T, H, W].
-    Metrics are float32 scalars, equal on all devices. A
-    non-finite loss or gradient leaves parameters and moments as they were and is counted in the state; where it comes
-    from predictions or targets, `finite clips`, bool [B] and split as the batch is, says of which clips.
+    Metrics are float32 scalars, equal on all devices. A non-finite loss or gradient leaves parameters and moments as
+    they were and is counted in the state; where it comes from predictions or targets, `finite clips`, bool [B] and
+    split as the batch is, says of which clips.
 
     State and optimiser lie as `layout` says. `accumulate`: see `loss_and_gradients`. `average` is the decay of the
     moving average in a step, for a state that has one.

@@ -20,7 +20,7 @@ import pytest
 
 from logvggt_jax.config import from_mapping
 from logvggt_jax.errors import DiskError, InputError, OutputExists
-from logvggt_jax.training.checkpoints import checkpoint_files
+from logvggt_jax.training.checkpoints import checkpoint_files, run_checkpoints
 from logvggt_jax.training.checkpoints import run_models as module
 from logvggt_jax.training.checkpoints.checkpoint_files import Position
 from logvggt_jax.training.checkpoints.run_checkpoints import RunCheckpoints
@@ -442,3 +442,13 @@ def test_the_newest_are_kept_and_one_can_give_its_place(
         checkpoints.save(_at(state, 7), POSITION, in_place_of=6)
         checkpoints.wait()
         assert checkpoints.steps == [3, 7]
+
+
+def test_a_folder_that_process_0_cannot_use_is_an_error_of_the_others_too(
+    run_config: TrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(jax, "process_index", lambda: 1)
+    monkeypatch.setattr(run_checkpoints, "any_process", lambda wants: True)
+    with pytest.raises(InputError, match=r"process 0 cannot use .*run; its output says why"):
+        RunCheckpoints(tmp_path / "run", run_config).__enter__()
+    assert not (tmp_path / "run").exists()
