@@ -12,7 +12,7 @@ import jax
 import numpy as np
 import pytest
 
-from logvggt_jax.training.parallel import joining as processes
+from logvggt_jax.training.parallel import agreement
 from logvggt_jax.training.parallel.agreement import any_process, check_agreement
 from logvggt_jax.training.parallel.joining import check_processes, join_processes
 from logvggt_jax.training.reporting.metrics_log import read_metrics
@@ -67,7 +67,7 @@ def test_one_process_alone_answers_for_itself() -> None:
 def test_processes_that_differ_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(jax, "process_count", lambda: 3)
     monkeypatch.setattr(
-        processes.multihost_utils, "process_allgather", lambda digest: np.stack([digest, digest + 1, digest])
+        agreement.multihost_utils, "process_allgather", lambda digest: np.stack([digest, digest + 1, digest])
     )
     with pytest.raises(ValueError, match=r"the data of the processes \[1\] differ from those of process 0"):
         check_agreement("the data", {"a": 1})
