@@ -29,12 +29,12 @@ from logvggt_jax.errors import InputError, one_line
 from logvggt_jax.terminal import forgiving_streams
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.dry_run import described_mesh, dry_run
-from logvggt_jax.training.lifeline import Lifeline
 from logvggt_jax.training.loop import NonFiniteTraining, train
+from logvggt_jax.training.parallel.joining import JOIN_SECONDS, LOSS_SECONDS, check_processes, join_processes
+from logvggt_jax.training.parallel.lifeline import Lifeline
+from logvggt_jax.training.parallel.sharding import data_mesh, use_cpu_cores
 from logvggt_jax.training.preflight import preflight
-from logvggt_jax.training.processes import JOIN_SECONDS, LOSS_SECONDS, check_processes, join_processes
-from logvggt_jax.training.profile import ProfiledSteps
-from logvggt_jax.training.sharding import data_mesh, use_cpu_cores
+from logvggt_jax.training.reporting.profile import ProfiledSteps
 from logvggt_jax.training.source_text import with_sources
 
 _CONFIG = config_flags.DEFINE_config_file("config", None, "File with the run's settings.", lock_config=True)

@@ -27,9 +27,9 @@ from logvggt_jax import LogVGGT
 from logvggt_jax.data import Rooms
 from logvggt_jax.data.rooms.scenes import RoomScenes
 from logvggt_jax.training.config import TrainConfig
-from logvggt_jax.training.initialization import initial_parameters
-from logvggt_jax.training.program import make_program
-from logvggt_jax.training.sharding import data_mesh, put_batch
+from logvggt_jax.training.parallel.sharding import data_mesh, put_batch
+from logvggt_jax.training.step.initialization import initial_parameters
+from logvggt_jax.training.step.program import make_program
 
 HARD: dict[str, Any] = {
     "repetition": 0.5,

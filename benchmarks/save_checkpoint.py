@@ -21,11 +21,11 @@ import numpy as np
 from subject import tiny_configuration
 
 from logvggt_jax import LogVGGT
-from logvggt_jax.training.checkpoint_files import Position
-from logvggt_jax.training.checkpoints import RunCheckpoints
+from logvggt_jax.training.checkpoints.checkpoint_files import Position
+from logvggt_jax.training.checkpoints.run_checkpoints import RunCheckpoints
 from logvggt_jax.training.config import TrainConfig
-from logvggt_jax.training.program import abstract_parameters, make_program
-from logvggt_jax.training.sharding import data_mesh
+from logvggt_jax.training.parallel.sharding import data_mesh
+from logvggt_jax.training.step.program import abstract_parameters, make_program
 
 STEPS_AN_EPOCH = 800
 GOAL = 0.02

@@ -28,7 +28,7 @@ from logvggt_jax.metrics import NotMeasurable, depth_metrics, pose_accuracy, rel
 from logvggt_jax.metrics.trajectory import rms_radius
 from logvggt_jax.reconstruction.reconstruct import Reconstruction
 from logvggt_jax.reconstruction.room_sequence import read_room_sequence
-from logvggt_jax.training.metrics_log import FILE_NAME, read_metrics
+from logvggt_jax.training.reporting.metrics_log import FILE_NAME, read_metrics
 
 POINTS = 1_000_000
 # Views of the room from outside, in the direction in which the camera looked on average: degrees looked down.

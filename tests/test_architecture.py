@@ -32,6 +32,17 @@ ALLOWED: dict[str, set[str]] = {
     "reconstruction": {"geometry", "model", "data", "weights", "streaming"},
     "evaluation": {"geometry", "metrics", "model", "data", "weights", "streaming"},
 }
+# What each folder of `training` may import of it besides itself and `config.py`; the files above them may import all.
+TRAINING: dict[str, set[str]] = {
+    "losses": set(),
+    "parallel": set(),
+    "reporting": set(),
+    "step": {"losses", "parallel"},
+    "feeding": {"parallel", "step"},
+    "checkpoints": {"parallel", "step"},
+    "teaching": {"parallel", "feeding"},
+    "validation": {"parallel", "feeding"},
+}
 # `doctor` examines everything and is called by the command line alone.
 ENTRY_POINTS = {"__init__", "__main__", "cli", "doctor"}
 
@@ -63,6 +74,19 @@ def test_imports_go_one_way() -> None:
         allowed = set() if part in GROUND_FLOOR else ALLOWED[part]
         if forbidden := (others & {*ALLOWED, *ENTRY_POINTS}) - allowed:
             wrong.append(f"{name} imports {sorted(forbidden)}")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_imports_go_one_way_between_the_folders_of_training() -> None:
+    folders = {path.name for path in (PACKAGE / "training").iterdir() if (path / "__init__.py").exists()}
+    assert folders == set(TRAINING)
+    wrong = []
+    for name, path in sources().items():
+        part, *rest = name.split(".")[1:]
+        if part == "training" and rest[0] in TRAINING:
+            imported = {module.split(".")[2] for module in imported_modules(path) if ".training." in module}
+            if forbidden := imported - {rest[0], "config"} - TRAINING[rest[0]]:
+                wrong.append(f"{name} imports {sorted(forbidden)}")
     assert not wrong, "\n".join(wrong)
 
 

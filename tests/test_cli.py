@@ -22,7 +22,7 @@ from logvggt_jax.data import DATASETS
 from logvggt_jax.errors import DiskError
 from logvggt_jax.reconstruction import EXPORTERS, Reconstruction
 from logvggt_jax.reconstruction.exporters import Format
-from logvggt_jax.reconstruction.point_cloud import read_points
+from logvggt_jax.reconstruction.points.cloud_file import read_points
 from logvggt_jax.streaming import METHODS
 from logvggt_jax.weights.checkpoints import save_model
 from logvggt_jax.weights.provenance import Provenance

@@ -15,11 +15,11 @@ from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.data.feeding.holdouts import PUBLISHED
 from logvggt_jax.data.rooms.rooms import Rooms
 from logvggt_jax.training.config import TrainConfig
-from logvggt_jax.training.dry_run import abstract_clips
-from logvggt_jax.training.optimizer import learning_rate_schedule
-from logvggt_jax.training.program import abstract_parameters, make_program
-from logvggt_jax.training.sharding import check_batch_size, data_mesh
-from logvggt_jax.training.state import TrainState
+from logvggt_jax.training.parallel.sharding import check_batch_size, data_mesh
+from logvggt_jax.training.step.costs import abstract_clips
+from logvggt_jax.training.step.optimizer import learning_rate_schedule
+from logvggt_jax.training.step.program import abstract_parameters, make_program
+from logvggt_jax.training.step.state import TrainState
 from logvggt_jax.weights.folder import write_description
 from logvggt_jax.weights.provenance import Provenance
 

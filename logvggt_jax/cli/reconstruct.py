@@ -27,7 +27,7 @@ def _reconstruct(options: argparse.Namespace) -> int:
     from logvggt_jax.reconstruction.calibration import Calibration
     from logvggt_jax.reconstruction.exporters import check_formats
     from logvggt_jax.reconstruction.method import choose_method
-    from logvggt_jax.reconstruction.point_cloud import PointFilter
+    from logvggt_jax.reconstruction.points.point_filter import PointFilter
     from logvggt_jax.reconstruction.reconstruct import LONGER_EDGE, reconstruct
     from logvggt_jax.reconstruction.request import check_masks, check_request, describe
     from logvggt_jax.reconstruction.sources import open_source

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 def _export(options: argparse.Namespace) -> None:
     from logvggt_jax.reconstruction.exporters import export
-    from logvggt_jax.reconstruction.point_cloud import PointFilter
+    from logvggt_jax.reconstruction.points.point_filter import PointFilter
     from logvggt_jax.reconstruction.result import Reconstruction
 
     points = None if options.max_points is None else PointFilter(max_points=options.max_points or None)

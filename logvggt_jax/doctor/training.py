@@ -16,12 +16,12 @@ from logvggt_jax.doctor.subject import Subject, random_variables
 from logvggt_jax.model.parameters import stack_layers
 from logvggt_jax.operations import matmul_flops_per_second
 from logvggt_jax.training.config import LossConfig, OptimizerConfig
-from logvggt_jax.training.dry_run import step_flops
-from logvggt_jax.training.freezing import ENCODER
-from logvggt_jax.training.optimizer import make_optimizer
-from logvggt_jax.training.sharding import data_mesh, parameter_layout, replicated, split
-from logvggt_jax.training.state import TrainState, initial_state
-from logvggt_jax.training.step import make_loss_terms, make_train_step
+from logvggt_jax.training.parallel.sharding import data_mesh, parameter_layout, replicated, split
+from logvggt_jax.training.step.costs import step_flops
+from logvggt_jax.training.step.freezing import ENCODER
+from logvggt_jax.training.step.optimizer import make_optimizer
+from logvggt_jax.training.step.state import TrainState, initial_state
+from logvggt_jax.training.step.train_step import make_loss_terms, make_train_step
 
 # As configs/h20.py has them; what they are changes no time.
 _LOSS = LossConfig(

@@ -7,7 +7,7 @@ from logvggt_jax.reconstruction.exporters import EXPORTERS, export
 from logvggt_jax.reconstruction.exporters.tum import read_trajectory, write_trajectory
 from logvggt_jax.reconstruction.fusion.fuse import fuse
 from logvggt_jax.reconstruction.fusion.rescale import rescale
-from logvggt_jax.reconstruction.point_cloud import PointFilter
+from logvggt_jax.reconstruction.points.point_filter import PointFilter
 from logvggt_jax.reconstruction.reconstruct import reconstruct
 from logvggt_jax.reconstruction.result import Reconstruction
 from logvggt_jax.reconstruction.sources import Source, SourceFrame, SourceOptions, open_source

@@ -9,7 +9,7 @@ from logvggt_jax.frames import evenly_spaced
 from logvggt_jax.reconstruction.exporters.ply import write_cloud
 from logvggt_jax.reconstruction.exporters.tum import export_tum
 from logvggt_jax.reconstruction.frame_pool import FramePool
-from logvggt_jax.reconstruction.point_cloud import PointSelection
+from logvggt_jax.reconstruction.points.selection import PointSelection
 from logvggt_jax.reconstruction.previews import write_previews
 from logvggt_jax.reconstruction.result import (
     EXPORT_FOLDER,

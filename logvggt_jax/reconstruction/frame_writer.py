@@ -17,7 +17,7 @@ from logvggt_jax.reconstruction.depth_files import write_depth, write_picture
 from logvggt_jax.reconstruction.frame_pool import FramePool
 from logvggt_jax.reconstruction.health.recorder import HealthRecorder
 from logvggt_jax.reconstruction.health.report import HEALTH_FILE, HEALTH_PAGE, examine, without_harm, write_health
-from logvggt_jax.reconstruction.point_cloud import PointSelection
+from logvggt_jax.reconstruction.points.selection import PointSelection
 from logvggt_jax.reconstruction.result import DEPTH_FOLDER, IMAGE_FOLDER, Reconstruction, depth_file, image_file
 from logvggt_jax.reconstruction.sources.record import SourceRecord
 from logvggt_jax.reconstruction.watching import LiveResult

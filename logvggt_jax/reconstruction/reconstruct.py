@@ -32,7 +32,8 @@ from logvggt_jax.reconstruction.calibration import Calibration
 from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE
 from logvggt_jax.reconstruction.finishing import finish
 from logvggt_jax.reconstruction.frame_pool import FramePool
-from logvggt_jax.reconstruction.point_cloud import PointFilter, PointSelection
+from logvggt_jax.reconstruction.points.point_filter import PointFilter
+from logvggt_jax.reconstruction.points.selection import PointSelection
 from logvggt_jax.reconstruction.request import check_masks, check_request
 from logvggt_jax.reconstruction.result import Reconstruction
 from logvggt_jax.reconstruction.run import Run

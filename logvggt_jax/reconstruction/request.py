@@ -16,7 +16,8 @@ from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.operations import matmul_flops_per_second
 from logvggt_jax.reconstruction.calibration import Calibration
 from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE
-from logvggt_jax.reconstruction.point_cloud import VERTEX, PointFilter
+from logvggt_jax.reconstruction.points.cloud_file import VERTEX
+from logvggt_jax.reconstruction.points.point_filter import PointFilter
 from logvggt_jax.reconstruction.sources import Source
 from logvggt_jax.reconstruction.work_folder import is_unfinished
 from logvggt_jax.streaming import METHODS

@@ -11,7 +11,7 @@ from logvggt_jax.errors import InputError, disk_errors, printable
 from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE, read_cameras
 from logvggt_jax.reconstruction.depth_files import read_depth, read_picture
 from logvggt_jax.reconstruction.health.report import HEALTH_FILE, HEALTH_PAGE, Health, read_health
-from logvggt_jax.reconstruction.point_cloud import Cloud, count_points, read_cloud, read_points
+from logvggt_jax.reconstruction.points.cloud_file import Cloud, count_points, read_cloud, read_points
 from logvggt_jax.reconstruction.sources.record import SourceRecord
 from logvggt_jax.reconstruction.work_folder import is_unfinished
 

@@ -18,7 +18,7 @@ from logvggt_jax.reconstruction.calibration import Calibration
 from logvggt_jax.reconstruction.frame_pool import FramePool
 from logvggt_jax.reconstruction.frame_writer import FrameWriter, Picture
 from logvggt_jax.reconstruction.masking import mask_at, without_masked
-from logvggt_jax.reconstruction.point_cloud import PointSelection
+from logvggt_jax.reconstruction.points.selection import PointSelection
 from logvggt_jax.reconstruction.result import Reconstruction
 from logvggt_jax.reconstruction.sources import SkippedFrame, Source, SourceFrame
 from logvggt_jax.reconstruction.sources.record import record_source

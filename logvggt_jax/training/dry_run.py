@@ -1,4 +1,4 @@
-"""What a run's training step costs before anything is trained: compiled for abstract values, nothing is allocated."""
+"""What a run's steps need, said before anything is trained: for each stage and size, and how many clips would fit."""
 
 from __future__ import annotations
 
@@ -7,49 +7,20 @@ import functools
 import importlib.util
 import math
 import os
-import re
-import time
 from collections.abc import Callable
-from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.sharding import AxisType, Mesh
 
-from logvggt_jax.compile import device_bytes, out_of_device_memory
-from logvggt_jax.config import ModelConfig
+from logvggt_jax.compile import device_bytes
 from logvggt_jax.errors import InputError, MissingPackage, one_line
-from logvggt_jax.model.logvggt import LogVGGT
-from logvggt_jax.operations import count_flops
 from logvggt_jax.training.config import StageConfig, TrainConfig
-from logvggt_jax.training.program import abstract_parameters, make_program
-from logvggt_jax.training.sharding import DATA_AXIS, check_batch_size, split
+from logvggt_jax.training.parallel.sharding import DATA_AXIS, check_batch_size
+from logvggt_jax.training.step.costs import StepCosts, step_costs, step_flops
 
 _GIB = 2**30
 # Numbers of clips that a device takes at once, tried for the largest that fits: each is a compilation of minutes.
 _TRIED_CLIPS = (1, 2, 4, 8)
-_COLLECTIVE = re.compile(
-    r"= (.*?) (all-reduce|all-gather|reduce-scatter|all-to-all|collective-permute)(?:-start)?\(", re.MULTILINE
-)
-_ARRAY = re.compile(r"([a-z]+)(\d*)[a-z0-9]*\[([\d,]*)\]")
-
-
-@dataclasses.dataclass(frozen=True)
-class StepCosts:
-    """What a compiled step needs on each device, by the compiler's own account.
-
-    Attributes:
-      arguments: bytes of parameters, moments and the batch; the new state takes the old one's place.
-      temporaries: bytes at the most.
-      collectives: exchanges between devices, by name: how many and the bytes of their results.
-      compilation: seconds.
-    """
-
-    arguments: int
-    temporaries: int
-    collectives: dict[str, tuple[int, int]]
-    compilation: float
 
 
 def dry_run(config: TrainConfig, mesh: Mesh, say: Callable[[str], None] = print) -> None:
@@ -101,73 +72,6 @@ def described_mesh(topology: str) -> Mesh:
     return Mesh(np.array(devices), (DATA_AXIS,), axis_types=(AxisType.Auto,))
 
 
-def step_flops(config: ModelConfig, clips: tuple[int, ...]) -> float:
-    """Operations of a step on clips [B, T, H, W] over all devices: forward and gradient, nothing computed twice."""
-    model = LogVGGT(dataclasses.replace(config, attention="xla"))
-    params, images = abstract_parameters(config), jax.ShapeDtypeStruct((*clips, 3), jnp.uint8)
-    forward = count_flops(lambda p, x: model.apply({"params": p}, x), params, images)
-    encoder = count_flops(lambda p, x: model.windows.encode({"params": p}, x), params, images)
-    # The gradient of a product is two of the kind; a frozen encoder has none.
-    return 3 * forward - 2 * encoder if config.encoder.frozen else 3 * forward
-
-
-def step_costs(
-    config: TrainConfig, mesh: Mesh, clips: int, clip_length: int, size: tuple[int, int]
-) -> StepCosts | None:
-    """Compiles the step for `clips` a device; None where the compiler finds that they do not fit."""
-    params = abstract_parameters(config.model)
-    program = make_program(LogVGGT(config.model), config, params, mesh)
-    batch = jax.tree.map(
-        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=split(mesh)),
-        abstract_clips(clips * mesh.size, clip_length, size, taught=config.teacher is not None),
-    )
-    started = time.perf_counter()
-    try:
-        compiled = program.step.lower(program.abstract_state(params), batch).compile()
-    except jax.errors.JaxRuntimeError as error:
-        if out_of_device_memory(error):
-            return None
-        raise
-    memory: Any = compiled.memory_analysis()
-    return StepCosts(
-        arguments=memory.argument_size_in_bytes,
-        temporaries=memory.temp_size_in_bytes,
-        collectives=collectives(compiled.as_text() or ""),
-        compilation=time.perf_counter() - started,
-    )
-
-
-def abstract_clips(
-    batch: int, frames: int, size: tuple[int, int], *, taught: bool = False
-) -> dict[str, jax.ShapeDtypeStruct]:
-    """A batch as the training step takes it, without values; with a teacher's confidence where it is `taught`."""
-    confidence = {"confidence": jax.ShapeDtypeStruct((batch, frames, *size), jnp.float32)} if taught else {}
-    return {
-        **confidence,
-        "images": jax.ShapeDtypeStruct((batch, frames, *size, 3), jnp.uint8),
-        "depth": jax.ShapeDtypeStruct((batch, frames, *size), jnp.float32),
-        "intrinsics": jax.ShapeDtypeStruct((batch, frames, 3, 3), jnp.float32),
-        "extrinsics": jax.ShapeDtypeStruct((batch, frames, 4, 4), jnp.float32),
-    }
-
-
-def collectives(program: str) -> dict[str, tuple[int, int]]:
-    """Number and bytes of the exchanges between devices in a compiled program's text, by name.
-
-    One in a loop counts once. The training step exchanges its sums outside of all loops; parameters in parts are put
-    together within them.
-    """
-    found: dict[str, tuple[int, int]] = {}
-    for shapes, name in _COLLECTIVE.findall(program):
-        size = 0
-        for kind, bits, shape in _ARRAY.findall(shapes):
-            items = math.prod(int(side) for side in shape.split(",") if side)
-            size += items * (1 if kind == "pred" else int(bits) // 8)
-        count, total = found.get(name, (0, 0))
-        found[name] = count + 1, total + size
-    return found
-
-
 def _largest_that_fits(
     costs_of: Callable[[int, int, tuple[int, int]], StepCosts | None],
     mesh: Mesh,
@@ -181,17 +85,13 @@ def _largest_that_fits(
     numbers = [accumulate * clips for clips in _TRIED_CLIPS]
     for clips in numbers:
         costs = costs_of(clips, stage.clip_length, size)
-        if costs is None or not _fits(costs, limit):
+        if costs is None or not costs.fits(limit):
             break
         fitting = clips
     tried = f"of {', '.join(map(str, numbers))} clips a device at {size[0]}x{size[1]}"
     if not fitting:
         return f"none {tried} fits: fewer frames (clip_length) or smaller images (sizes) do"
     return f"{fitting} is the largest {tried} that fits, batch_size={fitting * mesh.size}"
-
-
-def _fits(costs: StepCosts, limit: int | None) -> bool:
-    return limit is None or costs.arguments + costs.temporaries <= limit
 
 
 def _described(costs: StepCosts | None, limit: int | None) -> str:
@@ -202,6 +102,6 @@ def _described(costs: StepCosts | None, limit: int | None) -> str:
     )
     return (
         f"arguments {costs.arguments / _GIB:.3g} GiB, temporaries {costs.temporaries / _GIB:.3g} GiB"
-        f"{'' if _fits(costs, limit) else ', which do not fit'}; {exchanged or 'no collectives'}; "
+        f"{'' if costs.fits(limit) else ', which do not fit'}; {exchanged or 'no collectives'}; "
         f"compiled in {costs.compilation:.0f} s"
     )

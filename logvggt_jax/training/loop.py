@@ -1,51 +1,46 @@
 """The training loop: stages, logging, validation, checkpoints, and a clean end whatever ends it."""
 
 import contextlib
-import math
 import time
-from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
-from absl import logging
 from jax.sharding import Mesh
 from rich.console import Console
 
-from logvggt_jax.compile import device_bytes, most_device_bytes, out_of_device_memory
+from logvggt_jax.compile import most_device_bytes
 from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.data.feeding.batches import BatchIterator
-from logvggt_jax.errors import InputError, one_line
 from logvggt_jax.interruption import StopRequest
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.operations import matmul_flops_per_second
-from logvggt_jax.training.batches import stage_batches
-from logvggt_jax.training.checkpoint_files import Position
-from logvggt_jax.training.checkpoints import RunCheckpoints
-from logvggt_jax.training.compilation import compiled_steps
-from logvggt_jax.training.config import VALIDATION_METRICS, StageConfig, TrainConfig
-from logvggt_jax.training.device_batches import DeviceBatches
-from logvggt_jax.training.distillation import open_data
-from logvggt_jax.training.dry_run import step_flops
-from logvggt_jax.training.initialization import initial_parameters
-from logvggt_jax.training.metrics_log import MetricsLog, read_metrics
-from logvggt_jax.training.processes import Vote, any_process, check_agreement, check_shared
-from logvggt_jax.training.profile import ProfiledSteps, Profiler
-from logvggt_jax.training.program import abstract_parameters, make_program
-from logvggt_jax.training.progress import IntervalMeans, RunTimes, duration, goodput, progress_line
-from logvggt_jax.training.sharding import check_batch_size
-from logvggt_jax.training.skipped import clips_to_blame, described
-from logvggt_jax.training.state import TrainState
-from logvggt_jax.training.step import Metrics
-from logvggt_jax.training.validation import Validation
-from logvggt_jax.training.wandb_run import WandbRun, load_wandb
-from logvggt_jax.training.watchdog import Watchdog
-
-# Steps handed to the device before the oldest has to be finished: enough to hide the host's work.
-STEPS_IN_FLIGHT = 2
-GIB = 2**30
+from logvggt_jax.training import steps_in_flight
+from logvggt_jax.training.checkpoints.checkpoint_files import Position
+from logvggt_jax.training.checkpoints.run_checkpoints import RunCheckpoints
+from logvggt_jax.training.config import StageConfig, TrainConfig
+from logvggt_jax.training.feeding.batches import stage_batches
+from logvggt_jax.training.feeding.device_batches import DeviceBatches
+from logvggt_jax.training.parallel.agreement import Vote, any_process, check_agreement, check_shared
+from logvggt_jax.training.parallel.sharding import check_batch_size
+from logvggt_jax.training.parallel.watchdog import Watchdog
+from logvggt_jax.training.reporting.intervals import report_interval
+from logvggt_jax.training.reporting.metrics_log import MetricsLog, read_metrics
+from logvggt_jax.training.reporting.profile import ProfiledSteps, Profiler
+from logvggt_jax.training.reporting.progress import duration, goodput
+from logvggt_jax.training.reporting.run_times import RunTimes
+from logvggt_jax.training.reporting.wandb_run import WandbRun, load_wandb
+from logvggt_jax.training.step.compilation import compiled_steps
+from logvggt_jax.training.step.costs import step_flops
+from logvggt_jax.training.step.device_memory import memory_explained
+from logvggt_jax.training.step.initialization import initial_parameters
+from logvggt_jax.training.step.program import abstract_parameters, make_program
+from logvggt_jax.training.step.state import TrainState
+from logvggt_jax.training.steps_in_flight import StepsInFlight
+from logvggt_jax.training.teaching.run_data import open_data
+from logvggt_jax.training.validation.earlier import is_best, is_validated
+from logvggt_jax.training.validation.validation import Validation, validation_line
 
 
 class NonFiniteTraining(RuntimeError):
@@ -105,6 +100,7 @@ class _Run:
 
     state: TrainState
     times: RunTimes
+    in_flight: StepsInFlight
     profiler: Profiler
 
     def __init__(
@@ -124,12 +120,7 @@ class _Run:
         self.peak = None
         if mesh.devices.flat[0].platform != "cpu":  # whose cores share one peak
             self.peak = mesh.size * matmul_flops_per_second(config.model.dtype)
-        self.means = IntervalMeans()
-        self.skipped = self.longest_skip = 0.0
-        # Clips of the latest updates left out in a row, and its last step.
-        self.blamed: list[str] = []
-        self.last_skip = -1
-        self.vote = Vote(mesh, delay=STEPS_IN_FLIGHT)
+        self.vote = Vote(mesh, delay=steps_in_flight.MOST)
 
     def start(self, resume_step: int | None) -> tuple[int, Position | None]:
         """Takes up a checkpoint, or the initial weights if there is none.
@@ -151,7 +142,7 @@ class _Run:
     ) -> None:
         """All stages that are not finished."""
         step, end = int(self.state.step), 0
-        self.skipped = float(self.state.skipped)
+        self.in_flight = StepsInFlight(skipped=int(self.state.skipped), step_ended=self.watchdog.step_ended)
         self.times = RunTimes(self.config, productive=log.productive_seconds, peak=self.peak)
         left: list[tuple[int, StageConfig, int, BatchIterator]] = []
         # All of them at once: data that do not fit the last stage are an error of the first minute.
@@ -170,17 +161,23 @@ class _Run:
             self._save(Position(0, left[0][3].get_state()))
             self.checkpoints.wait()
         # After a save, and again where the run was killed between the two.
-        if self._validation_is_due(step) and any_process(not log.silent and not _is_validated(log.path, step)):
+        if self._validation_is_due(step) and any_process(
+            not log.silent and not is_validated(read_metrics(log.path), step)
+        ):
             self._validate(step, log)
         for index, stage, end, source in left:
-            with source, DeviceBatches(source, self.mesh) as batches, self._device_memory(stage):
+            with (
+                source,
+                DeviceBatches(source, self.mesh) as batches,
+                memory_explained(stage, self.mesh, self.programs.values()),
+            ):
                 self._compile(stage, source.sizes, log)
                 step, ended = self._train_stage(index, stage, batches, step, end, log, stop)
             if ended:
                 break
         self.checkpoints.wait()
         log.say(
-            f"{step}/{self.config.total_steps} steps done; model in {self.checkpoints.model_folder}; "
+            f"{step}/{self.config.total_steps} steps done; model in {self.checkpoints.models.newest}; "
             f"{goodput(self.times.productive, time.time() - log.started)}"
         )
 
@@ -196,7 +193,6 @@ class _Run:
     ) -> tuple[int, bool]:
         """Steps up to `end`, or fewer if the run is to stop; the number of steps done, and whether it is to stop."""
         config = self.config
-        in_flight: deque[tuple[int, Metrics, jax.Array, list[str]]] = deque()
         logged = saved = step
         self.times.begin()
         while step < end:
@@ -206,7 +202,7 @@ class _Run:
             except Exception:
                 # Of several processes the others wait in a step that this one has no share for.
                 if jax.process_count() == 1 and step > saved:
-                    self._finish(in_flight)
+                    self.in_flight.finish()
                     if step > logged:
                         self._log(step, end, stage, batches.broken_clips, log)
                     self._save(Position(index, batches.get_state()))
@@ -216,17 +212,16 @@ class _Run:
             self.state, metrics, finite = program(self.state, batch)
             step += 1
             self.times.count(self.operations.get(batch["images"].shape, 0.0))
-            in_flight.append((step, metrics, finite, batches.names))
-            self._finish(in_flight, STEPS_IN_FLIGHT)
+            self.in_flight.add(step, metrics, finite, batches.names)
             if self.profiler.is_last(step):
-                self._finish(in_flight)
+                self.in_flight.finish()
                 self.profiler.stop()
 
             ending = self._reason_to_end(stop)
             saving = step % config.save_every == 0 or step == end or ending is not None
             # Intervals begin anew after a save, where a run that is killed goes on.
             if step % config.log_every == 0 or step == 1 or saving or self._failing():
-                self._finish(in_flight)
+                self.in_flight.finish()
                 self._log(step, end, stage, batches.broken_clips, log)
                 logged = step
             self.checkpoints.check()
@@ -243,39 +238,23 @@ class _Run:
                 return step, True
         return step, False
 
-    def _finish(self, in_flight: deque[tuple[int, Metrics, jax.Array, list[str]]], allowed: int = 0) -> None:
-        """Waits until no more than `allowed` steps are unfinished, and takes down what the finished ones say."""
-        while len(in_flight) > allowed:
-            step, metrics, finite, names = in_flight.popleft()
-            values = {name: float(value) for name, value in jax.device_get(metrics).items()}
-            self.watchdog.step_ended()
-            self.means.add(values)
-            if values["skipped"] > self.skipped:
-                self._blame(step, *clips_to_blame(finite, names))
-            self.skipped, self.longest_skip = values["skipped"], values["longest_skip"]
-
-    def _blame(self, step: int, clips: list[str], reason: str) -> None:
-        if step != self.last_skip + 1:
-            self.blamed.clear()
-        self.last_skip = step
-        self.blamed += [name for name in clips if name not in self.blamed]
-        logging.warning("step %d: update left out, %s %s", step, reason, described(clips))
-
     def _failing(self) -> bool:
-        return self.longest_skip >= self.config.max_skipped_in_a_row
+        return self.in_flight.longest_skip >= self.config.max_skipped_in_a_row
 
     def _fail(self, step: int, position: Position) -> None:
         """Saves, so that the same command goes on past the clips that were named, and raises."""
-        longest, row = self.longest_skip, int(self.state.skipped_in_a_row)
+        longest, row = self.in_flight.longest_skip, int(self.state.skipped_in_a_row)
         zero = jax.device_put(np.int32(0), self.state.step.sharding)
         self.state = self.state._replace(skipped_in_a_row=zero, longest_skip=zero)
+        with self.watchdog.other("the save"):  # before, which may still be on its way to the disk
+            self.checkpoints.wait()
         # A latest checkpoint with the very same parameters gives place, not the oldest: that may be the good one.
         latest = self.checkpoints.steps[-1]
         self._save(position, in_place_of=latest if step - latest <= row else None)
         self.checkpoints.wait()
         raise NonFiniteTraining(
             f"step {step}: {longest:.0f} updates in a row had a non-finite loss or gradient "
-            f"(max_skipped_in_a_row={self.config.max_skipped_in_a_row}), with {described(self.blamed)}; the same "
+            f"(max_skipped_in_a_row={self.config.max_skipped_in_a_row}), with {self.in_flight.blamed}; the same "
             "command goes on past them; if that does not help start a new --workdir with a lower "
             "optimizer.learning_rate, or resume from an earlier checkpoint with --resume_step"
         )
@@ -301,62 +280,11 @@ class _Run:
                     f"{number} of {len(new)}"
                 )
 
-    @contextlib.contextmanager
-    def _device_memory(self, stage: StageConfig) -> Iterator[None]:
-        """Turns a device's being out of memory into one line: what a step needs, and what lowers it."""
-        try:
-            yield
-        except jax.errors.JaxRuntimeError as error:
-            if not out_of_device_memory(error):
-                raise
-            raise InputError(
-                f"stage {stage.name!r} does not fit the memory of {self._memory()}: lower stages.{stage.name}."
-                f"batch_size={stage.batch_size} ({stage.batch_size // self.mesh.size} clips a device) or clip_length="
-                f"{stage.clip_length}, or train on more devices; --dry_run says what fits ({one_line(error):.200})"
-            ) from error
-
-    def _memory(self) -> str:
-        """A device, its memory, and what the largest step compiled so far needs of it."""
-        device = self.mesh.devices.flat[0]
-        limit, text = device_bytes(device), str(device.device_kind)
-        if limit is not None:
-            text += f", {limit / GIB:.1f} GiB"
-        known: list[Any] = [program.memory_analysis() for program in self.programs.values()]
-        needs = [memory.argument_size_in_bytes + memory.temp_size_in_bytes for memory in known if memory is not None]
-        return text + (f", where the largest step needs {max(needs) / GIB:.1f} GiB" if needs else "")
-
     def _log(self, step: int, end: int, stage: StageConfig, broken_clips: int, log: MetricsLog) -> None:
         """One line about the steps since the last one, all of which have finished."""
-        values = {**self.means.read(), "broken_clips": float(broken_clips)}
-        speed = self.times.read(stage)
-        log.write(step, {**values, "frames_per_second": speed.frames_per_second})
+        values = {**self.in_flight.means.read(), "broken_clips": float(broken_clips)}
         memory = most_device_bytes(self.mesh.local_devices)
-        stages = self.config.stages
-        stage_seconds = self.times.remaining_seconds(step, end)
-        run_seconds = self.times.remaining_seconds(step, compilations=len(stages) - 1 - stages.index(stage))
-        log.write_times(
-            step,
-            {
-                "productive_seconds": self.times.productive,
-                "data_share": speed.data_share,
-                "stage_seconds_left": stage_seconds,
-                "run_seconds_left": run_seconds,
-                **({} if speed.utilisation is None else {"utilisation": speed.utilisation}),
-                **({} if memory is None else {"device_gib": memory / GIB}),
-            },
-        )
-        log.say(
-            progress_line(
-                step,
-                self.config.total_steps,
-                stage.name,
-                values,
-                speed,
-                memory=memory,
-                stage_seconds=stage_seconds,
-                run_seconds=run_seconds,
-            )
-        )
+        report_interval(log, step, values, self.times, config=self.config, stage=stage, end=end, memory=memory)
 
     def _validation_is_due(self, step: int) -> bool:
         every = None if self.config.validation is None else self.config.validation.every
@@ -373,11 +301,7 @@ class _Run:
         log.show(step, pictures)
         log.write(step, values)
         log.say(
-            f"validation after step {step} ({duration(time.perf_counter() - started)}): "
-            f"abs_rel {values['validation/abs_rel']:.3f} (constant depth {values['validation/constant_abs_rel']:.3f}), "
-            f"delta<1.25 {values['validation/delta_1.25']:.3f}, "
-            f"rotation {values['validation/rotation']:.2f}° (identity {values['validation/identity_rotation']:.2f}°), "
-            f"direction {values['validation/translation_direction']:.1f}°{best}"
+            f"validation after step {step} ({duration(time.perf_counter() - started)}): {validation_line(values)}{best}"
         )
 
     def _keep_if_best(self, step: int, values: Mapping[str, float], log: MetricsLog) -> str:
@@ -386,8 +310,8 @@ class _Run:
         if name is None:
             return ""
         # Process 0 has the earlier values and decides.
-        better = not log.silent and _is_best(
-            read_metrics(log.path), step, f"validation/{name}", values, held=self.checkpoints.best_step
+        better = not log.silent and is_best(
+            read_metrics(log.path), step, name, values, held=self.checkpoints.models.best_step
         )
         if not any_process(better):
             return ""
@@ -403,20 +327,3 @@ class _Run:
             reason = f"max_minutes={self.config.max_minutes} are over"
         # A process that left alone would let the others wait for its share of the next step for ever.
         return (reason or "another process is to stop") if self.vote(reason is not None) else None
-
-
-def _is_best(
-    before: Sequence[Mapping[str, Any]], step: int, name: str, values: Mapping[str, float], held: int | None
-) -> bool:
-    """Whether the value of this step is better than that of the model that is `held`, of another step; None: of no one.
-
-    Where nothing is known of that step, it has to be better than every validation before. What is no number is not.
-    """
-    sign = 1.0 if VALIDATION_METRICS[name.removeprefix("validation/")] else -1.0
-    known = {line["step"]: sign * line[name] for line in before if line["step"] < step and line.get(name) is not None}
-    rivals = [] if held is None else [known[held]] if held in known else known.values()
-    return math.isfinite(values[name]) and sign * values[name] > max(rivals, default=-math.inf)
-
-
-def _is_validated(metrics: Path, step: int) -> bool:
-    return any(entry["step"] == step and "validation/abs_rel" in entry for entry in read_metrics(metrics))

@@ -21,16 +21,17 @@ from logvggt_jax.data.feeding.batches import training_batches
 from logvggt_jax.errors import InputError, one_line, printable
 from logvggt_jax.files import check_writable
 from logvggt_jax.model.logvggt import LogVGGT
-from logvggt_jax.training.batches import open_sources, stage_batches
-from logvggt_jax.training.checkpoint_files import Position
-from logvggt_jax.training.checkpoints import RunCheckpoints
+from logvggt_jax.training.checkpoints.checkpoint_files import Position
+from logvggt_jax.training.checkpoints.run_checkpoints import RunCheckpoints
 from logvggt_jax.training.config import SourceConfig, StageConfig, TeacherConfig, TrainConfig
-from logvggt_jax.training.distillation import label
-from logvggt_jax.training.dry_run import step_costs
-from logvggt_jax.training.processes import any_process, check_shared
-from logvggt_jax.training.program import abstract_parameters, make_program
-from logvggt_jax.training.sharding import DATA_AXIS, check_batch_size, split
-from logvggt_jax.training.teacher import PlainVGGT, Teacher
+from logvggt_jax.training.feeding.batches import stage_batches
+from logvggt_jax.training.feeding.sources import open_sources
+from logvggt_jax.training.parallel.agreement import any_process, check_shared
+from logvggt_jax.training.parallel.sharding import DATA_AXIS, check_batch_size, split
+from logvggt_jax.training.step.costs import step_costs
+from logvggt_jax.training.step.program import abstract_parameters, make_program
+from logvggt_jax.training.teaching.run_data import label
+from logvggt_jax.training.teaching.teacher import PlainVGGT, Teacher
 
 CLIPS = 20
 _EXCHANGED_BYTES = 2**26
@@ -180,7 +181,7 @@ def _compile(config: TrainConfig, stage: StageConfig, mesh: Mesh) -> str:
     name = f"{clips} clips a device of {stage.clip_length} frames at {size[0]}x{size[1]}"
     costs = step_costs(config, mesh, clips, stage.clip_length, size)
     limit = device_bytes(mesh.devices.flat[0])
-    if costs is None or (limit is not None and costs.arguments + costs.temporaries > limit):
+    if costs is None or not costs.fits(limit):
         raise InputError(f"{name} do not fit the memory of a device; --dry_run says what does")
-    needed = f"{(costs.arguments + costs.temporaries) / _GIB:.2f} GiB"
+    needed = f"{costs.memory / _GIB:.2f} GiB"
     return f"{name}, {needed}{'' if limit is None else f' of {limit / _GIB:.1f} GiB'}, compiled"

@@ -119,7 +119,7 @@ def _read_result(root: Path, output: Path) -> None:
     from logvggt_jax.geometry import camera_centres, is_rotation, matrix_to_quaternion
     from logvggt_jax.reconstruction.exporters import export
     from logvggt_jax.reconstruction.exporters.tum import read_trajectory
-    from logvggt_jax.reconstruction.point_cloud import read_points
+    from logvggt_jax.reconstruction.points.cloud_file import read_points
     from logvggt_jax.reconstruction.result import Reconstruction
 
     result = Reconstruction.open(root)

@@ -8,7 +8,7 @@ import numpy as np
 
 from logvggt_jax.reconstruction.cameras_file import write_cameras
 from logvggt_jax.reconstruction.depth_files import write_depth, write_picture
-from logvggt_jax.reconstruction.point_cloud import VERTEX, write_points
+from logvggt_jax.reconstruction.points.cloud_file import VERTEX, write_points
 
 SIZE = (24, 32)
 

@@ -14,7 +14,7 @@ from recorder import Recorder, reconstruct_recorded
 from logvggt_jax.geometry import unproject
 from logvggt_jax.reconstruction import PointFilter, Reconstruction
 from logvggt_jax.reconstruction.exporters.ply import export_ply
-from logvggt_jax.reconstruction.point_cloud import read_points
+from logvggt_jax.reconstruction.points.cloud_file import read_points
 from logvggt_jax.streaming import Cameras
 
 COUNT = 5

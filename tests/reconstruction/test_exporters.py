@@ -23,7 +23,7 @@ from logvggt_jax.geometry import camera_centres, invert, project, unproject_pixe
 from logvggt_jax.reconstruction import EXPORTERS, PointFilter, Reconstruction, export
 from logvggt_jax.reconstruction.exporters.frame_names import file_stems
 from logvggt_jax.reconstruction.exporters.original_depth import depth_at
-from logvggt_jax.reconstruction.point_cloud import read_points
+from logvggt_jax.reconstruction.points.cloud_file import read_points
 
 COUNT = 6
 FEW_POINTS = PointFilter(max_points=600)

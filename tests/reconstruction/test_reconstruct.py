@@ -22,7 +22,8 @@ from logvggt_jax.reconstruction import run as run_module
 from logvggt_jax.reconstruction.cameras_file import read_cameras
 from logvggt_jax.reconstruction.depth_files import read_depth
 from logvggt_jax.reconstruction.exporters.tum import read_trajectory
-from logvggt_jax.reconstruction.point_cloud import PointFilter, count_points
+from logvggt_jax.reconstruction.points.cloud_file import count_points
+from logvggt_jax.reconstruction.points.point_filter import PointFilter
 from logvggt_jax.reconstruction.reconstruct import reconstruct
 from logvggt_jax.reconstruction.result import Reconstruction
 from logvggt_jax.reconstruction.room_sequence import write_room_sequence

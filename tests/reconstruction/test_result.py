@@ -17,7 +17,8 @@ from logvggt_jax.geometry import camera_centres
 from logvggt_jax.reconstruction.depth_files import write_picture
 from logvggt_jax.reconstruction.exporters.ply import export_ply
 from logvggt_jax.reconstruction.exporters.tum import export_tum, read_trajectory
-from logvggt_jax.reconstruction.point_cloud import PointFilter, read_points
+from logvggt_jax.reconstruction.points.cloud_file import read_points
+from logvggt_jax.reconstruction.points.point_filter import PointFilter
 from logvggt_jax.reconstruction.result import Reconstruction
 
 

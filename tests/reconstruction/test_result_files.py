@@ -17,7 +17,7 @@ from logvggt_jax.geometry import camera_centres, invert, quaternion_to_matrix, r
 from logvggt_jax.reconstruction.cameras_file import read_cameras, write_cameras
 from logvggt_jax.reconstruction.depth_files import read_depth, read_picture, write_depth, write_picture
 from logvggt_jax.reconstruction.exporters.tum import read_trajectory, write_trajectory
-from logvggt_jax.reconstruction.point_cloud import read_points
+from logvggt_jax.reconstruction.points.cloud_file import read_points
 from logvggt_jax.reconstruction.room_sequence import read_room_sequence, write_room_sequence
 
 

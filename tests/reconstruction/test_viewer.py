@@ -17,7 +17,7 @@ from result_folder import write_result
 from room_result import write_room_result
 
 from logvggt_jax.errors import InputError, MissingPackage
-from logvggt_jax.reconstruction.point_cloud import VERTEX, write_points
+from logvggt_jax.reconstruction.points.cloud_file import VERTEX, write_points
 from logvggt_jax.reconstruction.result import Reconstruction
 from logvggt_jax.reconstruction.viewer import access_note, open_viewer
 from logvggt_jax.reconstruction.viewer.window import Window

@@ -9,7 +9,7 @@ import pytest
 from result_folder import write_result
 
 from logvggt_jax.colours import depth_picture
-from logvggt_jax.reconstruction.point_cloud import Cloud
+from logvggt_jax.reconstruction.points.cloud_file import Cloud
 from logvggt_jax.reconstruction.result import Reconstruction
 from logvggt_jax.reconstruction.viewer.colouring import colourings, level_limits, palette, point_colours, point_levels
 from logvggt_jax.reconstruction.viewer.detail import Detail

@@ -23,9 +23,9 @@ from jax.sharding import PartitionSpec as P
 from logvggt_jax import LogVGGT, ModelConfig, Predictions
 from logvggt_jax.model.parameters import whole
 from logvggt_jax.training.config import LossConfig, TrainConfig
-from logvggt_jax.training.program import make_program
-from logvggt_jax.training.sharding import data_mesh, parameter_layout, put_batch
-from logvggt_jax.training.step import loss_and_gradients, make_loss_terms
+from logvggt_jax.training.parallel.sharding import data_mesh, parameter_layout, put_batch
+from logvggt_jax.training.step.program import make_program
+from logvggt_jax.training.step.train_step import loss_and_gradients, make_loss_terms
 from logvggt_jax.weights.digests import whole_array
 
 Clips = dict[str, np.ndarray]

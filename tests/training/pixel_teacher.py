@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from logvggt_jax.training.teacher import Labels
+from logvggt_jax.training.teaching.labels import Labels
 
 
 class PixelTeacher:

@@ -19,7 +19,6 @@ from logvggt_jax.data.feeding.batches import training_batches
 from logvggt_jax.errors import InputError
 from logvggt_jax.metrics.depth import depth_metrics
 from logvggt_jax.training import loop
-from logvggt_jax.training import taught as module
 from logvggt_jax.training.config import (
     LossConfig,
     OptimizerConfig,
@@ -28,15 +27,17 @@ from logvggt_jax.training.config import (
     TrainConfig,
     ValidationConfig,
 )
-from logvggt_jax.training.distillation import label
-from logvggt_jax.training.losses import distilled_depth_losses
-from logvggt_jax.training.metrics_log import read_metrics
-from logvggt_jax.training.optimizer import make_optimizer
-from logvggt_jax.training.sharding import data_mesh, parameter_layout, put_batch
-from logvggt_jax.training.state import initial_state
-from logvggt_jax.training.step import make_loss_terms, make_train_step
-from logvggt_jax.training.taught import TaughtDataset, taught
-from logvggt_jax.training.teacher import PlainVGGT
+from logvggt_jax.training.losses.distillation import distilled_depth_losses
+from logvggt_jax.training.parallel.sharding import data_mesh, parameter_layout, put_batch
+from logvggt_jax.training.reporting.metrics_log import read_metrics
+from logvggt_jax.training.step.optimizer import make_optimizer
+from logvggt_jax.training.step.state import initial_state
+from logvggt_jax.training.step.train_step import make_loss_terms, make_train_step
+from logvggt_jax.training.teaching import labelling as module
+from logvggt_jax.training.teaching.labelling import taught
+from logvggt_jax.training.teaching.run_data import label
+from logvggt_jax.training.teaching.taught import TaughtDataset
+from logvggt_jax.training.teaching.teacher import PlainVGGT
 from logvggt_jax.weights.checkpoints import save_model
 from logvggt_jax.weights.folder import write_description
 from logvggt_jax.weights.provenance import Provenance

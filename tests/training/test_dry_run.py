@@ -12,11 +12,12 @@ import jax
 import pytest
 
 from logvggt_jax.errors import InputError, MissingPackage
-from logvggt_jax.operations import count_flops
 from logvggt_jax.training import dry_run as module
 from logvggt_jax.training.config import TrainConfig
-from logvggt_jax.training.dry_run import StepCosts, abstract_clips, collectives, dry_run, step_costs, step_flops
-from logvggt_jax.training.sharding import data_mesh
+from logvggt_jax.training.dry_run import dry_run
+from logvggt_jax.training.parallel.sharding import data_mesh
+from logvggt_jax.training.step import costs
+from logvggt_jax.training.step.costs import StepCosts, step_costs
 
 ROOT = Path(__file__).parents[2]
 SIZE = (28, 42)
@@ -36,8 +37,8 @@ def config(monkeypatch: pytest.MonkeyPatch) -> TrainConfig:
 def quick(monkeypatch: pytest.MonkeyPatch, layered: Any, layered_params: Any) -> list[tuple[int, ...]]:
     """Runs have a model that compiles at once; the clips whose operations, which are none of its, were asked for."""
     asked: list[tuple[int, ...]] = []
-    monkeypatch.setattr(module, "LogVGGT", lambda _: layered)
-    monkeypatch.setattr(module, "abstract_parameters", lambda _: jax.eval_shape(lambda: layered_params))
+    monkeypatch.setattr(costs, "LogVGGT", lambda _: layered)
+    monkeypatch.setattr(costs, "abstract_parameters", lambda _: jax.eval_shape(lambda: layered_params))
     monkeypatch.setattr(module, "step_flops", lambda _, clips: asked.append(clips) or 3e12)
     return asked
 
@@ -47,11 +48,11 @@ def tried(quick: list[tuple[int, ...]], monkeypatch: pytest.MonkeyPatch) -> list
     """Numbers of clips a device whose steps were asked for; each takes five bytes, and ten a clip."""
     asked: list[int] = []
 
-    def costs(config: TrainConfig, mesh: object, clips: int, clip_length: int, size: object) -> StepCosts:
+    def given(config: TrainConfig, mesh: object, clips: int, clip_length: int, size: object) -> StepCosts:
         asked.append(clips)
         return StepCosts(5, 10 * clips, {}, 0.0)
 
-    monkeypatch.setattr(module, "step_costs", costs)
+    monkeypatch.setattr(module, "step_costs", given)
     return asked
 
 
@@ -71,29 +72,15 @@ def test_a_step_is_described_and_nothing_is_allocated(
         assert word in lines[1]
     assert "is not known" in lines[2], "a CPU does not say how much memory a program may use"
 
-    (costs,) = found
-    assert costs is not None
-    params = module.abstract_parameters(config.model)
+    (step,) = found
+    assert step is not None
+    params = costs.abstract_parameters(config.model)
     size = {name: sum(4 * leaf.size for leaf in jax.tree.leaves(tree)) for name, tree in params.items()}
     trained = sum(size.values()) - size["encoder"]
-    exchanged = sum(total for _, total in costs.collectives.values())
+    exchanged = sum(total for _, total in step.collectives.values())
     # A compiler may leave out sums of what is zero everywhere, of the frozen encoder; there are numbers for the log.
     assert trained <= exchanged < sum(size.values()) + 1_000
-    assert costs.arguments > sum(size.values()) + 2 * trained, "parameters, two moments, a batch"
-
-
-def test_operations_grow_with_the_clips_and_what_is_trained(
-    config: TrainConfig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    counted: list[float] = []
-    monkeypatch.setattr(module, "count_flops", lambda *given: counted.append(count_flops(*given)) or counted[-1])
-    one, four = (step_flops(config.model, (clips, 2, *SIZE)) for clips in (1, 4))
-    assert four == pytest.approx(4 * one, rel=1e-3)
-    forward, encoder = counted[:2]
-    assert 0 < encoder < forward and one == 3 * forward - 2 * encoder
-    monkeypatch.setattr(module, "count_flops", lambda *_: counted.pop(0))
-    trained = dataclasses.replace(config.model.encoder, frozen=False)
-    assert step_flops(dataclasses.replace(config.model, encoder=trained), (1, 2, *SIZE)) == 3 * forward
+    assert step.arguments > sum(size.values()) + 2 * trained, "parameters, two moments, a batch"
 
 
 @pytest.mark.parametrize(
@@ -120,33 +107,9 @@ def test_clips_that_are_accumulated_are_tried_in_whole_parts(
     assert tried == [2, 4, 8] and "4 is the largest of 2, 4, 8, 16 clips a device" in lines[-1]
 
 
-@pytest.mark.usefixtures("quick")
-def test_what_the_compiler_refuses_does_not_fit(config: TrainConfig, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object, **__: object) -> None:
-        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Ran out of memory in memory space hbm")
-
-    monkeypatch.setattr(jax.stages.Lowered, "compile", refuse)
-    assert step_costs(config, data_mesh(1), 1, 2, SIZE) is None
-
-
-def test_collectives_are_read_from_the_program() -> None:
-    program = """
-      %all-reduce.1 = (f32[10,2]{1,0}, bf16[3]{0}) all-reduce(%a, %b), replica_groups={{0,1}}
-      %all-reduce-start = f32[] all-reduce-start(%c)
-      %all-reduce-done = f32[] all-reduce-done(%all-reduce-start)
-      ROOT %g = pred[7]{0} all-gather(%d)
-    """
-    assert collectives(program) == {"all-reduce": (2, 80 + 6 + 4), "all-gather": (1, 7)}
-
-
 def test_batches_have_to_split_over_the_devices(config: TrainConfig) -> None:
     with pytest.raises(InputError, match="batch_size=4 does not split over 3 devices"):
         dry_run(config, data_mesh(3))
-
-
-def test_clips_have_the_shapes_of_a_batch() -> None:
-    batch = abstract_clips(2, 3, SIZE)
-    assert {name: value.shape[:2] for name, value in batch.items()} == dict.fromkeys(batch, (2, 3))
 
 
 def test_an_unknown_slice_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from logvggt_jax.training.config import TrainConfig
-from logvggt_jax.training.metrics_log import read_metrics
+from logvggt_jax.training.reporting.metrics_log import read_metrics
 from logvggt_jax.weights.checkpoints import load_model, read_provenance
 from logvggt_jax.weights.digests import digests
 
@@ -28,9 +28,10 @@ import jax
 jax.config.update("jax_num_cpu_devices", 2)
 sys.path.insert(0, sys.argv[3])
 from conftest import PixelModel
-from logvggt_jax.training import checkpoint_files, loop
+from logvggt_jax.training.checkpoints import checkpoint_files
+from logvggt_jax.training import loop
 from logvggt_jax.training.config import TrainConfig
-from logvggt_jax.training.sharding import data_mesh
+from logvggt_jax.training.parallel.sharding import data_mesh
 settings, params = pickle.loads(Path(sys.argv[1]).read_bytes())
 config = TrainConfig.from_dict(settings)
 loop.LogVGGT = lambda _: PixelModel(config.model)

@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 import signal
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,17 +21,19 @@ from logvggt_jax.errors import InputError
 from logvggt_jax.interruption import StopRequest
 from logvggt_jax.model.parameters import stack_layers
 from logvggt_jax.training import loop
-from logvggt_jax.training.checkpoint_files import Position
-from logvggt_jax.training.checkpoints import RunCheckpoints
+from logvggt_jax.training.checkpoints import run_checkpoints
+from logvggt_jax.training.checkpoints.checkpoint_files import Position
+from logvggt_jax.training.checkpoints.run_checkpoints import RunCheckpoints
 from logvggt_jax.training.config import VALIDATION_METRICS, SourceConfig, TrainConfig, ValidationConfig
-from logvggt_jax.training.device_batches import DeviceBatches
+from logvggt_jax.training.feeding.device_batches import DeviceBatches
 from logvggt_jax.training.loop import NonFiniteTraining, train
-from logvggt_jax.training.metrics_log import MetricsLog, read_metrics
-from logvggt_jax.training.profile import ProfiledSteps
-from logvggt_jax.training.program import Program, make_program
-from logvggt_jax.training.sharding import data_mesh
-from logvggt_jax.training.state import TrainState
-from logvggt_jax.training.validation import Judgement
+from logvggt_jax.training.parallel.sharding import data_mesh
+from logvggt_jax.training.reporting.metrics_log import MetricsLog, read_metrics
+from logvggt_jax.training.reporting.profile import ProfiledSteps
+from logvggt_jax.training.step.program import Program, make_program
+from logvggt_jax.training.step.state import TrainState
+from logvggt_jax.training.validation.earlier import is_best
+from logvggt_jax.training.validation.validation import Judgement
 from logvggt_jax.weights.checkpoints import digests, load_model, read_provenance
 
 UNTIMED = ("time", "frames_per_second")
@@ -209,7 +212,7 @@ def test_changed_leaf_is_refused_by_its_digest(
     true = digests(state.params)
     with RunCheckpoints(tmp_path, run_config) as checkpoints, pytest.MonkeyPatch.context() as patch:
         # What Orbax stores differs from what was digested, as after a flipped byte.
-        patch.setattr("logvggt_jax.training.checkpoint_files.digests", lambda tree: true)
+        patch.setattr("logvggt_jax.training.checkpoints.checkpoint_files.digests", lambda tree: true)
         wrong = {**state.params, "camera_head": jax.tree.map(lambda x: x + 1, state.params["camera_head"])}
         checkpoints.save(state._replace(params=wrong), Position(1, {}))
         checkpoints.wait()
@@ -319,7 +322,7 @@ def test_a_step_that_does_not_fit_says_what_it_needs_and_what_lowers_it(
         "compiled_steps",
         lambda *given, **named: [step._replace(run=Refusing(step.run)) for step in compiled(*given, **named)],
     )
-    monkeypatch.setattr(loop, "device_bytes", lambda device: 3 * 2**30)
+    monkeypatch.setattr("logvggt_jax.training.step.device_memory.device_bytes", lambda device: 3 * 2**30)
     if reason.startswith("INTERNAL"):
         with pytest.raises(jax.errors.JaxRuntimeError, match="broken"):
             train(run_config, tmp_path, mesh=data_mesh(2))
@@ -381,7 +384,7 @@ def test_the_best_model_is_compared_with_the_one_that_is_kept() -> None:
     lines = [{"step": 0, "validation/abs_rel": 0.2}, {"step": 3, "validation/abs_rel": 0.4}]
     name = "validation/abs_rel"
     judged = {
-        held: [loop._is_best(lines, 6, name, {name: value}, held) for value in (0.1, 0.3, 0.5, float("nan"))]
+        held: [is_best(lines, 6, "abs_rel", {name: value}, held) for value in (0.1, 0.3, 0.5, float("nan"))]
         for held in (None, 0, 3, 9)
     }
     assert judged == {
@@ -456,7 +459,7 @@ def test_a_save_or_a_validation_that_fails_says_so_before_the_first_step(
         raise OSError("cannot be done")
 
     if failing == "save":
-        monkeypatch.setattr("logvggt_jax.training.checkpoints.write_checkpoint", fail)
+        monkeypatch.setattr("logvggt_jax.training.checkpoints.run_checkpoints.write_checkpoint", fail)
     else:
         monkeypatch.setattr(loop.Validation, "__call__", fail)
     monkeypatch.setattr(loop._Run, "_compile", lambda *_: pytest.fail("no step is to be compiled"))
@@ -578,3 +581,27 @@ def test_useless_restarts_do_not_push_good_checkpoints_out(
         with RunCheckpoints(tmp_path, config) as checkpoints:
             # Of the same parameters one is kept, the newest.
             assert checkpoints.steps == [0, step]
+
+
+def test_a_save_that_is_under_way_when_updates_fail_gives_place_to_the_next(
+    run_config: TrainConfig, pixel_model: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(loop, "LogVGGT", lambda _: DazzledModel(pixel_model.config, pixel_model))
+    read, write = ClipReader.__call__, run_checkpoints.write_checkpoint
+
+    def reading(reader: ClipReader, index: int, sequence: str) -> dict[str, Any]:
+        clip = read(reader, index, sequence)
+        # Those of the fourth step, one after a save.
+        return {**clip, "images": np.zeros_like(clip["images"])} if index in (6, 7) else clip
+
+    def slow(folder: Path, *given: Any) -> None:
+        time.sleep(1 if folder.name == "3" else 0)
+        write(folder, *given)
+
+    monkeypatch.setattr(ClipReader, "__call__", reading)
+    monkeypatch.setattr(run_checkpoints, "write_checkpoint", slow)
+    config = dataclasses.replace(run_config, max_skipped_in_a_row=1)
+    with pytest.raises(NonFiniteTraining, match="step 4: 1 updates in a row"):
+        train(config, tmp_path, mesh=data_mesh(1))
+    # The step that was left out changed nothing of what was saved after the third.
+    assert RunCheckpoints(tmp_path, config).steps == [0, 4]

@@ -10,11 +10,11 @@ from pixel_teacher import PixelTeacher
 from logvggt_jax.data.registry import open_dataset
 from logvggt_jax.errors import DiskError, InputError
 from logvggt_jax.training import preflight as module
-from logvggt_jax.training.checkpoints import RunCheckpoints
+from logvggt_jax.training.checkpoints.run_checkpoints import RunCheckpoints
 from logvggt_jax.training.config import TeacherConfig, TrainConfig
-from logvggt_jax.training.dry_run import StepCosts
+from logvggt_jax.training.parallel.sharding import data_mesh
 from logvggt_jax.training.preflight import preflight
-from logvggt_jax.training.sharding import data_mesh
+from logvggt_jax.training.step.costs import StepCosts
 
 
 @pytest.fixture

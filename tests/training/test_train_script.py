@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from logvggt_jax.training.metrics_log import read_metrics
+from logvggt_jax.training.reporting.metrics_log import read_metrics
 from logvggt_jax.weights.checkpoints import load_model, read_provenance
 
 ROOT = Path(__file__).parents[2]

@@ -16,7 +16,7 @@ from logvggt_jax.cli import main
 from logvggt_jax.errors import InputError, MissingInput, OutputExists
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.model.parameters import unstack_layers
-from logvggt_jax.training.initialization import initial_parameters
+from logvggt_jax.training.step.initialization import initial_parameters
 from logvggt_jax.weights import from_pretrained, load_model, read_provenance, resolve, save_model, shipped_models
 from logvggt_jax.weights.half_precision import PARAMETERS_FILE, rounded
 from logvggt_jax.weights.provenance import Provenance, TrainingRecord

@@ -28,7 +28,7 @@ from logvggt_jax.reconstruction.exporters.original_depth import DEPTH_INDEX
 from logvggt_jax.reconstruction.exporters.ply import export_ply
 from logvggt_jax.reconstruction.exporters.rosbag import export_rosbag
 from logvggt_jax.reconstruction.exporters.tum import export_tum
-from logvggt_jax.reconstruction.point_cloud import PointFilter
+from logvggt_jax.reconstruction.points.point_filter import PointFilter
 from logvggt_jax.reconstruction.result import EXPORT_FOLDER, Reconstruction
 
 

@@ -10,7 +10,10 @@ from rich.console import Console
 from rich.progress import track
 
 from logvggt_jax.reconstruction.frame_pool import FramePool
-from logvggt_jax.reconstruction.point_cloud import FramePoints, PointFilter, PointSelection, frame_vertices
+from logvggt_jax.reconstruction.points.cloud_file import frame_vertices
+from logvggt_jax.reconstruction.points.frame_points import FramePoints
+from logvggt_jax.reconstruction.points.point_filter import PointFilter
+from logvggt_jax.reconstruction.points.selection import PointSelection
 from logvggt_jax.reconstruction.result import Reconstruction
 
 Item = TypeVar("Item")

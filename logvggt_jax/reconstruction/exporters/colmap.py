@@ -15,7 +15,7 @@ from logvggt_jax.reconstruction.exporters.libraries import library
 from logvggt_jax.reconstruction.exporters.pictures import Pictures
 from logvggt_jax.reconstruction.exporters.tracks import Tracks, find_tracks
 from logvggt_jax.reconstruction.frame_pool import FramePool
-from logvggt_jax.reconstruction.point_cloud import PointFilter
+from logvggt_jax.reconstruction.points.point_filter import PointFilter
 from logvggt_jax.reconstruction.result import Reconstruction
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from logvggt_jax.files import atomic_file
 from logvggt_jax.reconstruction.exporters.libraries import library
 from logvggt_jax.reconstruction.exporters.original_depth import original_depth, write_depth_folder
-from logvggt_jax.reconstruction.point_cloud import PointFilter
+from logvggt_jax.reconstruction.points.point_filter import PointFilter
 from logvggt_jax.reconstruction.result import Reconstruction
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from logvggt_jax.data.feeding.transforms import ResizeTransform
 from logvggt_jax.files import atomic_file
 from logvggt_jax.reconstruction.exporters.original_depth import depth_at, write_depth_folder
-from logvggt_jax.reconstruction.point_cloud import PointFilter
+from logvggt_jax.reconstruction.points.point_filter import PointFilter
 from logvggt_jax.reconstruction.result import Reconstruction
 
 

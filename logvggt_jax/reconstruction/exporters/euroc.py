@@ -8,7 +8,7 @@ import numpy as np
 
 from logvggt_jax.files import write_text
 from logvggt_jax.geometry import camera_centres, matrix_to_quaternion
-from logvggt_jax.reconstruction.point_cloud import PointFilter
+from logvggt_jax.reconstruction.points.point_filter import PointFilter
 from logvggt_jax.reconstruction.result import Reconstruction
 
 _HEADER = "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []"

@@ -14,7 +14,7 @@ from logvggt_jax.geometry import invert, matrix_to_quaternion
 from logvggt_jax.reconstruction.exporters.cloud import frame_cloud, select_points
 from logvggt_jax.reconstruction.exporters.libraries import library
 from logvggt_jax.reconstruction.frame_pool import FramePool
-from logvggt_jax.reconstruction.point_cloud import PointFilter
+from logvggt_jax.reconstruction.points.point_filter import PointFilter
 from logvggt_jax.reconstruction.result import Reconstruction
 
 _NUM_POINTS = 500_000

@@ -8,7 +8,7 @@ import numpy as np
 
 from logvggt_jax.files import write_text
 from logvggt_jax.geometry import invert
-from logvggt_jax.reconstruction.point_cloud import PointFilter
+from logvggt_jax.reconstruction.points.point_filter import PointFilter
 from logvggt_jax.reconstruction.result import Reconstruction
 
 

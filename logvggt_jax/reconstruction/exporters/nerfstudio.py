@@ -15,7 +15,7 @@ from logvggt_jax.reconstruction.exporters.frame_names import file_stems
 from logvggt_jax.reconstruction.exporters.pictures import Pictures
 from logvggt_jax.reconstruction.exporters.ply import export_ply
 from logvggt_jax.reconstruction.exporters.tracks import NUM_POINTS
-from logvggt_jax.reconstruction.point_cloud import PointFilter
+from logvggt_jax.reconstruction.points.point_filter import PointFilter
 from logvggt_jax.reconstruction.result import Reconstruction
 
 _POINTS = "points.ply"

@@ -9,7 +9,9 @@ import numpy as np
 
 from logvggt_jax.reconstruction.exporters.cloud import frame_cloud, select_points
 from logvggt_jax.reconstruction.frame_pool import FramePool
-from logvggt_jax.reconstruction.point_cloud import PointFilter, PointSelection, write_points
+from logvggt_jax.reconstruction.points.cloud_file import write_points
+from logvggt_jax.reconstruction.points.point_filter import PointFilter
+from logvggt_jax.reconstruction.points.selection import PointSelection
 from logvggt_jax.reconstruction.result import Reconstruction
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from logvggt_jax.geometry import project
 from logvggt_jax.reconstruction.exporters.cloud import frame_cloud, select_points, tracked
 from logvggt_jax.reconstruction.frame_pool import FramePool
-from logvggt_jax.reconstruction.point_cloud import PointFilter
+from logvggt_jax.reconstruction.points.point_filter import PointFilter
 from logvggt_jax.reconstruction.result import Reconstruction
 
 NUM_POINTS = 100_000

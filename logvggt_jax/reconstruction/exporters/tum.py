@@ -11,7 +11,7 @@ import numpy as np
 from logvggt_jax.errors import InputError
 from logvggt_jax.files import open_regular, write_text
 from logvggt_jax.geometry import as_matrix, camera_centres, invert, matrix_to_quaternion, quaternion_to_matrix
-from logvggt_jax.reconstruction.point_cloud import PointFilter
+from logvggt_jax.reconstruction.points.point_filter import PointFilter
 from logvggt_jax.reconstruction.result import Reconstruction
 
 # Numbers whose squares are infinite in float32 are no lengths, and what is shorter than this has lost its direction.

@@ -14,7 +14,9 @@ from logvggt_jax.reconstruction.calibration import Calibration
 from logvggt_jax.reconstruction.finishing import finish
 from logvggt_jax.reconstruction.frame_pool import FramePool
 from logvggt_jax.reconstruction.frame_writer import FrameWriter, Picture
-from logvggt_jax.reconstruction.point_cloud import VERTEX, PointFilter, PointSelection
+from logvggt_jax.reconstruction.points.cloud_file import VERTEX
+from logvggt_jax.reconstruction.points.point_filter import PointFilter
+from logvggt_jax.reconstruction.points.selection import PointSelection
 from logvggt_jax.reconstruction.result import Reconstruction
 from logvggt_jax.reconstruction.work_folder import WorkFolder
 from logvggt_jax.streaming import FrameResult, Predictor

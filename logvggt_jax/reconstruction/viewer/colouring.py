@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from logvggt_jax.colours import COLOUR_MAP, coloured, depth_levels
-from logvggt_jax.reconstruction.point_cloud import Cloud
+from logvggt_jax.reconstruction.points.cloud_file import Cloud
 from logvggt_jax.reconstruction.result import Reconstruction
 
 IMAGE, DEPTH, CONFIDENCE, TIME = "image", "depth", "confidence", "time"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from logvggt_jax.reconstruction.point_cloud import Cloud
+from logvggt_jax.reconstruction.points.cloud_file import Cloud
 
 # A browser turns so many smoothly; they are 16 bytes each on their way there.
 MOST_SHOWN = 2_000_000

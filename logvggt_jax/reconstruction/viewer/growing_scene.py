@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from logvggt_jax.geometry import decode_poses
-from logvggt_jax.reconstruction.point_cloud import PointFilter
+from logvggt_jax.reconstruction.points.point_filter import PointFilter
 from logvggt_jax.reconstruction.watching import LiveResult
 
 # All points together, and the frames that they are from.

@@ -18,7 +18,7 @@ from logvggt_jax.files import check_writable, write_text
 from logvggt_jax.frames import evenly_spaced
 from logvggt_jax.geometry import camera_centres
 from logvggt_jax.reconstruction.depth_files import encode_picture
-from logvggt_jax.reconstruction.point_cloud import Cloud
+from logvggt_jax.reconstruction.points.cloud_file import Cloud
 from logvggt_jax.reconstruction.previews import depth_range
 from logvggt_jax.reconstruction.result import IMAGE_FOLDER, Reconstruction
 from logvggt_jax.reconstruction.viewer.colouring import IMAGE, colourings, level_limits, palette, point_levels

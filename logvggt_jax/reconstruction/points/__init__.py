@@ -1,0 +1,1 @@
+"""Coloured point clouds: which pixels become points, the choice among all frames, the file."""

@@ -1,0 +1,232 @@
+"""Checkpoints from which a run goes on as if it had not stopped."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from absl import logging
+
+from logvggt_jax.errors import DiskError, InputError, disk_errors, one_line
+from logvggt_jax.files import FolderLock, check_space, write_text
+from logvggt_jax.training.checkpoints.checkpoint_files import (
+    DamagedCheckpoint,
+    Position,
+    StoredCheckpoint,
+    write_checkpoint,
+)
+from logvggt_jax.training.checkpoints.run_models import RunModels
+from logvggt_jax.training.checkpoints.same_run import check_configuration
+from logvggt_jax.training.checkpoints.work_folder import remove_scratch
+from logvggt_jax.training.config import TrainConfig
+from logvggt_jax.training.parallel.agreement import any_process
+from logvggt_jax.training.step.state import TrainState
+from logvggt_jax.weights.digests import whole_array
+
+_BEGIN_ANEW = "start a new --workdir"
+
+
+class RunCheckpoints:
+    """The checkpoints `<workdir>/checkpoints/<step>` and the model folders `<workdir>/model` and `<workdir>/best`; a
+    context manager.
+
+    While entered, the folder is this run's alone. Saves are written in the background, by process 0. A checkpoint
+    appears under its name only when complete, see `checkpoint_files`. What `restore` passes over stays, under the name
+    `<step>.aside`. A model folder that another run or a conversion wrote is never replaced: OutputExists.
+    """
+
+    def __init__(self, workdir: Path, config: TrainConfig) -> None:
+        self.config = config
+        self.folder = workdir.expanduser().absolute() / "checkpoints"
+        self.models = RunModels(self.folder.parent, config)
+        self._honoured = self.folder / "resumed.json"
+        self._lock: FolderLock | None = None
+        self._writer = ThreadPoolExecutor(1, "checkpoints")
+        self._pending: Future[None] | None = None
+        # A model without checkpoints is this run's if it was killed before its first one was complete.
+        if not self.steps:
+            self.models.check_own()
+
+    def __enter__(self) -> RunCheckpoints:
+        """Raises InputError, on every process, where another run uses the folder or process 0 cannot."""
+        failure: InputError | None = None
+        if jax.process_index() == 0:
+            try:
+                self._lock = FolderLock(self.folder.parent, "start in another --workdir")
+                remove_scratch(self.folder.parent)
+            except InputError as error:
+                failure = error
+        if any_process(failure is not None):
+            self.__exit__()
+            raise failure or InputError(f"process 0 cannot use {self.folder.parent}; its output says why")
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        """Ends after the last save; whoever must know how it went calls `wait` before."""
+        self._writer.shutdown(wait=True)
+        if self._pending is not None and (failure := self._pending.exception()) is not None:
+            logging.error("the last save failed: %s", one_line(failure))
+        if self._lock is not None:
+            self._lock.release()
+
+    @property
+    def steps(self) -> list[int]:
+        """Steps that have a complete checkpoint, oldest first."""
+        return sorted(int(entry.name) for entry in self.folder.glob("*") if entry.name.isdecimal())
+
+    def save(self, state: TrainState, position: Position, *, in_place_of: int | None = None) -> None:
+        """Begins to replace the model folder and to write the checkpoint of `state.step`, and returns.
+
+        The state may be donated as soon as this returns: copies are on the host of process 0, once. Raises what kept
+        the save before from being written, see `wait`. The checkpoint `in_place_of` goes when this one is complete.
+        """
+        self.wait()
+        copies = self._copied(state)
+        if jax.process_index() == 0:
+            self._pending = self._writer.submit(self._write, copies, position, in_place_of)
+
+    def save_best(self, state: TrainState) -> None:
+        """Begins to replace the model folder `best` by this state's parameters, and returns; as `save`."""
+        self.wait()
+        params, step = self._copied(state.averaged), int(state.step)
+        if jax.process_index() == 0:
+            self._pending = self._writer.submit(self._write_best, params, step)
+
+    def check(self) -> None:
+        """Raises on process 0 what kept a save from being written, as soon as that is known; waits for nothing."""
+        if self._pending is not None and self._pending.done() and self._pending.exception() is not None:
+            self._pending.result()
+
+    def wait(self) -> None:
+        """Returns when the last save is complete; raises on every process what kept process 0 from writing it.
+
+        All processes have to call this at the same point.
+        """
+        pending, self._pending = self._pending, None
+        failure = None if pending is None else pending.exception()
+        if any_process(failure is not None):
+            raise failure or DiskError(f"process 0 could not save to {self.folder}; its output says why")
+
+    def restore(self, like: TrainState, *, step: int | None = None) -> tuple[TrainState, Position]:
+        """The state at `step` (None: the latest that is not damaged), with the shapes and placement of `like`.
+
+        A `step` is gone back to once: the same request of a command that is started again goes on from the latest.
+        Checkpoints of later steps, and damaged ones, are moved aside, with a `best` model of a later step, and a
+        warning says so.
+
+        Raises InputError naming step, path and the other steps there are: no such checkpoint, one of another
+        configuration, or DamagedCheckpoint where `step` is damaged or all are.
+        """
+        steps = self.steps
+        if step is not None and step == self._went_back_to() and steps:
+            logging.warning(
+                "--resume_step=%d was honoured before: going on from the latest; to go back once more, remove %s",
+                step,
+                self._honoured,
+            )
+            step = None
+        if not steps or (step is not None and step not in steps):
+            raise InputError(f"{self.folder}: no checkpoint of step {step}; there are {steps or 'none'}")
+        candidates = list(reversed(steps)) if step is None else [step]
+        for chosen in candidates:
+            try:
+                state, position = self._restore(chosen, like)
+            except DamagedCheckpoint as error:
+                if chosen == candidates[-1]:
+                    others = [other for other in steps if other not in candidates]
+                    mend = f"resume from another with --resume_step (there are {others})" if others else _BEGIN_ANEW
+                    raise DamagedCheckpoint(f"{error}; {mend}") from error
+                logging.error("%s; going on from the checkpoint before it", one_line(error))
+            else:
+                break
+        if jax.process_index() == 0:
+            with disk_errors(self.folder):
+                discarded = [other for other in steps if other > chosen]
+                for later in discarded:
+                    aside = _set_aside(self.folder / str(later))
+                    logging.warning("the run goes on from step %d; that of step %d moved to %s", chosen, later, aside)
+                best = self.models.best_step
+                if discarded and best is not None and best > chosen:
+                    aside = _set_aside(self.models.best)
+                    logging.warning("the run goes on from step %d; best model, of %d, moved to %s", chosen, best, aside)
+                if step is not None:
+                    write_text(self._honoured, json.dumps({"resume_step": step}))
+        return state, position
+
+    @staticmethod
+    def _copied(tree: Any) -> Any:
+        """Arrays on the host of process 0, nothing on the others; all have to call this at the same point."""
+
+        def copied(leaf: Any) -> np.ndarray | None:
+            whole = whole_array(leaf)
+            # Always a copy: on a CPU it could be the very memory that the next step writes to.
+            return np.array(whole) if jax.process_index() == 0 else None
+
+        return jax.tree.map(copied, tree)
+
+    def _restore(self, step: int, like: TrainState) -> tuple[TrainState, Position]:
+        """Raises DamagedCheckpoint on every process where one of them finds damage."""
+        problem: DamagedCheckpoint | None = None
+        stored, state = None, like
+        try:
+            stored = StoredCheckpoint(self.folder / str(step))
+            check_configuration(stored, self.config)
+            state = stored.read(like, self.config)
+        except DamagedCheckpoint as error:
+            problem = error
+        # Comparison needs all of them.
+        if any_process(problem is not None) or stored is None:
+            raise problem or DamagedCheckpoint(f"checkpoint of step {step} cannot be read by another process")
+        try:
+            state = stored.verified(state)
+        except DamagedCheckpoint as error:
+            problem = error
+        if any_process(problem is not None):
+            raise problem or DamagedCheckpoint(f"{stored.where} is damaged, as another process finds")
+        return state, stored.position
+
+    def _write(self, state: TrainState, position: Position, in_place_of: int | None) -> None:
+        step = int(state.step)
+        _check_room(self.folder / str(step), (state, state.averaged))
+        # First, so that a run that is killed in between goes on from an older checkpoint and writes both again.
+        self.models.write(self.models.newest, state.averaged, step)
+        write_checkpoint(self.folder / str(step), state, position, self.config)
+        newest = [kept for kept in self.steps if kept != in_place_of][-self.config.keep_checkpoints :]
+        for old in {*self.steps} - {step, *newest}:
+            # Under another name first: what is deleted by half must not look like a checkpoint.
+            leaving = self.folder / f".{old}.old"
+            (self.folder / str(old)).rename(leaving)
+            shutil.rmtree(leaving, ignore_errors=True)
+
+    def _write_best(self, params: Any, step: int) -> None:
+        _check_room(self.models.best, params)
+        self.models.write(self.models.best, params, step)
+
+    def _went_back_to(self) -> int | None:
+        """The step that an earlier start of this run was told to go back to, and did."""
+        try:
+            found: int | None = json.loads(self._honoured.read_text())["resume_step"]
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):
+            return None
+        return found
+
+
+def _check_room(path: Path, tree: Any) -> None:
+    """Raises DiskError where these arrays do not fit; the library that writes would say so in hundreds of lines."""
+    needed = sum(leaf.nbytes for leaf in jax.tree.leaves(tree))
+    check_space(path, needed, "make room, and the same command goes on from the last checkpoint")
+
+
+def _set_aside(folder: Path) -> Path:
+    """Gives a checkpoint or a model a name that no other has, under which it is none."""
+    path, number = folder.with_name(f"{folder.name}.aside"), 1
+    while path.exists():
+        number += 1
+        path = folder.with_name(f"{folder.name}.aside{number}")
+    folder.rename(path)
+    return path

@@ -1,0 +1,85 @@
+"""The model folders that a run leaves."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from logvggt_jax.errors import InputError, OutputExists
+from logvggt_jax.model.parameters import unstack_layers
+from logvggt_jax.training.config import TrainConfig
+from logvggt_jax.weights.checkpoints import check_destination, read_licence, read_provenance, save_model
+from logvggt_jax.weights.folder import is_model_folder
+from logvggt_jax.weights.provenance import Provenance, TrainingRecord
+
+
+class RunModels:
+    """The models `<workdir>/model`, of the newest checkpoint, and `<workdir>/best`, of the best validation.
+
+    Attributes:
+      newest, best: their folders.
+    """
+
+    def __init__(self, workdir: Path, config: TrainConfig) -> None:
+        """Raises OutputExists where one of the folders is something else than a model."""
+        self.newest, self.best = workdir / "model", workdir / "best"
+        self._workdir, self._config = workdir, config
+        # Now rather than after the steps before the first save.
+        for folder in (self.newest, self.best):
+            check_destination(folder)
+
+    @property
+    def best_step(self) -> int | None:
+        """The step of the model in `best`; None without one."""
+        record = read_provenance(self.best).training if is_model_folder(self.best) else None
+        return None if record is None else record.steps
+
+    def check_own(self) -> None:
+        """Raises OutputExists for a model that another run or a conversion wrote, by its provenance."""
+        for folder in filter(is_model_folder, (self.newest, self.best)):
+            source = read_provenance(folder).source or "source not recorded"
+            if not source.endswith(self._here):
+                raise OutputExists(
+                    f"{folder}: a model that this run did not write ({source}) would be replaced; start in another "
+                    "--workdir or move it away"
+                )
+
+    def write(self, folder: Path, params: Any, step: int) -> None:
+        """Replaces one of the folders by these parameters, which are on the host, deep stacks as one."""
+        save_model(folder, self._config.model, unstack_layers(params, self._config.model), self._provenance(step))
+
+    @property
+    def _here(self) -> str:
+        return f" in {self._workdir}"
+
+    @property
+    def _source(self) -> str:
+        return f"trained from {self._config.initial_weights or 'random parameters'}{self._here}"
+
+    @functools.cached_property
+    def _licence(self) -> str | None:
+        """Of the weights that the run started from and of its teacher's, which its own are made of, as far as known."""
+        teacher = self._config.teacher
+        found: list[str | None] = []
+        # Either may be gone, or its hub out of reach, when a run goes on.
+        for weights in (self._config.initial_weights, None if teacher is None else teacher.weights):
+            with contextlib.suppress(InputError):
+                found.append(None if weights is None else read_licence(weights))
+        if terms := " and ".join(dict.fromkeys(filter(None, found))):
+            return terms
+        earlier = read_provenance(self.newest) if is_model_folder(self.newest) else Provenance()
+        return earlier.licence if earlier.source == self._source else None
+
+    def _provenance(self, step: int) -> Provenance:
+        longer_edge = max(max(size) for stage in self._config.stages for size in stage.sizes)
+        record = TrainingRecord(
+            configuration=self._config.to_dict(),
+            data=", ".join(f"{source.name} ({source.split})" for source in self._config.data.sources),
+            steps=step,
+            device=f"{jax.device_count()} x {jax.devices()[0].device_kind}",
+        )
+        return Provenance("windows", longer_edge, self._licence, self._source, record)

@@ -1,0 +1,119 @@
+"""What processes that train together have to agree on: all ask at the same point, and all hear the same.
+
+A process alone agrees with itself, at once.
+"""
+
+import hashlib
+import json
+import platform
+import secrets
+import time
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental import multihost_utils
+from jax.sharding import Mesh
+
+from logvggt_jax.errors import InputError, one_line
+from logvggt_jax.files import write_text
+from logvggt_jax.training.parallel.sharding import replicated, split
+
+# A network file system shows a new file to other machines after so long.
+SHARED_SECONDS = 60.0
+
+
+def any_process(wants: bool) -> bool:
+    """Whether this is true of at least one process; all processes have to ask at the same point."""
+    return bool(np.any(from_all(np.array(wants))))
+
+
+def from_all(values: np.ndarray) -> np.ndarray:
+    """The `values` of every process, [processes, …], of one shape; all processes have to ask at the same point."""
+    if jax.process_count() == 1:
+        return values[None]
+    return np.asarray(multihost_utils.process_allgather(values))
+
+
+class Vote:
+    """Whether some process wants to stop, asked in every step without waiting for an answer.
+
+    All processes cast a vote in the same steps, and each reads the answer `delay` steps later, when the devices are
+    done with it: so all of them stop after the same step.
+    """
+
+    def __init__(self, mesh: Mesh, *, delay: int) -> None:
+        self._mesh, self._delay = mesh, delay
+        self._any = jax.jit(jnp.any, out_shardings=replicated(mesh))
+        self._cast: deque[jax.Array] = deque()
+
+    def __call__(self, wants: bool) -> bool:
+        """Casts this step's vote; whether one was for stopping `delay` steps ago. A process alone has its own way."""
+        if jax.process_count() == 1:
+            return wants
+        local = np.full(len(self._mesh.local_devices), wants)
+        self._cast.append(self._any(jax.make_array_from_process_local_data(split(self._mesh), local)))
+        return len(self._cast) > self._delay and bool(self._cast.popleft())
+
+
+def check_agreement(what: str, value: Any) -> None:
+    """Raises InputError on every process unless `value` (JSON types) is the same on all of them.
+
+    All processes have to ask at the same point.
+    """
+    if jax.process_count() == 1:
+        return
+    digest = hashlib.sha256(json.dumps(value, sort_keys=True).encode()).digest()
+    rows = multihost_utils.process_allgather(np.frombuffer(digest, np.uint8))
+    odd = [process for process, row in enumerate(rows) if not np.array_equal(row, rows[0])]
+    if odd:
+        raise InputError(
+            f"{what} of the processes {odd} differ from those of process 0: let all see the same folders (their logs "
+            "name what was left out)"
+        )
+
+
+def check_shared(folder: Path) -> None:
+    """Raises InputError on every process unless all see the same `folder`, which is made.
+
+    Process 0 writes a token there, and the others have to find it within `SHARED_SECONDS`. All processes have to ask
+    at the same point.
+    """
+    if jax.process_count() == 1:
+        return
+    drawn = multihost_utils.process_allgather(np.frombuffer(secrets.token_bytes(8), np.uint8))[0]
+    token = folder / f".shared-{drawn.tobytes().hex()}"
+    failure: InputError | None = None
+    try:
+        if jax.process_index() == 0:
+            folder.mkdir(parents=True, exist_ok=True)
+            write_text(token, platform.node())
+    except (OSError, InputError) as error:
+        failure = InputError(f"{folder}: process 0 cannot write there ({one_line(error)})")
+    if any_process(failure is not None):
+        raise failure or InputError(f"{folder}: process 0 cannot write there; its output says why")
+    seen = _within(SHARED_SECONDS, token.is_file)
+    blind = [int(p) for p in np.flatnonzero(~multihost_utils.process_allgather(np.array(seen)).ravel())]
+    if jax.process_index() == 0:
+        token.unlink(missing_ok=True)
+    # A process that ends now ends the others too: not before the token is gone.
+    any_process(False)
+    if blind:
+        raise InputError(
+            f"--workdir={folder} of the processes {blind} is another folder than that of process 0, on a disk of "
+            "their own machine: name one that all machines share"
+        )
+
+
+def _within(seconds: float, condition: Callable[[], bool]) -> bool:
+    """Whether `condition` comes true in time."""
+    end = time.monotonic() + seconds
+    while not condition():
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.2)
+    return True

@@ -1,0 +1,56 @@
+"""The steps between two log lines, on the terminal and in both files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from logvggt_jax.training.config import StageConfig, TrainConfig
+from logvggt_jax.training.reporting.metrics_log import MetricsLog
+from logvggt_jax.training.reporting.progress import progress_line
+from logvggt_jax.training.reporting.run_times import RunTimes
+
+
+def report_interval(
+    log: MetricsLog,
+    step: int,
+    values: Mapping[str, float],
+    times: RunTimes,
+    *,
+    config: TrainConfig,
+    stage: StageConfig,
+    end: int,
+    memory: int | None,
+) -> None:
+    """Ends the interval of `times` with `step`, which has finished as all before it have, and says what it was like.
+
+    `values` are its means, `stage` is the one that its steps belong to, with `end` its last step; `memory` is the most
+    bytes that a device of this process held.
+    """
+    speed = times.read(stage)
+    log.write(step, {**values, "frames_per_second": speed.frames_per_second})
+    stage_seconds = times.remaining_seconds(step, end)
+    later = len(config.stages) - 1 - config.stages.index(stage)
+    run_seconds = times.remaining_seconds(step, compilations=later)
+    log.write_times(
+        step,
+        {
+            "productive_seconds": times.productive,
+            "data_share": speed.data_share,
+            "stage_seconds_left": stage_seconds,
+            "run_seconds_left": run_seconds,
+            **({} if speed.utilisation is None else {"utilisation": speed.utilisation}),
+            **({} if memory is None else {"device_gib": memory / 2**30}),
+        },
+    )
+    log.say(
+        progress_line(
+            step,
+            config.total_steps,
+            stage.name,
+            values,
+            speed,
+            memory=memory,
+            stage_seconds=stage_seconds,
+            run_seconds=run_seconds,
+        )
+    )

@@ -1,0 +1,129 @@
+"""Scalars and pictures of a run: JSON lines, TensorBoard and the terminal, written by process 0."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+from rich.console import Console
+from tensorboardX import SummaryWriter
+
+from logvggt_jax.files import write_text
+from logvggt_jax.training.reporting.wandb_run import WandbRun
+
+FILE_NAME = "metrics.jsonl"
+# Beside the metrics, which are the same however often a run was interrupted.
+TIMES_NAME = "times.jsonl"
+
+
+class MetricsLog:
+    """Appends to `metrics.jsonl`, `times.jsonl` and `tensorboard/` of a work folder; a context manager.
+
+    Attributes:
+      started: when the run began for the first time, seconds since 1970.
+      productive_seconds: what earlier sessions spent on the steps that are left of them.
+
+    On a run that resumes at `first_step`, lines of later steps (of the run that was interrupted) are dropped, so
+    that the file reads like one uninterrupted run.
+    """
+
+    def __init__(
+        self,
+        workdir: Path,
+        *,
+        first_step: int,
+        console: Console,
+        silent: bool = False,
+        wandb: WandbRun | None = None,
+    ) -> None:
+        """Args: `silent` writes and says nothing, as is right for all processes of a run but the first; `wandb` gets
+        what TensorBoard gets."""
+        self.path = workdir / FILE_NAME
+        self.console = console
+        self.silent = silent
+        self._wandb = wandb
+        self.started, self.productive_seconds = time.time(), 0.0
+        if silent:
+            return
+        workdir.mkdir(parents=True, exist_ok=True)
+        times = workdir / TIMES_NAME
+        for path in (self.path, times):
+            _drop_later_lines(path, first_step)
+        self._file, self._times = self.path.open("a"), times.open("a")
+        self._tensorboard = SummaryWriter(str(workdir / "tensorboard"), purge_step=first_step + 1)
+        known = read_metrics(times)
+        if known:
+            self.started = known[0]["time"]
+            self.productive_seconds = known[-1]["productive_seconds"]
+        else:
+            self.write_times(first_step, {"productive_seconds": 0.0})
+
+    def __enter__(self) -> MetricsLog:
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        if not self.silent:
+            self._file.close()
+            self._times.close()
+            self._tensorboard.close()
+
+    def write(self, step: int, values: dict[str, float]) -> None:
+        """Appends one line {"step", "time" (seconds since 1970), …}; non-finite values become null."""
+        if not self.silent:
+            self._append(self._file, step, values)
+            self._draw(step, values)
+
+    def write_times(self, step: int, values: dict[str, float]) -> None:
+        """The same for what differs from one machine and session to the next, in a file of its own."""
+        if not self.silent:
+            self._append(self._times, step, values)
+            self._draw(step, {f"times/{name}": value for name, value in values.items()})
+
+    def show(self, step: int, pictures: Mapping[str, np.ndarray]) -> None:
+        """Pictures by name, [h, w, 3] uint8 RGB."""
+        if self.silent:
+            return
+        for name, picture in pictures.items():
+            self._tensorboard.add_image(name, picture, step, dataformats="HWC")
+        if self._wandb is not None:
+            self._wandb.show(step, pictures)
+
+    def _append(self, file: TextIO, step: int, values: dict[str, float]) -> None:
+        finite = {name: value if math.isfinite(value) else None for name, value in values.items()}
+        file.write(json.dumps({"step": step, "time": round(time.time(), 3), **finite}) + "\n")
+        file.flush()
+
+    def _draw(self, step: int, values: dict[str, float]) -> None:
+        finite = {name: value for name, value in values.items() if math.isfinite(value)}
+        for name, value in finite.items():
+            self._tensorboard.add_scalar(name, value, step)
+        if self._wandb is not None:
+            self._wandb.write(step, finite)
+
+    def say(self, message: str) -> None:
+        """One line on the terminal."""
+        if not self.silent:
+            self.console.print(message, highlight=False, soft_wrap=True)
+
+
+def read_metrics(path: Path) -> list[dict[str, Any]]:
+    """The lines of a metrics file; an unfinished last line (a killed run) is left out."""
+    entries = []
+    for line in path.read_text().splitlines():
+        try:
+            entries.append(json.loads(line))
+        except json.JSONDecodeError:
+            break
+    return entries
+
+
+def _drop_later_lines(path: Path, last_step: int) -> None:
+    if not path.exists():
+        return
+    kept = [entry for entry in read_metrics(path) if entry["step"] <= last_step]
+    write_text(path, "".join(json.dumps(entry) + "\n" for entry in kept))

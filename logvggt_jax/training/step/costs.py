@@ -1,0 +1,120 @@
+"""What a training step costs, counted or by the compiler's account: nothing is allocated or run."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+import time
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.sharding import Mesh
+
+from logvggt_jax.compile import out_of_device_memory
+from logvggt_jax.config import ModelConfig
+from logvggt_jax.model.logvggt import LogVGGT
+from logvggt_jax.operations import count_flops
+from logvggt_jax.training.config import TrainConfig
+from logvggt_jax.training.parallel.sharding import split
+from logvggt_jax.training.step.program import abstract_parameters, make_program
+
+_COLLECTIVE = re.compile(
+    r"= (.*?) (all-reduce|all-gather|reduce-scatter|all-to-all|collective-permute)(?:-start)?\(", re.MULTILINE
+)
+
+_ARRAY = re.compile(r"([a-z]+)(\d*)[a-z0-9]*\[([\d,]*)\]")
+
+
+@dataclasses.dataclass(frozen=True)
+class StepCosts:
+    """What a compiled step needs on each device, by the compiler's own account.
+
+    Attributes:
+      arguments: bytes of parameters, moments and the batch; the new state takes the old one's place.
+      temporaries: bytes at the most.
+      collectives: exchanges between devices, by name: how many and the bytes of their results.
+      compilation: seconds.
+    """
+
+    arguments: int
+    temporaries: int
+    collectives: dict[str, tuple[int, int]]
+    compilation: float
+
+    @property
+    def memory(self) -> int:
+        """Bytes that a device holds at the most."""
+        return self.arguments + self.temporaries
+
+    def fits(self, limit: int | None) -> bool:
+        """Whether a device of `limit` bytes can take the step; True where that is not known (None)."""
+        return limit is None or self.memory <= limit
+
+
+def abstract_clips(
+    batch: int, frames: int, size: tuple[int, int], *, taught: bool = False
+) -> dict[str, jax.ShapeDtypeStruct]:
+    """A batch as the training step takes it, without values; with a teacher's confidence where it is `taught`."""
+    confidence = {"confidence": jax.ShapeDtypeStruct((batch, frames, *size), jnp.float32)} if taught else {}
+    return {
+        **confidence,
+        "images": jax.ShapeDtypeStruct((batch, frames, *size, 3), jnp.uint8),
+        "depth": jax.ShapeDtypeStruct((batch, frames, *size), jnp.float32),
+        "intrinsics": jax.ShapeDtypeStruct((batch, frames, 3, 3), jnp.float32),
+        "extrinsics": jax.ShapeDtypeStruct((batch, frames, 4, 4), jnp.float32),
+    }
+
+
+def step_flops(config: ModelConfig, clips: tuple[int, ...]) -> float:
+    """Operations of a step on clips [B, T, H, W] over all devices: forward and gradient, nothing computed twice."""
+    model = LogVGGT(dataclasses.replace(config, attention="xla"))
+    params, images = abstract_parameters(config), jax.ShapeDtypeStruct((*clips, 3), jnp.uint8)
+    forward = count_flops(lambda p, x: model.apply({"params": p}, x), params, images)
+    encoder = count_flops(lambda p, x: model.windows.encode({"params": p}, x), params, images)
+    # The gradient of a product is two of the kind; a frozen encoder has none.
+    return 3 * forward - 2 * encoder if config.encoder.frozen else 3 * forward
+
+
+def step_costs(
+    config: TrainConfig, mesh: Mesh, clips: int, clip_length: int, size: tuple[int, int]
+) -> StepCosts | None:
+    """Compiles the step for `clips` a device; None where the compiler finds that they do not fit."""
+    params = abstract_parameters(config.model)
+    program = make_program(LogVGGT(config.model), config, params, mesh)
+    batch = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=split(mesh)),
+        abstract_clips(clips * mesh.size, clip_length, size, taught=config.teacher is not None),
+    )
+    started = time.perf_counter()
+    try:
+        compiled = program.step.lower(program.abstract_state(params), batch).compile()
+    except jax.errors.JaxRuntimeError as error:
+        if out_of_device_memory(error):
+            return None
+        raise
+    memory: Any = compiled.memory_analysis()
+    return StepCosts(
+        arguments=memory.argument_size_in_bytes,
+        temporaries=memory.temp_size_in_bytes,
+        collectives=collectives(compiled.as_text() or ""),
+        compilation=time.perf_counter() - started,
+    )
+
+
+def collectives(program: str) -> dict[str, tuple[int, int]]:
+    """Number and bytes of the exchanges between devices in a compiled program's text, by name.
+
+    One in a loop counts once. The training step exchanges its sums outside of all loops; parameters in parts are put
+    together within them.
+    """
+    found: dict[str, tuple[int, int]] = {}
+    for shapes, name in _COLLECTIVE.findall(program):
+        size = 0
+        for kind, bits, shape in _ARRAY.findall(shapes):
+            items = math.prod(int(side) for side in shape.split(",") if side)
+            size += items * (1 if kind == "pred" else int(bits) // 8)
+        count, total = found.get(name, (0, 0))
+        found[name] = count + 1, total + size
+    return found

@@ -1,0 +1,112 @@
+"""AdamW with gradients clipped in each module by itself, and the schedule of its learning rate."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from logvggt_jax.training.config import OptimizerConfig, StageConfig
+from logvggt_jax.training.step.freezing import frozen_leaves
+
+Norm = Callable[[Any], jax.Array]
+# Group of the parameters that are frozen in a module of which others are trained.
+_FROZEN = "frozen"
+
+
+def learning_rate_schedule(config: OptimizerConfig, stages: tuple[StageConfig, ...]) -> optax.Schedule:
+    """The learning rate at each step of the run: one schedule over all stages, or a new one for each stage."""
+    lengths = [stage.steps for stage in stages]
+    if not config.restart_each_stage:
+        lengths = [sum(lengths)]
+    boundaries = [sum(lengths[: i + 1]) for i in range(len(lengths) - 1)]
+    return optax.join_schedules([_schedule(config, length) for length in lengths], boundaries)
+
+
+def make_optimizer(
+    config: OptimizerConfig, params: Any, *, frozen: tuple[str, ...], norm: Norm = optax.tree.norm
+) -> optax.GradientTransformation:
+    """AdamW without the learning rate: the training step multiplies what it returns with the rate of that step.
+
+    `params` is a dict of modules (encoder, aggregator, heads). The gradient of each module is clipped to
+    `config.clip_norm` by itself, so that one head with an exploding gradient does not slow down the others. Parameters
+    matched by the patterns `frozen` (see `freezing`) do not move, and no moments are kept for them. `norm` is that of a
+    tree of gradients, of which a device may hold a part.
+
+    Weight decay applies to the kernels of linear layers and convolutions: not to biases, norms, gains of residual
+    branches, special tokens and the position embedding, unless `config.decay_all`.
+
+    Source: clipping by module as in VGGT's released trainer.
+    """
+    still = frozen_leaves(params, frozen)
+    groups: dict[str, optax.GradientTransformation] = {}
+    labels: dict[str, Any] = {}
+    for module, leaves in still.items():
+        whole = all(jax.tree.leaves(leaves))
+        groups[module] = optax.set_to_zero() if whole else _module_optimizer(config, norm)
+        apart = module if whole else _FROZEN
+        labels[module] = jax.tree.map(lambda frozen, own=module, apart=apart: apart if frozen else own, leaves)
+    # A group that no parameter is in would only change what checkpoints hold.
+    if _FROZEN in jax.tree.leaves(labels):
+        groups[_FROZEN] = optax.set_to_zero()
+    return optax.partition(groups, labels)
+
+
+def apply_updates(params: Any, directions: Any, learning_rate: jax.Array) -> Any:
+    """params - learning_rate * directions."""
+    return jax.tree.map(lambda p, u: (p - learning_rate * u).astype(p.dtype), params, directions)
+
+
+def moving_average(average: Any, params: Any, decay: float | None) -> Any:
+    """decay * average + (1 - decay) * params for the modules in `average`; None where none is kept."""
+    if average is None or decay is None:
+        return average
+    return {
+        module: jax.tree.map(lambda a, p: (a + (1 - decay) * (p - a)).astype(a.dtype), tree, params[module])
+        for module, tree in average.items()
+    }
+
+
+def module_norms(gradients: Any, norm: Norm = optax.tree.norm) -> dict[str, jax.Array]:
+    """l2 norm of each module's gradient."""
+    return {module: norm({module: tree}) for module, tree in gradients.items()}
+
+
+def _schedule(config: OptimizerConfig, steps: int) -> optax.Schedule:
+    warmup = round(config.warmup_fraction * steps)
+    if config.schedule == "cosine":
+        return optax.warmup_cosine_decay_schedule(
+            0.0, config.learning_rate, warmup, max(steps, warmup + 1), end_value=config.final_learning_rate
+        )
+    tail = steps - steps // 4
+    return optax.join_schedules(
+        [
+            optax.linear_schedule(0.0, config.learning_rate, warmup),
+            optax.constant_schedule(config.learning_rate),
+            optax.linear_schedule(config.learning_rate, config.final_learning_rate, steps - tail),
+        ],
+        [warmup, tail],
+    )
+
+
+def _clip(limit: float, norm: Norm) -> optax.GradientTransformation:
+    """`optax.clip_by_global_norm` with a norm that knows where the gradients lie."""
+
+    def update(updates: Any, state: optax.EmptyState, params: Any = None) -> tuple[Any, optax.EmptyState]:
+        del params
+        length = norm(updates)
+        return jax.tree.map(lambda x: jnp.where(length < limit, x, x / length.astype(x.dtype) * limit), updates), state
+
+    return optax.GradientTransformation(lambda _: optax.EmptyState(), update)
+
+
+def _module_optimizer(config: OptimizerConfig, norm: Norm) -> optax.GradientTransformation:
+    def decayed(tree: Any) -> Any:
+        return jax.tree_util.tree_map_with_path(lambda path, _: config.decay_all or path[-1].key == "kernel", tree)
+
+    return optax.chain(
+        _clip(config.clip_norm, norm),
+        optax.scale_by_adam(config.b1, config.b2),
+        optax.add_decayed_weights(config.weight_decay, decayed),
+    )

@@ -1,0 +1,63 @@
+"""Steps that the devices work on while the host goes on, and what the finished ones say."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+
+import jax
+from absl import logging
+
+from logvggt_jax.training.reporting.progress import IntervalMeans
+from logvggt_jax.training.reporting.skipped import clips_to_blame, described
+from logvggt_jax.training.step.train_step import Metrics
+
+# Steps handed to the device before the oldest has to be finished: enough to hide the host's work.
+MOST = 2
+
+
+class StepsInFlight:
+    """Takes down the metrics of steps in their order, each when it has finished.
+
+    Attributes:
+      means: of the steps that have finished since they were last read.
+      longest_skip: updates left out in a row, the longest row so far.
+    """
+
+    def __init__(self, *, skipped: int, step_ended: Callable[[], None]) -> None:
+        """Args: `skipped` updates were left out before; `step_ended` is called for every step that has finished."""
+        self.means = IntervalMeans()
+        self.longest_skip = 0.0
+        self._skipped, self._step_ended = float(skipped), step_ended
+        self._steps: deque[tuple[int, Metrics, jax.Array, list[str]]] = deque()
+        # Clips of the latest updates left out in a row, and its last step.
+        self._blamed: list[str] = []
+        self._last_skip = -1
+
+    @property
+    def blamed(self) -> str:
+        """In words, the clips of the latest updates that were left out in a row."""
+        return described(self._blamed)
+
+    def add(self, step: int, metrics: Metrics, finite: jax.Array, names: list[str]) -> None:
+        """A step that was begun, what it returns, and the names of this process's clips; waits while too many run."""
+        self._steps.append((step, metrics, finite, names))
+        self.finish(MOST)
+
+    def finish(self, allowed: int = 0) -> None:
+        """Waits until no more than `allowed` steps are unfinished."""
+        while len(self._steps) > allowed:
+            step, metrics, finite, names = self._steps.popleft()
+            values = {name: float(value) for name, value in jax.device_get(metrics).items()}
+            self._step_ended()
+            self.means.add(values)
+            if values["skipped"] > self._skipped:
+                self._blame(step, *clips_to_blame(finite, names))
+            self._skipped, self.longest_skip = values["skipped"], values["longest_skip"]
+
+    def _blame(self, step: int, clips: list[str], reason: str) -> None:
+        if step != self._last_skip + 1:
+            self._blamed.clear()
+        self._last_skip = step
+        self._blamed += [name for name in clips if name not in self._blamed]
+        logging.warning("step %d: update left out, %s %s", step, reason, described(clips))

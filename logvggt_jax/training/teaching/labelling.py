@@ -1,0 +1,95 @@
+"""A teacher's labels for the clips of a data set: what the cache does not hold yet is labelled, by all processes."""
+
+import itertools
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import jax
+import numpy as np
+from absl import logging
+from rich.console import Console
+from rich.progress import Progress
+
+from logvggt_jax.data.dataset import Dataset, DrawnOnDevice
+from logvggt_jax.data.feeding.broken_clips import describe
+from logvggt_jax.data.feeding.transforms import fit_each, nearest_size
+from logvggt_jax.errors import InputError
+from logvggt_jax.training.config import TeacherConfig
+from logvggt_jax.training.parallel.agreement import any_process, check_agreement, from_all
+from logvggt_jax.training.teaching.labels import DIGEST_BYTES, is_labelled, label_digest, label_folder, write_labels
+from logvggt_jax.training.teaching.taught import Size, TaughtClip, TaughtDataset
+from logvggt_jax.training.teaching.teacher import Teacher
+
+
+def taught(
+    name: str,
+    dataset: Dataset,
+    teacher: Teacher,
+    config: TeacherConfig,
+    sizes: Sequence[Size],
+    cache: Path,
+    *,
+    progress: bool = False,
+    most: int | None = None,
+) -> TaughtDataset:
+    """The data set as its teacher sees it; labels the clips that `cache` does not hold yet, at `most` so many of all.
+
+    Every sequence is cut into clips of `config.clip_length` frames, `config.stride` apart, the last one ending where
+    the sequence ends; of several `sizes` (H, W) they have the one nearest to the pictures' aspect. Of several processes
+    each reads and labels its share and tells the others, so that all have the same clips; all have to call this. A
+    clip whose pictures cannot be read is left out, with a warning that names it.
+
+    Raises InputError where no clip is left, for a data set that is drawn on the device, and on every process where one
+    of them fails or sees other sequences.
+    """
+    if isinstance(dataset, DrawnOnDevice):
+        raise InputError(
+            f"{name} is drawn on the device (renderer='device'), where a teacher does not see it: use 'host'"
+        )
+    wanted = list(itertools.islice(_cut(dataset, config), most))
+    check_agreement(f"{name}: the sequences", [[sequence, *frames] for sequence, frames in wanted])
+    found = np.zeros((len(wanted), 1 + DIGEST_BYTES), np.uint8)
+    failure: InputError | None = None
+    console = Console(stderr=True, quiet=not progress)
+    try:
+        with Progress(console=console, transient=True) as bar:
+            share = range(jax.process_index(), len(wanted), jax.process_count())
+            for place in bar.track(share, description=f"Labelling clips of {name}"):
+                sequence, frames = wanted[place]
+                try:
+                    size = nearest_size(dataset.image_size(sequence), sizes)
+                    images = fit_each((dataset.read(sequence, [i]) for i in frames), len(frames), size).images
+                except Exception as error:  # of a decoder: one damaged picture is not to end a run of a week
+                    where = f"{name}, {sequence}@{frames[0]}"
+                    logging.warning("%s: left out, its pictures cannot be read: %s", where, describe(error))
+                    continue
+                digest = label_digest(images, teacher.digest)
+                folder = label_folder(cache, digest)
+                if not is_labelled(folder, images.shape):
+                    write_labels(folder, teacher.label(images))
+                found[place] = [1 + list(sizes).index(size), *digest]
+    except InputError as error:
+        failure = error
+    # Whoever has failed: the others wait for its clips.
+    if any_process(failure is not None):
+        raise failure or InputError(f"{name}: another process cannot label its clips; its output says why")
+    clips: dict[str, TaughtClip] = {}
+    for (sequence, frames), (number, *digest) in zip(wanted, from_all(found).max(0), strict=True):
+        if number:  # 0: left out
+            folder = label_folder(cache, bytes(digest))
+            clips[f"{sequence}@{frames[0]}"] = TaughtClip(sequence, frames, sizes[number - 1], folder)
+    if not clips:
+        raise InputError(f"{name}: no clip of two frames or more that can be read, nothing to be taught on")
+    return TaughtDataset(dataset, clips, teacher.digest)
+
+
+def _cut(dataset: Dataset, config: TeacherConfig) -> Iterator[tuple[str, tuple[int, ...]]]:
+    """Sequence and frames of every clip."""
+    span = (config.clip_length - 1) * config.stride + 1
+    for sequence in dataset.sequences:
+        count = dataset.num_frames(sequence)
+        last = max(count - span, 0)
+        for start in sorted({*range(0, last + 1, span), last}):
+            frames = tuple(range(start, min(start + span, count), config.stride))
+            if len(frames) > 1:
+                yield sequence, frames

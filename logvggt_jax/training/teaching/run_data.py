@@ -1,0 +1,55 @@
+"""The data of a run: of its own truth, or labelled by a teacher before the first step."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from logvggt_jax.data.dataset import Dataset
+from logvggt_jax.training.config import TeacherConfig, TrainConfig
+from logvggt_jax.training.feeding.sources import open_source, open_sources
+from logvggt_jax.training.teaching.labelling import taught
+from logvggt_jax.training.teaching.teacher import PlainVGGT, Teacher
+
+
+def open_data(config: TrainConfig) -> tuple[Mapping[str, Dataset], Sequence[Dataset]]:
+    """The mixture's data sets by name, and the validation sets where they are not simply their sources.
+
+    With a teacher every clip is labelled here, or found in the cache; the teacher is gone when this returns. Raises
+    InputError as `open_sources`, `PlainVGGT` and `taught`.
+    """
+    datasets = open_sources(config.data, () if config.validation is None else config.validation.sources)
+    if config.teacher is None:
+        return datasets, ()
+    labelled = label(config, config.teacher, PlainVGGT(config.teacher), datasets)
+    # The programs of the teacher hold memory that the student's step needs.
+    jax.clear_caches()
+    return labelled
+
+
+def label(
+    config: TrainConfig,
+    settings: TeacherConfig,
+    teacher: Teacher,
+    datasets: Mapping[str, Dataset],
+    *,
+    most: int | None = None,
+) -> tuple[Mapping[str, Dataset], Sequence[Dataset]]:
+    """`datasets`, and the validation sources where the student is to be compared with its teacher, as it labels them.
+
+    Of several processes each labels its share; all have to call this. At `most` so many clips of a set are labelled,
+    None labels all.
+    """
+    assert config.data.cache_dir is not None  # as the configuration checks
+    shared: dict[str, Any] = {"progress": jax.process_index() == 0, "most": most}
+    cache, sizes = Path(config.data.cache_dir), list(dict.fromkeys(s for stage in config.stages for s in stage.sizes))
+    found: dict[str, Dataset] = {
+        name: taught(name, dataset, teacher, settings, sizes, cache, **shared) for name, dataset in datasets.items()
+    }
+    validated: list[Dataset] = []
+    if config.validation is not None and settings.validation:
+        size = [config.validation.size]
+        for source in config.validation.sources:
+            validated.append(taught(source.name, open_source(source), teacher, settings, size, cache, **shared))
+    return found, validated

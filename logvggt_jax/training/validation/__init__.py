@@ -1,0 +1,1 @@
+"""Accuracy on fixed clips that training never sees, and its pictures."""

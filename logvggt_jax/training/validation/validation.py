@@ -1,0 +1,147 @@
+"""Accuracy on a few fixed clips that training never sees."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jax.sharding import PartitionSpec as P
+
+from logvggt_jax.data.dataset import Dataset
+from logvggt_jax.data.feeding.transforms import fit
+from logvggt_jax.errors import InputError
+from logvggt_jax.metrics.depth import depth_metrics
+from logvggt_jax.metrics.pose import pose_accuracy, relative_pose_errors
+from logvggt_jax.model.logvggt import LogVGGT
+from logvggt_jax.training.config import ValidationConfig
+from logvggt_jax.training.feeding.sources import open_source
+from logvggt_jax.training.parallel.sharding import DATA_AXIS, Layout, replicated, split
+from logvggt_jax.training.validation.pictures import clip_picture, trajectory_picture
+from logvggt_jax.types import Frames
+
+
+class Judgement(NamedTuple):
+    """What validation finds.
+
+    Attributes:
+      values: means over the clips of all sources, `validation/abs_rel`, and where there are several over those of each,
+        `validation/SOURCE/abs_rel`. Depth is judged after median alignment, poses by errors over all pairs, in degrees.
+        `constant_abs_rel` and `identity_rotation` are what a constant depth and a motionless camera get.
+      pictures: of the first clip of each source, [h, w, 3] uint8 RGB.
+    """
+
+    values: dict[str, float]
+    pictures: dict[str, np.ndarray]
+
+
+class Validation:
+    """Fixed clips, read once, and the jitted model that is tried on them.
+
+    Clip i of a source shows frames start, start + stride, … of a sequence that is long enough. As many sequences as
+    there are have clips; those of one sequence start evenly spaced, the first one at frame 0. `datasets` take the place
+    of the sources that the configuration names.
+    """
+
+    def __init__(
+        self, model: LogVGGT, config: ValidationConfig, layout: Layout, datasets: Sequence[Dataset] = ()
+    ) -> None:
+        mesh = layout.mesh
+        self._names = [source.name for source in config.sources]
+        opened = datasets or [open_source(source) for source in config.sources]
+        each = zip(self._names, opened, strict=True)
+        self._clips = [clip for name, dataset in each for clip in _read_clips(name, dataset, config)]
+        self._each = config.num_clips
+        firsts = np.arange(0, len(self._clips), self._each)
+        self._without_learning = [_baselines(clip) for clip in self._clips]
+        # The last clip again, as often as the devices need it for equal shares.
+        shown = [*self._clips, *self._clips[-1:] * (-len(self._clips) % mesh.size)]
+        images = np.stack([clip.images for clip in shown])
+        self._images = jax.make_array_from_callback(images.shape, split(mesh), lambda index: images[index])
+
+        def predict(params: Any, images: jax.Array) -> tuple[jax.Array, ...]:
+            predictions = model.apply({"params": layout.in_parts(params)}, images)
+            return predictions.depth, predictions.extrinsics, predictions.depth_confidence
+
+        def on_all_devices(params: Any, images: jax.Array) -> tuple[jax.Array, ...]:
+            specs = (layout.specs(params), P(DATA_AXIS))
+            depth, extrinsics, confidence = jax.shard_map(
+                predict, mesh=mesh, in_specs=specs, out_specs=P(DATA_AXIS), check_vma=False
+            )(params, images)
+            return depth, extrinsics, confidence[firsts]
+
+        self._predict = jax.jit(on_all_devices, out_shardings=replicated(mesh))
+
+    def __call__(self, params: Any) -> Judgement:
+        """Judges these parameters."""
+        count = len(self._clips)
+        depth, extrinsics, confidence = jax.device_get(self._predict(params, self._images))
+        results = [
+            {**_clip_metrics(*each), **known}
+            for *each, known in zip(depth[:count], extrinsics[:count], self._clips, self._without_learning, strict=True)
+        ]
+        values = _means(results, "validation")
+        pictures = {}
+        for number, name in enumerate(self._names):
+            first = number * self._each
+            if len(self._names) > 1:
+                values |= _means(results[first : first + self._each], f"validation/{name}")
+            clip = self._clips[first]
+            pictures[f"validation/{name}/clip"] = clip_picture(clip, depth[first], confidence[number])
+            pictures[f"validation/{name}/trajectory"] = trajectory_picture(extrinsics[first], clip.extrinsics)
+        return Judgement(values, pictures)
+
+
+def validation_line(values: Mapping[str, float]) -> str:
+    """What a `Judgement` says, on one line beside what learns nothing gets."""
+    return (
+        f"abs_rel {values['validation/abs_rel']:.3f} (constant depth {values['validation/constant_abs_rel']:.3f}), "
+        f"delta<1.25 {values['validation/delta_1.25']:.3f}, "
+        f"rotation {values['validation/rotation']:.2f}° (identity {values['validation/identity_rotation']:.2f}°), "
+        f"direction {values['validation/translation_direction']:.1f}°"
+    )
+
+
+def _means(results: list[dict[str, float]], prefix: str) -> dict[str, float]:
+    means = {name: float(np.mean([result[name] for result in results])) for name in results[0]}
+    means["rotation_over_identity"] = means["rotation"] / max(means["identity_rotation"], 1e-6)
+    return {f"{prefix}/{name}": value for name, value in means.items()}
+
+
+def _read_clips(name: str, dataset: Dataset, config: ValidationConfig) -> list[Frames]:
+    span = (config.clip_length - 1) * config.stride + 1
+    # Starts that a sequence has room for.
+    room = {sequence: dataset.num_frames(sequence) - span + 1 for sequence in dataset.sequences}
+    sequences = [sequence for sequence in dataset.sequences if room[sequence] > 0][: config.num_clips]
+    counts = {each: len(range(i, config.num_clips, len(sequences))) for i, each in enumerate(sequences)}
+    if not sequences or any(counts[each] > room[each] for each in sequences):
+        raise InputError(
+            f"validation: data set {name!r} has {len(sequences)} sequences of at least {span} frames, "
+            f"num_clips={config.num_clips} needs more or longer ones; lower num_clips, clip_length or stride"
+        )
+    clips = []
+    for sequence in sequences:
+        for start in np.linspace(0, room[sequence] - 1, counts[sequence]).round().astype(int):
+            frames = dataset.read(sequence, range(start, start + span, config.stride))
+            clips.append(fit(frames, config.size))
+    return clips
+
+
+def _clip_metrics(depth: np.ndarray, extrinsics: np.ndarray, clip: Frames) -> dict[str, float]:
+    """Errors of one clip: depth [T, H, W], world-to-camera extrinsics [T, 3, 4]; angles in degrees."""
+    found = depth_metrics(depth, clip.depth, alignment="median")
+    rotation, direction = relative_pose_errors(extrinsics, clip.extrinsics)
+    return {
+        "abs_rel": found["abs_rel"],
+        "delta_1.25": found["delta_1.25"],
+        "rotation": float(rotation.mean()),
+        "translation_direction": float(direction.mean()),
+        "auc_30": pose_accuracy(rotation, direction)["auc"],
+    }
+
+
+def _baselines(clip: Frames) -> dict[str, float]:
+    """What a constant depth and a motionless camera get on a clip, whatever the model has learned."""
+    constant = depth_metrics(np.ones_like(clip.depth), clip.depth, alignment="median")
+    still = np.broadcast_to(np.eye(4), clip.extrinsics.shape)
+    identity, _ = relative_pose_errors(still, clip.extrinsics)
+    return {"constant_abs_rel": constant["abs_rel"], "identity_rotation": float(identity.mean())}

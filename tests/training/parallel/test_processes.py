@@ -1,0 +1,253 @@
+"""Two processes that train together give one process's numbers and leave one set of files."""
+
+import platform
+import re
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from logvggt_jax.training.parallel import agreement
+from logvggt_jax.training.parallel.agreement import any_process, check_agreement
+from logvggt_jax.training.parallel.joining import check_processes, join_processes
+from logvggt_jax.training.reporting.metrics_log import read_metrics
+from logvggt_jax.weights.checkpoints import load_model
+
+ROOT = Path(__file__).parents[3]
+# One shape of clip and few steps: nearly all of the time is compilation.
+SETTINGS = (
+    "--config=configs/tiny.py",
+    "--config.stages.stage_1.steps=3",
+    "--config.stages.stage_2.steps=1",
+    "--config.stages.stage_2.clip_length=4",
+    "--config.stages.stage_2.batch_size=8",
+    "--config.data.sources.rooms.options.num_rooms=8",
+    "--config.data.sources.rooms.options.num_frames=24",
+    "--config.validation.num_clips=4",
+    "--config.validation.sources.rooms.options.num_rooms=4",
+    "--config.validation.every=2",
+    "--config.log_every=1",
+    "--config.save_every=2",
+)
+
+PIXEL_MODEL = """
+import runpy, sys
+sys.path[:0] = ["tests/training", "."]
+import conftest
+from logvggt_jax.training import loop
+conftest.use_pixel_model(loop)
+"""
+PIXEL_SETTINGS = (
+    *SETTINGS[:1],
+    "--config.stages.stage_1.steps=100000",
+    "--config.stages.stage_1.batch_size=2",
+    "--config.stages.stage_2.batch_size=2",
+    *SETTINGS[5:9],
+    "--config.validation.every=100000",
+    "--config.log_every=10",
+    "--config.save_every=100000",
+)
+
+
+def started(workdir: Path, *arguments: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "train.py", *SETTINGS, f"--workdir={workdir}", *arguments]
+    return subprocess.Popen(command, cwd=ROOT, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+
+
+def test_one_process_alone_answers_for_itself() -> None:
+    assert jax.process_count() == 1 and any_process(True) and not any_process(False)
+    check_agreement("anything", {"a": 1})
+
+
+def test_processes_that_differ_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jax, "process_count", lambda: 3)
+    monkeypatch.setattr(
+        agreement.multihost_utils, "process_allgather", lambda digest: np.stack([digest, digest + 1, digest])
+    )
+    with pytest.raises(ValueError, match=r"the data of the processes \[1\] differ from those of process 0"):
+        check_agreement("the data", {"a": 1})
+
+
+@pytest.mark.parametrize(("gpus", "warned"), [(8, True), (1, False)])
+def test_several_gpus_of_one_process_draw_a_warning(
+    gpus: int, warned: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(jax, "process_count", lambda: 2)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(jax, "local_device_count", lambda: gpus)
+    check_processes()
+    assert warned == ("owns 8 GPUs beside 1 other processes" in caplog.text)
+
+
+def test_half_an_address_is_refused() -> None:
+    with pytest.raises(ValueError, match="all of --coordinator, --num_processes and --process_id"):
+        join_processes(coordinator="localhost:1234")
+
+
+class PixelRuns:
+    """Two processes of `train.py` with the model that compiles at once; ended when the block is left.
+
+    `patches` are Python statements for each process, run before training.
+    """
+
+    def __init__(self, *workdirs: Path, patches: tuple[str, str] = ("", ""), flags: tuple[str, ...] = ()) -> None:
+        address = f"localhost:{_free_port()}"
+        self.processes = [
+            subprocess.Popen(
+                [
+                    sys.executable,
+                    "-c",
+                    f"{PIXEL_MODEL}\n{patch}\nrunpy.run_path('train.py', run_name='__main__')",
+                    *PIXEL_SETTINGS,
+                    f"--workdir={workdir}",
+                    "--distributed",
+                    f"--coordinator={address}",
+                    "--num_processes=2",
+                    f"--process_id={number}",
+                    *flags,
+                ],
+                cwd=ROOT,
+                text=True,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+            )
+            for number, (workdir, patch) in enumerate(zip(workdirs, patches, strict=True))
+        ]
+
+    def __enter__(self) -> "PixelRuns":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for process in self.processes:
+            process.kill()
+            process.communicate()
+
+    def training(self) -> None:
+        """Waits for a line of a step after the first."""
+        stdout = self.processes[0].stdout
+        assert stdout is not None
+        for line in stdout:
+            if line.startswith("step 10/"):
+                return
+        raise AssertionError(self.errors(0))
+
+    def errors(self, process: int) -> str:
+        """What a process said on standard error until its end, without what the libraries say at the start."""
+        lines = self.processes[process].communicate(timeout=60)[1].splitlines(keepends=True)
+        return "".join(line for line in lines if not line.startswith(("[Gloo]", "rendering rooms")))
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("localhost", 0))
+        return int(probe.getsockname()[1])
+
+
+@pytest.mark.parametrize("lost", [1, pytest.param(0, marks=pytest.mark.slow)])
+def test_the_loss_of_a_process_ends_the_other_with_one_line(lost: int, tmp_path: Path) -> None:
+    with PixelRuns(tmp_path, tmp_path) as runs:
+        runs.training()
+        started = time.monotonic()
+        runs.processes[lost].kill()
+        errors = runs.errors(1 - lost)
+        assert time.monotonic() - started < 10
+        assert runs.processes[1 - lost].returncode == 1, errors
+        where = f"process {lost} on {re.escape(platform.node())}"
+        line = rf"train.py: {where} was lost: it was killed, or its machine is gone\n"
+        # JAX watches process 0 in the same way, and its trace may come in between.
+        assert (re.fullmatch if lost else re.search)(line, errors), errors
+
+
+def test_any_exception_ends_its_process_with_a_traceback_and_the_other_with_a_line(tmp_path: Path) -> None:
+    patch = "def fail(run, step, *_):\n    raise KeyError('a bug')\nloop._Run._validate = fail"
+    with PixelRuns(tmp_path, tmp_path, patches=("", patch), flags=("--config.validation.every=10",)) as runs:
+        assert "Traceback" in runs.errors(1) and runs.processes[1].returncode == 1
+        errors = runs.errors(0)
+        assert runs.processes[0].returncode == 1
+        assert re.fullmatch(r"train.py: process 1 on \S+ was lost, it ended with: KeyError: 'a bug'\n", errors)
+
+
+def test_a_stop_signal_for_one_process_stops_all_after_the_same_step(tmp_path: Path) -> None:
+    with PixelRuns(tmp_path, tmp_path) as runs:
+        runs.training()
+        runs.processes[1].terminate()
+        output = runs.processes[0].communicate(timeout=60)
+        assert [process.wait(60) for process in runs.processes] == [0, 0], output
+        found = re.search(r"stopping after step (\d+): another process is to stop", output[0])
+        assert found is not None, output
+        assert (tmp_path / "checkpoints" / found[1]).is_dir()
+
+
+def test_folders_that_are_not_shared_are_an_error_of_the_start(tmp_path: Path) -> None:
+    patch = "from logvggt_jax.training.parallel import agreement; agreement.SHARED_SECONDS = 0.5"
+    with PixelRuns(tmp_path / "a", tmp_path / "b", patches=(patch, patch)) as runs:
+        for number in range(2):
+            errors = runs.errors(number)
+            assert runs.processes[number].returncode == 1
+            assert re.search(r"of the processes \[1\] is another folder than that of process 0", errors), errors
+            assert "Traceback" not in errors
+    assert not list((tmp_path / "a").iterdir())
+
+
+def test_a_preflight_goes_on_together_when_one_process_fails_a_try(tmp_path: Path) -> None:
+    quick = (
+        "from logvggt_jax.training import preflight as flight\n"
+        "from logvggt_jax.training.step.costs import StepCosts\n"
+        "flight.step_costs = lambda *_: StepCosts(1, 1, {}, 1.0)\n"
+        "flight.abstract_parameters = loop.abstract_parameters\n"
+    )
+    broken = (
+        "from logvggt_jax.errors import InputError\n"
+        "def fail(*_): raise InputError('scene0001: cannot be opened')\n"
+        "flight._read_clips = fail\n"
+    )
+    with PixelRuns(tmp_path, tmp_path, patches=(quick, quick + broken), flags=("--preflight",)) as runs:
+        outputs = [process.communicate(timeout=60) for process in runs.processes]
+        assert [process.returncode for process in runs.processes] == [1, 1], outputs
+    assert "rooms: FAILED on process 1: scene0001: cannot be opened" in outputs[1][0]
+    assert "checkpoint: " in outputs[0][0] and "checkpoint: " not in outputs[1][0]
+    assert "preflight: 1 of the tries failed: rooms; see the lines above" in outputs[0][1] + outputs[1][1]
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_process_that_never_joins_is_waited_for_as_long_as_stated(tmp_path: Path) -> None:
+    with PixelRuns(tmp_path, tmp_path, patches=("", "sys.exit()"), flags=("--join_seconds=2",)) as runs:
+        errors = runs.errors(0)
+        assert runs.processes[0].returncode == 1
+    assert re.fullmatch(r"train.py: not all of the 2 processes joined within 2 s .*\n", errors)
+
+
+@pytest.mark.slow
+def test_two_processes_train_one_model(tmp_path: Path) -> None:
+    address = f"localhost:{_free_port()}"
+    together = [
+        started(
+            tmp_path / "two",
+            "--distributed",
+            f"--coordinator={address}",
+            "--num_processes=2",
+            f"--process_id={process}",
+        )
+        for process in range(2)
+    ]
+    outputs = [process.communicate(timeout=600)[0] for process in together]
+    assert [process.returncode for process in together] == [0, 0], outputs
+    assert "step 4/4" in outputs[0]
+    assert "step 4/4" not in outputs[1], "one process speaks"
+    alone = started(tmp_path / "one")
+    output = alone.communicate(timeout=600)[0]
+    assert alone.returncode == 0, output
+
+    ours, theirs = (read_metrics(tmp_path / name / "metrics.jsonl") for name in ("two", "one"))
+    assert [entry["step"] for entry in ours] == [entry["step"] for entry in theirs]
+    # The first step's loss is of the same parameters and clips; later ones drift with the order of sums.
+    assert ours[0]["loss/total"] == pytest.approx(theirs[0]["loss/total"], rel=1e-4)
+    assert ours[-1]["validation/abs_rel"] == pytest.approx(theirs[-1]["validation/abs_rel"], rel=0.05)
+    two, one = (load_model(tmp_path / name / "model")[1] for name in ("two", "one"))
+    for a, b in zip(jax.tree.leaves(two), jax.tree.leaves(one), strict=True):
+        np.testing.assert_allclose(a, b, atol=5e-3)

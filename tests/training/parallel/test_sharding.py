@@ -1,0 +1,326 @@
+"""Parameters in parts and clips one after the other: the numbers of one device with everything, and less memory."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from jax.sharding import PartitionSpec as P
+from parallel_runs import LayeredModel, Outcome, first_gradient, steps, steps_of_processes
+
+from logvggt_jax import LogVGGT, ModelConfig
+from logvggt_jax.model.parameters import stack_layers
+from logvggt_jax.training import loop
+from logvggt_jax.training.checkpoints.checkpoint_files import Position, StoredCheckpoint
+from logvggt_jax.training.config import LossConfig, TrainConfig
+from logvggt_jax.training.loop import train
+from logvggt_jax.training.parallel.sharding import (
+    Layout,
+    check_batch_size,
+    data_mesh,
+    parameter_layout,
+    put_batch,
+    use_cpu_cores,
+)
+from logvggt_jax.training.parallel.watchdog import Watchdog
+from logvggt_jax.training.step.program import make_program
+
+Clips = dict[str, np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def sixteen(clips: Clips) -> Clips:
+    """Sixteen clips with uneven masks."""
+    return {name: np.concatenate([value, value[::-1]]) for name, value in clips.items()}
+
+
+@pytest.fixture(scope="module")
+def alone(layered: Any, loss_config: LossConfig, layered_params: Any, sixteen: Clips) -> Any:
+    return first_gradient(layered, loss_config, layered_params, sixteen, data_mesh(1))
+
+
+@pytest.mark.parametrize(
+    ("devices", "shard", "accumulate"),
+    [(1, False, 4), (4, False, 1), (4, True, 1), (4, True, 2), (4, False, 4), (16, False, 1), (16, True, 1)],
+)
+def test_first_gradient_is_that_of_one_device(
+    devices: int,
+    shard: bool,
+    accumulate: int,
+    layered: Any,
+    loss_config: LossConfig,
+    layered_params: Any,
+    sixteen: Clips,
+    alone: Any,
+) -> None:
+    mesh = data_mesh(devices)
+    found = first_gradient(layered, loss_config, layered_params, sixteen, mesh, shard=shard, accumulate=accumulate)
+    _agree(found, alone, rel=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("devices", "shard", "accumulate"), [(4, True, 2), (16, True, 1)])
+def test_first_gradient_of_the_real_model_is_that_of_one_device(
+    devices: int, shard: bool, accumulate: int, small_config: ModelConfig, loss_config: LossConfig, sixteen: Clips
+) -> None:
+    # All of it trained, with layers that run as loops in encoder and aggregator.
+    encoder = dataclasses.replace(small_config.encoder, frozen=False, depth=2)
+    aggregator = dataclasses.replace(small_config.aggregator, depth=6, key_layers=(0, 1, 2, 5))
+    model = LogVGGT(dataclasses.replace(small_config, encoder=encoder, aggregator=aggregator))
+    variables = model.init(jax.random.key(0), np.zeros((1, 1, 28, 42, 3), np.float32))
+    params = jax.device_get(stack_layers(variables["params"]))
+    generator = np.random.default_rng(0)
+    # No gate is zero.
+    params = jax.tree.map(lambda x: x + 0.1 * generator.standard_normal(x.shape).astype(np.float32), params)
+    short = {name: value[:, :3] for name, value in sixteen.items() if name != "frame_mask"}
+    one = first_gradient(model, loss_config, params, short, data_mesh(1))
+    found = first_gradient(model, loss_config, params, short, data_mesh(devices), shard=shard, accumulate=accumulate)
+    _agree(found, one, rel=1e-5)
+
+
+def _gentle(config: TrainConfig, **changes: Any) -> TrainConfig:
+    """A rate at which differences of rounding stay what they are, all modules trained, and no clipping."""
+    encoder = dataclasses.replace(config.model.encoder, frozen=False)
+    return dataclasses.replace(
+        config,
+        model=dataclasses.replace(config.model, encoder=encoder),
+        optimizer=dataclasses.replace(config.optimizer, learning_rate=1e-4, clip_norm=1e9),
+        **changes,
+    )
+
+
+def _same_run(found: Outcome, expected: Outcome) -> None:
+    """The first gradient, module by module, and the losses of all steps."""
+    for module, gradients in expected.gradient.items():
+        difference = _norm(jax.tree.map(np.subtract, found.gradient[module], gradients))
+        assert difference <= 1e-5 * _norm(gradients), module
+    assert len(found.losses) == 20 and found.losses == pytest.approx(expected.losses, rel=1e-3)
+
+
+@pytest.mark.slow
+def test_twenty_steps_on_sixteen_devices_and_in_two_processes_are_those_of_one_device(
+    run_config: TrainConfig, layered: LayeredModel, layered_params: Any, sixteen: Clips, tmp_path: Path
+) -> None:
+    alone = steps(layered, _gentle(run_config), layered_params, sixteen, data_mesh(1), 20)
+    assert alone.losses[-1] < alone.losses[0] - 0.01, "it learns"
+    parts = _gentle(run_config, shard_parameters=True)
+    _same_run(steps(layered, parts, layered_params, sixteen, data_mesh(16), 20), alone)
+    both = dataclasses.replace(parts, accumulate=2)
+    _same_run(steps_of_processes(both, layered_params, sixteen, 20, tmp_path, layered=True), alone)
+
+
+@pytest.mark.slow
+def test_twenty_steps_of_the_real_model_are_the_same_on_all_devices_and_in_two_processes(
+    run_config: TrainConfig, sixteen: Clips, tmp_path: Path
+) -> None:
+    config = _gentle(run_config)
+    model = LogVGGT(config.model)
+    variables = model.init(jax.random.key(0), np.zeros((1, 1, 28, 42, 3), np.float32))
+    generator = np.random.default_rng(0)
+    params = jax.tree.map(
+        lambda x: x + 0.1 * generator.standard_normal(x.shape).astype(np.float32),
+        jax.device_get(stack_layers(variables["params"])),
+    )
+    short = {name: value[:, :3] for name, value in sixteen.items() if name != "frame_mask"}
+    alone = steps(model, config, params, short, data_mesh(1), 20)
+    for devices, shard, accumulate in ((1, False, 4), (4, False, 1), (4, True, 2), (16, False, 1), (16, True, 1)):
+        changed = dataclasses.replace(config, shard_parameters=shard, accumulate=accumulate)
+        _same_run(steps(model, changed, params, short, data_mesh(devices), 20), alone)
+    for shard, accumulate in ((False, 1), (True, 2)):
+        changed = dataclasses.replace(config, shard_parameters=shard, accumulate=accumulate)
+        _same_run(steps_of_processes(changed, params, short, 20, tmp_path, layered=False), alone)
+
+
+def _agree(found: Any, expected: Any, *, rel: float) -> None:
+    """Objective, what is logged, and the gradient of every module and of all."""
+    assert found[0] == pytest.approx(expected[0], rel=rel)
+    for name, value in expected[1].items():
+        assert found[1][name] == pytest.approx(value, rel=1e-4, abs=1e-5), name
+    for module, gradients in expected[2].items():
+        difference = _norm(jax.tree.map(np.subtract, found[2][module], gradients))
+        assert difference <= rel * _norm(gradients), module
+    assert found[3] == pytest.approx(_norm(expected[2]), rel=rel)
+
+
+def _norm(tree: Any) -> float:
+    return float(np.sqrt(sum((leaf.astype(np.float64) ** 2).sum() for leaf in jax.tree.leaves(tree))))
+
+
+def test_matrices_are_split_along_no_axis_of_layers_and_vectors_stay_whole(layered_params: Any) -> None:
+    specs = parameter_layout(layered_params, data_mesh(4), shard=True).specs(layered_params)
+    assert specs["aggregator"] == {
+        "embed": {"kernel": P(None, "data")},
+        "frame_blocks": {"kernel": P(None, "data", None), "bias": P()},
+    }
+    assert specs["camera_head"] == {"kernel": P(), "bias": P()}, "four does not divide 3 x 9"
+    assert not parameter_layout(layered_params, data_mesh(4), shard=False).axes
+
+
+def test_the_state_lies_in_its_place_from_the_start(run_config: TrainConfig, layered: Any, layered_params: Any) -> None:
+    config = dataclasses.replace(run_config, shard_parameters=True, average=0.9)
+    shapes = jax.eval_shape(lambda: layered_params)
+    program = make_program(layered, config, shapes, data_mesh(4))
+    state = program.initial_state(layered_params)
+    kernel = state.params["aggregator"]["frame_blocks"]["kernel"]
+    assert kernel.addressable_shards[0].data.size == kernel.size // 4
+    like = [leaf for leaf in jax.tree.leaves(state) if leaf.shape == kernel.shape]
+    assert len(like) == 4, "the parameter, two moments, the average"
+    assert {leaf.sharding for leaf in like} == {kernel.sharding}
+    jax.tree.map(np.testing.assert_array_equal, jax.device_get(state.params), layered_params)
+    for leaf, expected in zip(*map(jax.tree.leaves, (state, program.abstract_state(shapes))), strict=True):
+        assert (leaf.shape, leaf.dtype, leaf.sharding.spec) == (expected.shape, expected.dtype, expected.sharding.spec)
+    # No two of them share memory, which a step is given to overwrite.
+    places = [
+        shard.data.unsafe_buffer_pointer() for leaf in jax.tree.leaves(state) for shard in leaf.addressable_shards
+    ]
+    assert len(set(places)) == len(places)
+
+
+@pytest.mark.parametrize("shard", [True, False])
+def test_no_device_ever_holds_a_second_copy_when_a_run_starts_or_goes_on(
+    shard: bool,
+    run_config: TrainConfig,
+    layered: LayeredModel,
+    layered_params: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Shapes, then places, then values: each goes to where it stays, from the host or from the disk."""
+    monkeypatch.setattr(loop, "LogVGGT", lambda _: layered)
+    monkeypatch.setattr(loop, "abstract_parameters", lambda _: jax.eval_shape(lambda: layered_params))
+    monkeypatch.setattr("logvggt_jax.training.checkpoints.run_models.save_model", lambda *_: None)
+    config, mesh = dataclasses.replace(run_config, shard_parameters=shard, average=0.5), data_mesh(4)
+    before, held = {id(x) for x in jax.live_arrays()}, []
+
+    def look(*_: Any, **__: Any) -> None:
+        # An array and its parts are the same memory.
+        places = {
+            (part.device, part.data.unsafe_buffer_pointer()): part.data.nbytes
+            for array in (x for x in jax.live_arrays() if id(x) not in before)
+            for part in array.addressable_shards
+        }
+        held.append(max(sum(size for (at, _), size in places.items() if at == device) for device in mesh.devices.flat))
+
+    def initial(*_: Any, **__: Any) -> Any:
+        look()
+        return layered_params
+
+    monkeypatch.setattr(loop, "initial_parameters", initial)
+    put, read, verified = Layout.put, StoredCheckpoint.read, StoredCheckpoint.verified
+    monkeypatch.setattr(Layout, "put", lambda *given: (look(), put(*given), look())[1])
+    monkeypatch.setattr(StoredCheckpoint, "read", lambda *given: (look(), read(*given), look())[1])
+    monkeypatch.setattr(StoredCheckpoint, "verified", lambda *given: (look(), verified(*given), look())[1])
+    for step in (0, 1):
+        run = loop._Run(config, tmp_path, mesh, Watchdog(0), ())
+        with run.checkpoints as checkpoints:
+            run.start(None)
+            state = run.state
+            look()
+            size = max(sum(leaf.addressable_shards[i].data.nbytes for leaf in jax.tree.leaves(state)) for i in range(4))
+            assert held[0] == 0, "shapes alone until then"
+            assert max(held) == held[-1] == size
+            if step == 0:
+                checkpoints.save(state._replace(step=state.step + 1), Position(0, {}))
+                checkpoints.wait()
+        del run, state
+        before, held[:] = {id(x) for x in jax.live_arrays()}, []
+
+
+def test_steps_in_parts_are_those_of_whole_parameters(
+    run_config: TrainConfig, layered: Any, layered_params: Any, sixteen: Clips
+) -> None:
+    states = []
+    for devices, shard, accumulate in ((1, False, 1), (4, True, 2)):
+        config = dataclasses.replace(run_config, shard_parameters=shard, accumulate=accumulate, average=0.5)
+        mesh = data_mesh(devices)
+        program = make_program(layered, config, jax.eval_shape(lambda: layered_params), mesh)
+        state, batch = program.initial_state(layered_params), put_batch(sixteen, mesh)
+        compiled = program.step.lower(state, batch).compile()
+        for _ in range(3):
+            state, metrics, finite = compiled(state, batch)
+        assert finite.shape == (16,) and np.asarray(finite).all()
+        # Clipping by module has to know the whole gradient.
+        assert float(metrics["gradient_norm/aggregator"]) > config.optimizer.clip_norm / 100
+        states.append(jax.device_get(state))
+    one, many = states
+    for name in ("params", "average"):
+        jax.tree.map(
+            lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=2e-5), getattr(one, name), getattr(many, name)
+        )
+
+
+def test_the_average_follows_the_parameters(
+    run_config: TrainConfig, layered: Any, layered_params: Any, sixteen: Clips
+) -> None:
+    config, mesh = dataclasses.replace(run_config, average=0.75), data_mesh(1)
+    program = make_program(layered, config, jax.eval_shape(lambda: layered_params), mesh)
+    state, batch = program.initial_state(layered_params), put_batch(sixteen, mesh)
+    assert set(state.average) == set(layered_params) - {"encoder"}, "what is frozen is its own average"
+    expected = {name: tree for name, tree in layered_params.items() if name != "encoder"}
+    for _ in range(3):
+        state, *_ = program.step(state, batch)
+        expected = jax.tree.map(
+            lambda a, p: 0.75 * a + 0.25 * p, expected, {name: jax.device_get(state.params[name]) for name in expected}
+        )
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7), state.average, expected)
+    moved = np.abs(np.asarray(state.averaged["camera_head"]["bias"] - state.params["camera_head"]["bias"])).max()
+    assert moved > 1e-4
+
+
+def test_a_sharded_run_is_saved_on_sixteen_devices_and_goes_on_with_eight(
+    run_config: TrainConfig,
+    layered: Any,
+    layered_params: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(loop, "LogVGGT", lambda _: layered)
+    monkeypatch.setattr(loop, "initial_parameters", lambda *_, **__: layered_params)
+    monkeypatch.setattr(loop, "abstract_parameters", lambda _: jax.eval_shape(lambda: layered_params))
+    monkeypatch.setattr("logvggt_jax.training.checkpoints.run_models.save_model", lambda *_: None)
+    stage = dataclasses.replace(run_config.stages[0], batch_size=16, steps=3)
+    config = dataclasses.replace(run_config, stages=(stage,), average=0.5)
+    sharded = dataclasses.replace(config, shard_parameters=True)
+    straight = train(config, tmp_path / "straight", mesh=data_mesh(1))
+    saved = train(dataclasses.replace(sharded, max_minutes=1e-9), tmp_path / "run", mesh=data_mesh(16))
+    assert int(saved.step) == 1
+    ended = train(dataclasses.replace(sharded, accumulate=2), tmp_path / "run", mesh=data_mesh(8))
+    assert int(ended.step) == 3
+    for name in ("params", "average"):
+        jax.tree.map(
+            lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4),
+            *(jax.device_get(getattr(state, name)) for state in (ended, straight)),
+        )
+
+
+def test_batches_have_to_split_into_the_parts(run_config: TrainConfig) -> None:
+    stage = dataclasses.replace(run_config.stages[0], batch_size=8)
+    check_batch_size(stage, data_mesh(4), accumulate=2)
+    with pytest.raises(ValueError, match=r"over 4 devices in accumulate=4 parts each; use a multiple of 16"):
+        check_batch_size(stage, data_mesh(4), accumulate=4)
+
+
+@pytest.mark.parametrize(
+    ("clips", "accumulate", "processes", "devices"), [(12, 1, 1, 6), (12, 4, 1, 3), (12, 2, 2, 3), (4, 4, 1, 1)]
+)
+def test_as_many_cores_become_devices_as_the_parts_of_a_batch_split_over(
+    clips: int,
+    accumulate: int,
+    processes: int,
+    devices: int,
+    run_config: TrainConfig,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    given: dict[str, int] = {}
+    monkeypatch.setattr(jax.config, "update", given.__setitem__)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(8), raising=False)
+    stages = tuple(dataclasses.replace(stage, batch_size=clips) for stage in run_config.stages)
+    use_cpu_cores(dataclasses.replace(run_config, stages=stages, accumulate=accumulate), num_processes=processes)
+    assert given == {"jax_num_cpu_devices": devices}
+    for stage in stages:
+        check_batch_size(stage, data_mesh(devices * processes), accumulate=accumulate)

@@ -1,0 +1,60 @@
+"""The metrics file: one line a step, readable after a crash, continued without duplicates."""
+
+import io
+import struct
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from rich.console import Console
+from tensorboardX.proto.event_pb2 import Event
+
+from logvggt_jax.training.reporting.metrics_log import FILE_NAME, MetricsLog, read_metrics
+
+
+def _log(workdir: Path, first_step: int) -> MetricsLog:
+    return MetricsLog(workdir, first_step=first_step, console=Console(quiet=True))
+
+
+def test_lines_hold_what_was_written(tmp_path: Path) -> None:
+    with _log(tmp_path, 0) as log:
+        log.write(1, {"loss": 0.5, "bad": float("nan")})
+    (entry,) = read_metrics(tmp_path / FILE_NAME)
+    assert entry["step"] == 1 and entry["loss"] == 0.5 and entry["bad"] is None
+    assert list((tmp_path / "tensorboard").iterdir())
+
+
+def test_pictures_are_shown_by_tensorboard(tmp_path: Path) -> None:
+    picture = np.random.default_rng(0).integers(0, 256, (4, 6, 3)).astype(np.uint8)
+    with _log(tmp_path, 0) as log:
+        log.show(3, {"validation/rooms/clip": picture})
+    (file,) = (tmp_path / "tensorboard").iterdir()
+    found = {}
+    for event in _events(file.read_bytes()):
+        found |= {value.tag: (event.step, value.image) for value in event.summary.value if value.HasField("image")}
+    ((tag, (step, image)),) = found.items()
+    assert (tag, step) == ("validation/rooms/clip", 3)
+    np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(image.encoded_image_string))), picture)
+
+
+def _events(records: bytes) -> list[Event]:
+    """Each is stored as its length, a check sum, itself, and another check sum."""
+    events, place = [], 0
+    while place < len(records):
+        (length,) = struct.unpack_from("<Q", records, place)
+        events.append(Event.FromString(records[place + 12 : place + 12 + length]))
+        place += 12 + length + 4
+    return events
+
+
+def test_resumed_run_replaces_later_lines_and_an_unfinished_one(tmp_path: Path) -> None:
+    with _log(tmp_path, 0) as log:
+        for step in range(1, 6):
+            log.write(step, {"loss": float(step)})
+    with (tmp_path / FILE_NAME).open("a") as file:
+        file.write('{"step": 6, "lo')
+    with _log(tmp_path, 3) as log:
+        log.write(4, {"loss": 40.0})
+    entries = read_metrics(tmp_path / FILE_NAME)
+    assert [(entry["step"], entry["loss"]) for entry in entries] == [(1, 1.0), (2, 2.0), (3, 3.0), (4, 40.0)]
+    assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []

@@ -1,0 +1,96 @@
+"""The time that is left counts what is no step; means are of the steps between two lines."""
+
+import dataclasses
+import math
+import time
+
+import pytest
+
+from logvggt_jax.training.config import SourceConfig, TrainConfig, ValidationConfig
+from logvggt_jax.training.reporting import progress
+from logvggt_jax.training.reporting.progress import IntervalMeans, progress_line
+from logvggt_jax.training.reporting.run_times import RunTimes, Speed
+
+
+class Clock:
+    """A clock that goes on when it is told to."""
+
+    now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr(time, "perf_counter", clock)
+    return clock
+
+
+@pytest.fixture
+def config(run_config: TrainConfig) -> TrainConfig:
+    """A hundred steps of four frames, sixty of six; saves at 30, 60, …, 150, and at the ends of the stages."""
+    source = SourceConfig(name="rooms", root=None, split="val")
+    validation = ValidationConfig(sources=(source,), every=70, num_clips=2, clip_length=2, stride=1, size=(28, 42))
+    first, second = run_config.stages
+    stages = dataclasses.replace(first, steps=100), dataclasses.replace(second, steps=60)
+    return dataclasses.replace(run_config, stages=stages, validation=validation, save_every=30)
+
+
+def test_the_time_left_counts_validations_saves_and_compilations(config: TrainConfig, clock: Clock) -> None:
+    times = RunTimes(config)
+    for kind, seconds in {"compilation": 50.0, "save": 7.0, "validation": 20.0}.items():
+        with times.other(kind):
+            clock.now += seconds
+    for _ in range(20):
+        with times.waiting():
+            clock.now += 1.0
+        times.count()
+        clock.now += 3.0
+    speed = times.read(config.stages[0])
+    assert speed == Speed(seconds=80.0, frames_per_second=1.0, data_share=0.25, utilisation=None)
+    assert times.productive == 60.0
+    # 80 steps; saves at 30, 60, 90 and 100; one validation at 70; another size to compile.
+    assert times.remaining_seconds(20, 100, compilations=1) == 80 * 4 + 4 * 7 + 20 + 50
+    # Besides 60 steps of six frames; saves at 120, 150 and 160; validations at 140 and 160.
+    assert times.remaining_seconds(20) == 80 * 4 + 60 * 6 + (4 + 3) * 7 + 3 * 20
+    assert times.remaining_seconds(160) == 0
+
+
+def test_utilisation_is_of_the_peak_in_the_time_of_steps(config: TrainConfig, clock: Clock) -> None:
+    times = RunTimes(config, peak=100.0)
+    for _ in range(4):
+        times.count(operations=50.0)
+        clock.now += 2.0
+    with times.other("save"):
+        clock.now += 1000.0
+    assert times.read(config.stages[0]).utilisation == pytest.approx(0.25)
+
+
+def test_means_are_of_finite_values_and_counters_are_the_last() -> None:
+    means = IntervalMeans()
+    for step, loss in enumerate([1.0, math.nan, 3.0]):
+        means.add({"loss/total": loss, "learning_rate": float(step), "skipped": float(step), "longest_skip": 1.0})
+    assert means.read() == {"loss/total": 2.0, "learning_rate": 2.0, "skipped": 2.0, "longest_skip": 1.0}
+    means.add({"loss/total": math.nan})
+    assert math.isnan(means.read()["loss/total"])
+
+
+def test_goodput_is_not_known_where_the_clock_was_set_back() -> None:
+    assert progress.goodput(60, 120) == "goodput 50%: 1:00 of training in 2:00 since the first start"
+    for wall in (59.0, -3600.0):
+        assert progress.goodput(60, wall).startswith("goodput not known, 1:00 of training in less time: the clock was")
+
+
+def test_a_line_says_what_a_person_looks_for() -> None:
+    values = {"loss/total": 1.5, "loss/camera": 0.5, "loss/depth": 1.0, "learning_rate": 3e-4}
+    values |= {"train/abs_rel": 0.1, "train/rotation_over_identity": 0.9, "train/translation_direction": 50.0}
+    speed = Speed(seconds=1.0, frames_per_second=19.0, data_share=0.02, utilisation=0.29)
+    line = progress_line(50, 100, "one", values, speed, memory=3 * 2**30, stage_seconds=61, run_seconds=3600)
+    assert line == (
+        "step 50/100 one: loss 1.5000 (camera 0.5, depth 1), abs_rel 0.100, rotation 0.90 of identity's, "
+        "direction 50°, rate 3.00e-04, 19 frames/s, utilisation 0.29, waiting for data 2%, memory 3.0 GiB, "
+        "1:01 left of the stage, 1:00:00 of the run"
+    )
+    assert progress.duration(59.6) == "1:00"
