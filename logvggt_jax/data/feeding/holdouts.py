@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 
 from logvggt_jax.data.dataset import Dataset
-from logvggt_jax.data.frame_range import FrameRange, shared_frames
+from logvggt_jax.data.feeding.frame_range import FrameRange, shared_frames
 from logvggt_jax.errors import InputError
 
 _SHOWN = 10

@@ -10,8 +10,8 @@ from absl import logging
 
 from logvggt_jax.data.dataset import Dataset, Reader
 from logvggt_jax.data.errors import EmptySplit
+from logvggt_jax.data.feeding.frame_range import FrameRange
 from logvggt_jax.data.feeding.holdouts import check_disjoint, check_held_out
-from logvggt_jax.data.frame_range import FrameRange
 from logvggt_jax.data.packed.index import is_packed
 from logvggt_jax.data.registry import DATASETS, READERS, open_dataset
 from logvggt_jax.errors import InputError

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from logvggt_jax.data import open_dataset
-from logvggt_jax.data.frame_range import FrameRange, shared_frames
+from logvggt_jax.data.feeding.frame_range import FrameRange, shared_frames
 from logvggt_jax.errors import InputError
 
 OPTIONS = {"height": 28, "width": 42, "num_frames": 10, "num_rooms": 2}
