@@ -246,7 +246,8 @@ def test_two_processes_train_one_model(tmp_path: Path) -> None:
     ours, theirs = (read_metrics(tmp_path / name / "metrics.jsonl") for name in ("two", "one"))
     assert [entry["step"] for entry in ours] == [entry["step"] for entry in theirs]
     # The first step's loss is of the same parameters and clips; later ones drift with the order of sums.
-    assert ours[0]["loss/total"] == pytest.approx(theirs[0]["loss/total"], rel=1e-4)
+    first = [next(entry["loss/total"] for entry in entries if "loss/total" in entry) for entries in (ours, theirs)]
+    assert first[0] == pytest.approx(first[1], rel=1e-4)
     assert ours[-1]["validation/abs_rel"] == pytest.approx(theirs[-1]["validation/abs_rel"], rel=0.05)
     two, one = (load_model(tmp_path / name / "model")[1] for name in ("two", "one"))
     for a, b in zip(jax.tree.leaves(two), jax.tree.leaves(one), strict=True):
