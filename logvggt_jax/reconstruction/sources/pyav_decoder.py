@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import itertools
 import math
 import re
 from collections import deque
@@ -37,6 +38,8 @@ _MOST_WAITING = 512
 # stand for no change. A decoder may drop a damaged packet of theirs without an error.
 _FRAME_A_PACKET = ("mpeg4", "h264", "hevc", "mjpeg")
 _EMPTY_PACKET = 8
+# Packets within which a stream that shows its frames in another order than it holds them does so.
+_MOST_UNTIL_REORDERED = 48
 
 
 class PyAVDecoder:
@@ -52,9 +55,12 @@ class PyAVDecoder:
         self._url, self._name, self._timeout = url, name, timeout
         # Packets before the first key frame.
         self._lead = 0
+        # Some writers number packets as they are stored, though their frames are shown in another order.
+        self._numbered_as_stored = False
 
     def header(self) -> VideoHeader:
         """See `VideoDecoder.header`."""
+        self._numbered_as_stored = self._is_numbered_as_stored()
         with self._open() as container:
             stream = self._stream(container)
             frame = next((frame for _, frame in self._decode(container, stream) if frame is not None), None)
@@ -180,7 +186,8 @@ class PyAVDecoder:
             if packet.dts is not None:
                 joined, last = joined or packet.dts < last, packet.dts
             key = packet.pts if key is None else key
-            if packet.size > _EMPTY_PACKET and packet.pts is not None and not packet.is_discard:
+            holds_frame = packet.size > (0 if self._numbered_as_stored else _EMPTY_PACKET)
+            if holds_frame and packet.pts is not None and not packet.is_discard:
                 heapq.heappush(waiting, packet.pts)
                 if len(waiting) > _MOST_WAITING:
                     heapq.heappop(waiting)
@@ -195,7 +202,12 @@ class PyAVDecoder:
                 else:
                     failures.append(str(error.strerror))
             for frame in frames:
-                if frame.pts is not None:
+                if self._numbered_as_stored:
+                    for reason in failures:
+                        yield Damage(_seconds(waiting, stream.time_base), reason), None
+                    failures.clear()
+                    frame.pts = heapq.heappop(waiting) if waiting else None
+                elif frame.pts is not None:
                     each = stream.codec_context.name in _FRAME_A_PACKET and not is_interlaced(frame, stream)
                     since = None if joined or not each else key
                     missing = _missing(waiting, failures, frame.pts, stream.time_base, since)
@@ -204,8 +216,28 @@ class PyAVDecoder:
         if stream.width * stream.height > _LARGE:
             failures.extend("cannot be decoded" for _ in waiting[len(failures) :])
         for reason in failures:
-            stamp = heapq.heappop(waiting) if waiting else None
-            yield Damage(None if stamp is None else float(stamp * stream.time_base), reason), None
+            yield Damage(_seconds(waiting, stream.time_base), reason), None
+
+    def _is_numbered_as_stored(self) -> bool:
+        """Whether the packets' time stamps only grow, and the frames' do not."""
+        with self._open() as container:
+            stream = self._stream(container)
+            if not stream.codec_context.has_b_frames:
+                return False
+            stored = shown = -math.inf
+            for packet in itertools.islice(self._packets(container, stream), _MOST_UNTIL_REORDERED):
+                if isinstance(packet, str) or (packet.pts is not None and packet.pts < stored):
+                    return False
+                stored = stored if packet.pts is None else packet.pts
+                try:
+                    stamps = [frame.pts for frame in packet.decode() if frame.pts is not None]
+                except av.FFmpegError:
+                    return False
+                for stamp in stamps:
+                    if stamp < shown:
+                        return True
+                    shown = stamp
+        return False
 
     def _packets(
         self, container: av.container.InputContainer, stream: av.video.stream.VideoStream
@@ -257,6 +289,11 @@ def _missing(
         stamp = heapq.heappop(waiting)
         if stamp < shown and (failures or (since is not None and stamp >= since)):
             yield Damage(float(stamp * time_base), failures.popleft() if failures else "gives no picture")
+
+
+def _seconds(waiting: list[int], time_base: Fraction) -> float | None:
+    """When the first of the frames that wait is shown; takes it from `waiting`."""
+    return float(heapq.heappop(waiting) * time_base) if waiting else None
 
 
 def _likely_frames(stated: int, seconds: float | None, rate: Fraction | None) -> int | None:
