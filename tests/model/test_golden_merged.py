@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from pathlib import Path
+from typing import Any
 
 import golden_methods
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import struct
 from golden_methods import POSES, TOKENS, Golden, assert_depth
 
 from logvggt_jax import LogVGGT
-from logvggt_jax.model.memory import Keys, OwnTokens
+from logvggt_jax.model import merging as merging_module
+from logvggt_jax.model.memory import Attend, Keys, OwnTokens, Project
 from logvggt_jax.model.merging import TokenMerging
 from logvggt_jax.model.parameters import run
 from logvggt_jax.streaming import MergedSettings
@@ -21,6 +25,36 @@ from logvggt_jax.streaming.merged import merging_for
 from logvggt_jax.streaming.offline import plain_vggt
 
 RUNS = ("default", "exact", "low", "zero")
+SIMILARITIES = 2e-6
+
+
+@struct.dataclass
+class Recorded(TokenMerging):
+    """A merging that notes what every layer does.
+
+    Attributes:
+      layer: static, of the block at hand.
+      notes: static, a function of the layer and of arrays by name.
+    """
+
+    layer: int = struct.field(pytree_node=False, default=-1)
+    notes: Any = struct.field(pytree_node=False, default=None)
+
+    def at(self, layer: int) -> Recorded:
+        return dataclasses.replace(self, layer=layer)
+
+    def attend(self, own: OwnTokens, attention: Attend, project: Project) -> tuple[jax.Array, TokenMerging]:
+        place, cosine = self.nearest(own.normed[0])
+        kept, merged, _ = self._assignment(own.normed[0])
+
+        def noted(query: jax.Array, keys: Keys) -> jax.Array:
+            arrays = {"place": place, "cosine": cosine, "kept": kept, "merged": merged, "normed": own.normed[0]}
+            rows = {"q": query, "k": keys.key, "v": keys.value}
+            arrays |= {f"{name}_merged": x[0].reshape(x.shape[1], -1) for name, x in rows.items()}
+            jax.debug.callback(functools.partial(self.notes, self.layer), **arrays)
+            return attention(query, keys)
+
+        return super().attend(own, noted, project)
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +104,14 @@ def test_golden_values(golden: Golden, name: str) -> None:
         out = windows.decode_dense(params, tokens, mask, size)
         return tokens.key[0], model.refinement.decode_cameras(params, out.camera_tokens, mask)[0], out
 
+    notes: dict[int, dict[str, np.ndarray]] = {}
+    if merging is not None:
+        fields = {field.name: getattr(merging, field.name) for field in dataclasses.fields(merging)}
+        merging = Recorded(**fields, notes=lambda layer, **arrays: notes.update({layer: arrays}))
     key, poses, out = jax.device_get(run_model(params, images, merging))
+    jax.effects_barrier()
+    if merging is not None:
+        _assert_assignments(golden, name, merging, jax.tree.map(np.asarray, notes))
     for i, layer in enumerate(golden.settings["layers"]):
         expected = arrays[f"{name}_tokens_{layer:02d}"]
         found = key[i] if expected.shape[1] == key.shape[2] else key[i][:, arrays["token_index"]]
@@ -79,6 +120,51 @@ def test_golden_values(golden: Golden, name: str) -> None:
     every = 1 if name == "default" else 2
     for found, expected in ((out.depth, "depth"), (out.depth_confidence, "depth_conf")):
         assert_depth(found[0, :, ::every, ::every], arrays[f"{name}_{expected}"])
+
+
+def _assert_assignments(golden: Golden, name: str, merging: Recorded, notes: dict[int, dict[str, np.ndarray]]) -> None:
+    """Each source's destination, its cosine, what is merged and how far the second best lies, in all layers; merged
+    queries, keys and values of some, and what these layers spread to all tokens."""
+    arrays, heads = golden.arrays, golden.config.aggregator.num_heads
+    free = ~np.isin(arrays["source_tokens"], arrays["protected_tokens"])
+    assert sorted(notes) == list(range(golden.config.aggregator.depth))
+    for layer, note in notes.items():
+        np.testing.assert_array_equal(note["place"], arrays[f"{name}_best_destination"][layer][free], str(layer))
+        cosines = arrays[f"{name}_best_similarity"][layer][free]
+        # In bfloat16 a cosine is one of few: the last digit of what was rounded decides between neighbours.
+        tolerance = SIMILARITIES if merging.similarity == "float32" else 2**-8
+        np.testing.assert_allclose(note["cosine"], cosines, rtol=0, atol=tolerance)
+        merged = arrays["source_tokens"][arrays[f"{name}_source_is_merged"][layer].astype(bool)]
+        assert set(note["merged"]) == set(merged)
+        unit = note["normed"] / np.linalg.norm(note["normed"].astype(np.float64), axis=1, keepdims=True)
+        two = np.sort(unit[arrays["source_tokens"]] @ unit[arrays["destination_tokens"]].T, axis=1)[:, -2:]
+        gap = arrays[f"{name}_similarity_gap"][layer]
+        np.testing.assert_allclose((two[:, 1] - two[:, 0])[free], gap[free], rtol=0, atol=2 * SIMILARITIES)
+    if f"{name}_l{golden.settings['detail_layers'][0]:02d}_q_merged" not in arrays:
+        return
+    for layer in golden.settings["detail_layers"]:
+        note, stem = notes[layer], f"{name}_l{layer:02d}"
+        np.testing.assert_array_equal(note["kept"], arrays[f"{stem}_unmerged_sources"])
+        for rows in ("q_merged", "k_merged", "v_merged"):
+            np.testing.assert_allclose(note[rows], arrays[f"{stem}_{rows}"], rtol=0, atol=TOKENS)
+        given = jnp.asarray(arrays[f"{stem}_attn_projected"])
+        nothing = jnp.zeros((1, len(note["normed"]), heads, given.shape[1] // heads))
+        own = OwnTokens(jnp.asarray(note["normed"][None]), nothing, Keys(nothing, nothing, None))
+        spread, _ = TokenMerging.attend(
+            merging, own, lambda *_, given=given: given.reshape(1, len(given), heads, -1), lambda _, own=own: own.keys
+        )
+        expected = arrays[f"{stem}_attn_unmerged"]
+        np.testing.assert_array_equal(spread[0].reshape(expected.shape), expected)
+
+
+def test_the_draws_are_the_originals(golden: Golden) -> None:
+    """Of each whole 2 x 2 cell the patch that the generator chose, in every frame but the first."""
+    draws, images = golden.arrays["rand_draws"], golden.arrays["images_u8"]
+    chosen = merging_module._chosen_of_cells(len(images) - 1, (images.shape[1] // 14, images.shape[2] // 14))
+    rows, columns = draws.shape[1:]
+    cells = chosen.reshape(-1, rows, 2, columns, 2).transpose(0, 1, 3, 2, 4).reshape(*draws.shape, 4)
+    np.testing.assert_array_equal(cells.argmax(-1), draws)
+    assert (cells.sum(-1) == 1).all()
 
 
 @pytest.mark.parametrize("index", [0, 1])
@@ -97,7 +183,7 @@ def test_golden_steps_of_a_layer(golden: Golden, index: int) -> None:
     place, cosine = merging.nearest(jnp.asarray(stored("metric")))
     free = ~np.isin(arrays["source_tokens"], arrays["protected_tokens"])
     np.testing.assert_array_equal(place, arrays["default_best_destination"][layer][free])
-    np.testing.assert_allclose(cosine, arrays["default_best_similarity"][layer][free], rtol=0, atol=2e-6)
+    np.testing.assert_allclose(cosine, arrays["default_best_similarity"][layer][free], rtol=0, atol=SIMILARITIES)
 
     def attention(query: jax.Array, keys: Keys) -> jax.Array:
         for found, key in ((query, "q"), (keys.key, "k"), (keys.value, "v")):

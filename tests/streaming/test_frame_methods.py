@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from logvggt_jax import LogVGGT, ModelConfig
+from logvggt_jax.compile import counted_compilations
 from logvggt_jax.errors import InputError
 from logvggt_jax.model.frame_by_frame import FrameByFrame
 from logvggt_jax.streaming import (
@@ -218,19 +219,27 @@ def test_bytes_of_a_pruned_state(small_config: ModelConfig, small_variables: dic
 
 
 def test_one_program_serves_all_frames(small_config: ModelConfig, small_variables: dict) -> None:
-    """Nothing compiles again but where buffers double: at 3, 5 and 9 frames of a cache that starts with two."""
+    """Nothing compiles again but where buffers double: at 3, 5 and 9 frames of a cache that starts with two. Streams
+    are three times as long as what the bounded ones keep; small programs of single operations count as well."""
     # A model of another configuration has compiled nothing yet.
     config = dataclasses.replace(small_config, refinement=dataclasses.replace(small_config.refinement, enabled=False))
-    for method, settings, programs in (
-        ("causal", CausalSettings(first_capacity=2), 4),
-        ("anchored-window", AnchoredWindowSettings(), 1),
-        ("rolling", SMALL_BUDGET, 1),
-        ("pruned", PrunedSettings(SMALL_CAP), 1),
-        ("pruned", PrunedSettings(SMALL_CAP, 16, first_capacity=2), 2),
+    for method, settings, compiling in (
+        ("causal", CausalSettings(first_capacity=2), {0, 2, 4, 8}),
+        ("anchored-window", AnchoredWindowSettings(window=2), {0}),
+        ("rolling", SMALL_BUDGET, {0}),
+        ("pruned", PrunedSettings(SMALL_CAP), {0}),
+        ("pruned", PrunedSettings(SMALL_CAP, 16, first_capacity=2), {0, 2}),
     ):
         before = frame_session._step._cache_size(), frame_session._locate._cache_size()
-        run(method, config, small_variables, settings)
-        assert frame_session._step._cache_size() - before[0] == programs, method
+        stream, counts = opened(method, config, small_variables, settings), [0]
+        with counted_compilations() as compilations:
+            for image in IMAGES:
+                stream.push(image)
+                counts.append(compilations())
+            stream.close()
+            counts[-1] = compilations()
+        assert set(np.flatnonzero(np.diff(counts))) == compiling, method
+        assert frame_session._step._cache_size() - before[0] == len(compiling), method
         assert frame_session._locate._cache_size() - before[1] <= 1, method
 
 
@@ -277,6 +286,10 @@ def test_a_layer_whose_budget_exceeds_its_share_gets_room(small_config: ModelCon
         (lambda: CausalSettings("shared"), "CausalSettings.camera_cache must be one of 'per_round', 'single'"),
         (lambda: CausalSettings(first_capacity=0), "CausalSettings.first_capacity must be a positive integer"),
         (lambda: AnchoredWindowSettings(window=0), "AnchoredWindowSettings.window must be a positive integer, got 0"),
+        (lambda: AnchoredWindowSettings(window=2**62), "AnchoredWindowSettings.window must lie in"),
+        (lambda: CausalSettings(first_capacity=2**62), "CausalSettings.first_capacity must lie in"),
+        (lambda: PrunedSettings(first_capacity=2**62), "PrunedSettings.first_capacity must lie in"),
+        (lambda: RollingSettings(first_capacity=2**62), "RollingSettings.first_capacity must lie in"),
         (lambda: PrunedSettings(cap=0), "PrunedSettings.cap must be a positive integer, got 0"),
         (lambda: PrunedSettings(bits=8), "PrunedSettings.bits must be one of 4, 16, got 8"),
         (lambda: RollingSettings(budget=0), "RollingSettings.budget must be a positive integer, got 0"),
@@ -317,7 +330,7 @@ def test_a_cap_below_a_frame(small_config: ModelConfig, small_variables: dict) -
 @pytest.mark.parametrize(
     ("method", "settings"),
     [
-        ("causal", CausalSettings()),
+        ("causal", CausalSettings(first_capacity=2)),
         ("rolling", RollingSettings(budget=2 * LAYERS * (5 + 1 * 2))),
         ("pruned", PrunedSettings(cap=16)),
     ],
