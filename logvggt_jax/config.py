@@ -91,8 +91,9 @@ def require_within(config: Any, interval: str, *names: str) -> None:
         value = getattr(config, name)
         if value is None:
             continue
-        above = value >= low if interval[0] == "[" else value > low
-        below = value <= high if interval[-1] == "]" else value < high
+        number = _is_number(value, numbers.Real)
+        above = number and (value >= low if interval[0] == "[" else value > low)
+        below = number and (value <= high if interval[-1] == "]" else value < high)
         if not (above and below):
             raise InputError(f"{type(config).__name__}.{name} must lie in {interval}, got {value!r}")
 

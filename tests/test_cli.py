@@ -256,11 +256,11 @@ def test_bad_input_is_one_line_and_exit_code_2(
     assert_fails(capsys, reconstruct(room, tmp_path / "no-model", "--longer-edge", "50"), "longer_edge", "14", "50")
     assert_fails(capsys, reconstruct(room, checkpoint, "--confidence-percentile", "120"), "confidence_percentile")
     assert_fails(capsys, reconstruct(room, checkpoint, "--stride", "0"), "stride")
-    assert_fails(capsys, reconstruct(room, checkpoint, "--chunk-size", "8"), "--chunk-size needs --mode chunks")
+    assert_fails(capsys, reconstruct(room, checkpoint, "--chunk-size", "8"), "--chunk-size needs --method chunks")
     chunks = ("--mode", "chunks", "--chunk-size", "8", "--chunk-overlap", "30")
     assert_fails(capsys, reconstruct(room, checkpoint, *chunks), "chunk overlap must be", "8, got 30")
     both = ("--mode", "chunks", "--chunk-size", "8", "--setting", "overlap=2")
-    assert_fails(capsys, reconstruct(room, checkpoint, *both), "--chunk-size needs --mode chunks without --setting")
+    assert_fails(capsys, reconstruct(room, checkpoint, *both), "--chunk-size needs --method chunks without --setting")
     for method, setting, words in (
         ("pruned", "cap", ("expected NAME=VALUE",)),
         ("pruned", "caps=9", ("unknown field pruned.caps", "did you mean cap")),

@@ -124,7 +124,7 @@ def test_intervals_are_those_of_mathematics(
 ) -> None:
     for value in (*inside, None):
         require_within(types.SimpleNamespace(x=value), interval, "x")
-    for value in (*outside, math.nan):
+    for value in (*outside, math.nan, "1", True):
         with pytest.raises(InputError, match=r"SimpleNamespace\.x must lie in"):
             require_within(types.SimpleNamespace(x=value), interval, "x")
 

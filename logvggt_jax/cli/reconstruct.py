@@ -126,7 +126,7 @@ def _settings(options: argparse.Namespace, method: str) -> Any:
         return ChunkPlan(size, overlap, options.loops)
     for name, value in {"--chunk-size": options.chunk_size, "--chunk-overlap": options.chunk_overlap}.items():
         if value is not None:
-            raise InputError(f"{name} needs --mode chunks{' without --setting' if options.setting else ''}")
+            raise InputError(f"{name} needs --method chunks{' without --setting' if options.setting else ''}")
     if method not in ("chunks", "windows") and options.loops:
         raise InputError(f"--loops needs --method chunks or windows, not {method}")
     given = dict(map(_setting, options.setting or ()))

@@ -17,8 +17,11 @@ from logvggt_jax.evaluation.report.report import write_report
 from logvggt_jax.evaluation.runner import evaluate
 from logvggt_jax.evaluation.settings import ClipRun, PaperRun, read_run
 from logvggt_jax.files import check_output
-from logvggt_jax.streaming import METHODS, expectation
+from logvggt_jax.streaming import expectation
 from logvggt_jax.weights.checkpoints import read_provenance
+
+# Rows that a run has unless it says otherwise.
+_REFERENCES = ("offline", "chunks")
 
 
 def run_evaluation(
@@ -101,8 +104,11 @@ def _row(method: str, checkpoint: Checkpoint, settings: Any, trained_for: str | 
 
 
 def _warn_of_unsuited(trained_for: str | None, methods: Sequence[str]) -> None:
-    """One warning for all methods that the weights were not trained for; plain VGGT is a reference row of every run."""
-    unsuited = [name for name in methods if METHODS[name].trained_for != "vggt" and expectation(trained_for, name)]
+    """One warning for all methods that the weights were not trained for; beside a method of theirs, plain VGGT is a
+    reference."""
+    unsuited = [name for name in methods if expectation(trained_for, name)]
+    if len(unsuited) < len(methods):
+        unsuited = [name for name in unsuited if name not in _REFERENCES]
     if unsuited:
         warnings.warn(
             f"these weights were trained for {trained_for}, not for {', '.join(unsuited)}: expect worse cameras and "

@@ -23,11 +23,11 @@ def choose_method(provenance: Provenance, asked: str | None = None) -> str:
     chosen = asked or _PREFERRED[provenance.trained_for]
     trained_for = provenance.trained_for
     if expect := expectation(trained_for, chosen):
-        warnings.warn(f"{expect}; leave --mode out for {_PREFERRED[trained_for]}", stacklevel=2)
+        warnings.warn(f"{expect}; leave --method out for {_PREFERRED[trained_for]}", stacklevel=2)
     elif trained_for is None and asked is None:
         warnings.warn(
             "the model folder does not say what its weights were trained for, and windows are taken; if they are "
-            "public VGGT's, pass --mode chunks, or convert them again",
+            "public VGGT's, pass --method chunks, or convert them again",
             stacklevel=2,
         )
     return chosen

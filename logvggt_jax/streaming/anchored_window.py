@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from logvggt_jax.config import ModelConfig, require_counts
+from logvggt_jax.config import ModelConfig, require_counts, require_within
 from logvggt_jax.model.key_value_cache import AnchoredCache, Caches, empty
 from logvggt_jax.streaming.frame_session import StreamMemory, block_shape, camera_memory
 
@@ -27,6 +27,7 @@ class AnchoredWindowSettings:
 
     def __post_init__(self) -> None:
         require_counts(self, "window")
+        require_within(self, "[1, 2147483647]", "window")
         require_counts(self, "ahead", least=0)
 
 

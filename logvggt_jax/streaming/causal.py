@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Literal
 
-from logvggt_jax.config import ModelConfig, require_counts, require_one_of
+from logvggt_jax.config import ModelConfig, require_counts, require_one_of, require_within
 from logvggt_jax.model.key_value_cache import Caches, GrowingCache, empty
 from logvggt_jax.streaming.frame_session import (
     CAMERA_CAPACITY,
@@ -42,6 +42,7 @@ class CausalSettings:
     def __post_init__(self) -> None:
         require_one_of(self, CAMERA_CACHES, "camera_cache")
         require_counts(self, "first_capacity")
+        require_within(self, "[1, 2147483647]", "first_capacity")
         require_counts(self, "ahead", least=0)
 
 

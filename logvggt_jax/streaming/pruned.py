@@ -6,7 +6,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Literal
 
-from logvggt_jax.config import ModelConfig, require_counts, require_one_of
+from logvggt_jax.config import ModelConfig, require_counts, require_one_of, require_within
 from logvggt_jax.errors import InputError
 from logvggt_jax.model.key_value_cache import AnchoredCache, Caches, CameraMemory, empty
 from logvggt_jax.model.memory import RoundMemory
@@ -44,6 +44,7 @@ class PrunedSettings:
         require_one_of(self, (4, 16), "bits")
         require_one_of(self, CAMERA_CACHES, "camera_cache")
         require_counts(self, "cap", "first_capacity")
+        require_within(self, "[1, 2147483647]", "first_capacity")
         require_counts(self, "ahead", least=0)
 
 

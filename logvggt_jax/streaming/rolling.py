@@ -59,7 +59,7 @@ class RollingSettings:
     def __post_init__(self) -> None:
         require_one_of(self, CAMERA_CACHES, "camera_cache")
         require_counts(self, "budget", "first_capacity")
-        require_within(self, "[1, 2147483647]", "budget")
+        require_within(self, "[1, 2147483647]", "budget", "first_capacity")
         require_within(self, "(0, inf)", "temperature")
         require_counts(self, "anchor", "ahead", least=0)
 

@@ -125,11 +125,15 @@ def test_the_model_and_all_baselines_make_a_table(
 def test_weights_in_methods_that_are_not_theirs_are_warned_of_once(
     small_config: ModelConfig, small_variables: dict[str, Any]
 ) -> None:
-    """Plain VGGT is a reference row of every run, whose line in the report says it."""
+    """Beside the weights' own method plain VGGT is a reference, whose line in the report says it."""
     checkpoint = Checkpoint(LogVGGT(small_config), small_variables, "digest")
     with pytest.warns(UserWarning, match=r"trained for windows, not for causal, pruned: expect worse") as caught:
         run_module._warn_of_unsuited("windows", ("windows", "causal", "offline", "pruned"))
     assert len(caught) == 1
+    for methods, unsuited in ((("windows", "offline", "merged"), "merged"), (("offline", "chunks"), "offline, chunks")):
+        with pytest.warns(UserWarning, match=f"not for {unsuited}: expect worse") as caught:
+            run_module._warn_of_unsuited("windows", methods)
+        assert len(caught) == 1
     run_module._warn_of_unsuited("windows", ("windows", "offline", "chunks"))
     run_module._warn_of_unsuited(None, ("causal",))
     assert "as they have never seen it" in run_module._row("causal", checkpoint, None, "windows").knows
