@@ -38,12 +38,14 @@ def get_config() -> ConfigDict:
     )
     # Tokens are those of the tiny model: 25 a frame of 56 x 70 pixels, four layers. All bounded methods are full well
     # before the longest clip ends: 12 frames of every layer, the first frame, the newest and six frames' worth of
-    # others, 12 frames of a chunk.
+    # others, 12 frames of a chunk. The other values are the defaults, here so that the command line can change them.
     config.settings = ConfigDict(
         {
+            "causal": {"camera_cache": "per_round"},
             "anchored-window": {"window": 5},
-            "rolling": {"budget": 12 * 25 * 4},
-            "pruned": {"cap": 8 * 25},
+            "rolling": {"budget": 12 * 25 * 4, "temperature": 0.5, "camera_cache": "per_round"},
+            "pruned": {"cap": 8 * 25, "bits": 4, "camera_cache": "per_round"},
+            "merged": {"ratio": 0.9, "similarity": "bfloat16"},
             "chunks": {"size": 12, "overlap": 6},
         }
     )

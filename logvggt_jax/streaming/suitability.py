@@ -11,7 +11,7 @@ _EXPECT: dict[tuple[str | None, str], str] = {
     ("vggt", "causal"): "these weights are public VGGT's, where every frame saw all others, and {method} shows a frame "
     "earlier ones alone: cameras and depth get worse from the first frame on",
     ("windows", "vggt"): "these weights were trained on windows with memory between them, and {method} shows them more "
-    "frames at once than they have ever seen",
+    "frames at once than they have ever seen: expect worse cameras and depth",
     ("windows", "causal"): "these weights were trained on windows with memory between them at the key layers, and "
     "{method} gives all layers a memory and frames one by one, as they have never seen it: expect worse cameras and "
     "depth",
