@@ -81,20 +81,18 @@ def _streamed(method: str, subject: Subject, variables: Any, pictures: np.ndarra
         settings = RollingSettings(first_capacity=2 * frames)
 
     def ends() -> list[float]:
-        """When the results of each push were there, seconds."""
-        predictor, found = open_predictor(method, subject.model, variables, settings), []
+        """When the stream began and when the results of each push were there, seconds."""
+        predictor, found = open_predictor(method, subject.model, variables, settings), [time.perf_counter()]
         for index in range(frames):
             predictor.push(pictures[index % len(pictures)])
             found.append(time.perf_counter())
         predictor.close()
         return found
 
-    started = time.perf_counter()
-    first = ends()
-    yield Finding(method, "first frame, compilation", first[0] - started, "s")
-    seconds = ends()
+    first, seconds = ends(), ends()
+    yield Finding(method, f"compilation, {frames} frames", first[-1] - first[0] - (seconds[-1] - seconds[0]), "s")
     # A push returns the results of the one before: the first ones only fill the pipeline.
-    early = _SPAN / (seconds[1 + _SPAN] - seconds[1])
+    early = _SPAN / (seconds[2 + _SPAN] - seconds[2])
     late = _SPAN / (seconds[-1] - seconds[-1 - _SPAN])
     yield _rate(method, f"frames/s, frames 2 to {1 + _SPAN}", early, 0, subject)
     yield _rate(method, f"frames/s, frames {frames - _SPAN} to {frames - 1}", late, STREAMED - 1, subject)
