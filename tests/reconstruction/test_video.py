@@ -7,6 +7,7 @@ import os
 import socket
 import sys
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -23,9 +24,11 @@ from logvggt_jax.reconstruction.sources import (
     SourceOptions,
     VideoSource,
     open_source,
+    opencv_decoder,
     pyav_decoder,
     video,
 )
+from logvggt_jax.reconstruction.sources.decoding import Picture
 from logvggt_jax.reconstruction.sources.sampling import FrameClock, expected_frames
 
 HEIGHT, WIDTH = 48, 64
@@ -798,6 +801,38 @@ def test_a_stream_that_says_nothing_is_given_up(library: str, monkeypatch: pytes
         source = open_source(f"http://127.0.0.1:{silent.getsockname()[1]}/live")
         with pytest.raises(InputError, match=r"0\.5 s"):
             list(source)
+
+
+def test_a_stream_that_falls_silent_is_waited_for_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[float] = []
+
+    class Stream:
+        def __init__(self, *arguments: object) -> None:
+            pass
+
+        def isOpened(self) -> bool:
+            return True
+
+        def grab(self) -> bool:
+            asked.append(time.monotonic())
+            if len(asked) <= 3:
+                return True
+            time.sleep(0.05)
+            return False
+
+        def retrieve(self) -> tuple[bool, np.ndarray]:
+            return True, grey(len(asked))
+
+        def get(self, name: int) -> float:
+            return 0.0
+
+        def release(self) -> None:
+            pass
+
+    monkeypatch.setattr(cv2, "VideoCapture", Stream)
+    pictures = list(opencv_decoder.OpenCVDecoder("rtsp://camera.local/live", "stream", 0.05).pictures())
+    assert sum(isinstance(each, Picture) for each in pictures) == 3
+    assert len(asked) == 4
 
 
 def test_digits_name_a_camera_unless_they_are_a_path(
