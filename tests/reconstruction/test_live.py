@@ -230,6 +230,15 @@ def test_a_stream_that_comes_back_goes_on(monkeypatch: pytest.MonkeyPatch) -> No
     assert times[3] - times[2] > 0.01
 
 
+def test_time_goes_on_from_where_a_fast_clock_was_when_the_stream_was_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(capture, "_PAUSE", 0.01)
+    results: list[LiveResult] = []
+    follow(FakeCamera(3, 2, step=10.0), session(on_result=results.append), reconnect=0.05)
+    steps = np.diff([each.timestamp for each in results])
+    np.testing.assert_allclose(steps[[0, 1, 3]], 10.0)
+    assert 0.01 < steps[2] < 5
+
+
 def test_a_video_is_played_at_its_own_pace_and_its_end_is_no_loss(tmp_path: Path) -> None:
     live = session(recording=Recording(tmp_path / "out", workers=1))
     began = time.monotonic()
