@@ -10,6 +10,8 @@ RUN pip install --no-cache-dir ".[${EXTRAS}]" && rm -rf /build
 
 RUN useradd --uid 1000 --create-home logvggt
 USER logvggt
+# A named volume that is mounted here gets this owner.
+RUN mkdir ~/.cache
 WORKDIR /data
 ENTRYPOINT ["logvggt"]
 CMD ["--help"]

@@ -7,6 +7,7 @@ import os
 import socket
 import sys
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -23,9 +24,11 @@ from logvggt_jax.reconstruction.sources import (
     SourceOptions,
     VideoSource,
     open_source,
+    opencv_decoder,
     pyav_decoder,
     video,
 )
+from logvggt_jax.reconstruction.sources.decoding import Picture
 from logvggt_jax.reconstruction.sources.sampling import FrameClock, expected_frames
 
 HEIGHT, WIDTH = 48, 64
@@ -798,6 +801,47 @@ def test_a_stream_that_says_nothing_is_given_up(library: str, monkeypatch: pytes
         source = open_source(f"http://127.0.0.1:{silent.getsockname()[1]}/live")
         with pytest.raises(InputError, match=r"0\.5 s"):
             list(source)
+
+
+def test_a_stream_that_falls_silent_is_waited_for_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+    monkeypatch.setattr(cv2, "VideoCapture", lambda *_: silent_stream([0, 0, 40], asked))
+    pictures = list(opencv_decoder.OpenCVDecoder("rtsp://camera.local/live", "stream", 0.05).pictures())
+    assert sum(isinstance(each, Picture) for each in pictures) == 3
+    assert len(asked) == 4
+
+
+def test_a_stream_whose_clock_begins_late_has_its_times(monkeypatch: pytest.MonkeyPatch, opencv_only: None) -> None:
+    monkeypatch.setattr(video, "_TIMEOUT", 0.01)
+    # As OpenCV gives those of an RTSP server.
+    monkeypatch.setattr(cv2, "VideoCapture", lambda *_: silent_stream([0, 0, 67, 133, 200], []))
+    seconds = times(list(open_source("rtsp://camera.local/live", most_broken=1.0)))
+    np.testing.assert_allclose(seconds, [0, 1 / 30, 0.067, 0.133, 0.2], atol=1e-6)
+
+
+def silent_stream(stamps: Sequence[float], asked: list[int]) -> Any:
+    """Stands for OpenCV's `VideoCapture`: frames at these milliseconds, then it waits and fails."""
+
+    class Stream:
+        def isOpened(self) -> bool:
+            return True
+
+        def grab(self) -> bool:
+            asked.append(len(asked))
+            if len(asked) > len(stamps):
+                time.sleep(0.05)
+            return len(asked) <= len(stamps)
+
+        def retrieve(self) -> tuple[bool, np.ndarray]:
+            return True, grey(len(asked))
+
+        def get(self, name: int) -> float:
+            return stamps[len(asked) - 1] if name == cv2.CAP_PROP_POS_MSEC and asked else 0.0
+
+        def release(self) -> None:
+            pass
+
+    return Stream()
 
 
 def test_digits_name_a_camera_unless_they_are_a_path(

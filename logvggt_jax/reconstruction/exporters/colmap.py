@@ -31,7 +31,7 @@ def export_colmap(
 
     Where the result has masks, `masks/` has one for each image, `NAME.jpg.png`, black where nothing is to be seen.
     Cameras are PINHOLE at the size of the pictures, one for frames of equal intrinsics; the centre of the first pixel
-    is at (0.5, 0.5), as COLMAP has it.
+    is at (0.5, 0.5), as COLMAP has it. Points that one frame alone sees have no observation.
 
     Args:
       result: the reconstruction.
@@ -46,7 +46,7 @@ def export_colmap(
     pycolmap = library("pycolmap")
     pictures = Pictures.of(result)
     files = [f"{stem}.jpg" for stem in file_stems(result.names)]
-    tracks = find_tracks(result, point_filter, progress=progress)
+    tracks = _of_several_frames(find_tracks(result, point_filter, progress=progress))
     model = build_model(
         pycolmap, result.extrinsics, pictures.intrinsics, pictures.size, files, tracks, result.depth_size
     )
@@ -59,6 +59,15 @@ def export_colmap(
 
 
 export_colmap_text = partial(export_colmap, text=True)
+
+
+def _of_several_frames(tracks: Tracks) -> Tracks:
+    """The same points, without the one observation of those that have no other.
+
+    COLMAP's bundle adjustment ends the process where it finds such a point.
+    """
+    kept = np.bincount(tracks.indices, minlength=len(tracks.points))[tracks.indices] > 1
+    return tracks._replace(frames=tracks.frames[kept], indices=tracks.indices[kept], pixels=tracks.pixels[kept])
 
 
 def _write_masks(result: Reconstruction, folder: Path, files: list[str], size: tuple[int, int]) -> None:

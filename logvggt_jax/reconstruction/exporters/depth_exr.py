@@ -1,4 +1,4 @@
-"""Depth of every frame as OpenEXR, in a channel called Z."""
+"""Depth of every frame as OpenEXR, in the channels Z and Y."""
 
 from __future__ import annotations
 
@@ -16,13 +16,17 @@ def export_depth_exr(
 ) -> None:
     """Fills a folder with `<frame>.exr`, 32-bit floats at the size of the original images, and `depth.json`.
 
+    Z is the name that the format has for depth. OpenCV and others look for a picture alone and give other numbers
+    without a word where there is none: Y, a picture's brightness, holds the same, and is compressed to almost nothing.
+
     Raises MissingPackage without OpenEXR.
     """
     exr = library("OpenEXR")
     header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
 
     def write(file: Path, index: int) -> None:
-        with atomic_file(file) as temporary, exr.File(header, {"Z": original_depth(result, index)}) as picture:
+        depth = original_depth(result, index)
+        with atomic_file(file) as temporary, exr.File(header, {"Y": depth, "Z": depth}) as picture:
             picture.write(str(temporary))
 
     write_depth_folder(result, path, ".exr", write, {"channel": "Z"}, progress=progress)

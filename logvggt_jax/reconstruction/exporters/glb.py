@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -37,8 +38,9 @@ def export_glb(
 ) -> None:
     """Writes points, frusta of at most 500 cameras, and a camera that is animated along the path.
 
-    Axes are glTF's (x right, y up, z backward of the result's world). The animation has the frames' time stamps from
-    the first on; where they are positions and not times, it shows ten frames a second.
+    Axes are glTF's (x right, y up, z backward of the result's world). Its cameras look through the middle of their
+    pictures and keep their lens: the animated one has the median of the focal lengths. The animation has the frames'
+    time stamps from the first on; where they are positions and not times, it shows ten frames a second.
 
     Args:
       result: the reconstruction.
@@ -91,12 +93,14 @@ def _add_camera(
 ) -> None:
     """Adds the camera and its animation to a glTF document before its buffers are laid out (trimesh writes neither)."""
     height, width = result.image_size
+    across = width / 2 / float(np.median(result.intrinsics[:, 0, 0]))
+    upright = height / 2 / float(np.median(result.intrinsics[:, 1, 1]))
     tree["cameras"] = [
         {
             "type": "perspective",
             "perspective": {
-                "aspectRatio": width / height,
-                "yfov": 2 * float(np.arctan(height / 2 / np.median(result.intrinsics[:, 1, 1]))),
+                "aspectRatio": across / upright,
+                "yfov": 2 * math.atan(upright),
                 "znear": span / 1000,
             },
         }

@@ -37,6 +37,7 @@ class Capture:
         self.reason: Exception | None = None
         self._stop = threading.Event()
         self._began = self._last = time.monotonic()
+        self._newest = 0.0  # the time stamp that was pushed last
         # A thread that waits for a camera cannot be ended.
         self._thread = threading.Thread(target=self._run, name="capture", daemon=True)
 
@@ -79,11 +80,12 @@ class Capture:
             if frame is None:
                 continue
             now = time.monotonic()
-            if offset is None:
-                offset = 0.0 if self._session.report().received == 0 else now - self._began - frame.timestamp
-                if offset == 0.0:
-                    self._began = now - frame.timestamp
-            timestamp = offset + frame.timestamp
+            if offset is None and self._session.report().received == 0:
+                offset, self._began = 0.0, now - frame.timestamp
+            elif offset is None:
+                # A stream's own clock may be ahead of ours; time goes on from where it was.
+                offset = self._newest + now - self._last - frame.timestamp
+            timestamp = self._newest = offset + frame.timestamp
             self._session.times.add("capture", now - asked)
             if self._realtime:
                 self._stop.wait(max(0.0, self._began + timestamp - now))

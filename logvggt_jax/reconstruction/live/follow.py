@@ -61,7 +61,9 @@ def follow(
             if capture.reason is not None and not isinstance(capture.reason, InputError):
                 broken = capture.reason
             elif capture.reason is not None or not realtime:
-                lost = f"{source.name} is lost: {capture.reason or 'no more frames come; is it still connected?'}"
+                reason = str(capture.reason or "no more frames come; is it still connected?")
+                never = capture.reason is not None and session.report().received == 0
+                lost = reason if never else f"{source.name} is lost: {reason.removeprefix(source.name).lstrip(': ')}"
             session.complete = broken is None and lost is None
         session.signal = stop.reason
     if broken is not None:

@@ -83,9 +83,14 @@ class OpenCVDecoder:
         before: np.ndarray | None = None
         try:
             while in_a_row < _MOST_FAILURES:
-                decoded, image = capture.retrieve() if capture.grab() else (False, None)
+                asked = time.monotonic()
+                with contextlib.nullcontext() if self._timeout is None else _quiet():
+                    decoded, image = capture.retrieve() if capture.grab() else (False, None)
                 if not decoded or image is None or not image.size:
                     in_a_row += 1
+                    # A stream that has fallen silent fails but once in that time.
+                    if self._timeout is not None and time.monotonic() - asked >= self._timeout:
+                        break
                     continue
                 failed, in_a_row = failed + in_a_row, 0
                 seconds = self._stamp(capture, last)

@@ -29,6 +29,8 @@ from logvggt_jax.reconstruction.sources.source import (
 _STREAM = re.compile(r"(rtsps?|rtmps?|https?|udp|tcp|rtp|srt|mms):/{1,2}(?=[^/])", re.IGNORECASE)
 # Seconds until a network stream that says nothing is given up.
 _TIMEOUT = 10.0
+# Frames a second, for those at the beginning of a stream that come before its clock is known; they are few.
+_STREAM_RATE = 30.0
 # Brands of files that are built like an mp4 but hold pictures.
 _PICTURES = (b"heic", b"heix", b"hevc", b"mif1", b"msf1", b"avif", b"avis")
 
@@ -115,7 +117,7 @@ class VideoSource(Source):
         """
         self.skipped.clear()
         header = self._header
-        clock, selection = FrameClock(header.rate if header else None), FrameSelection(self.options)
+        clock, selection = FrameClock(header.rate if header else _STREAM_RATE), FrameSelection(self.options)
         size = header.size if header else None
         taken, guessed, position, seconds = 0, 0, -1, 0.0
         for position, picture in enumerate(self._decoder.pictures()):
