@@ -58,7 +58,8 @@ def add_to(commands: Any) -> None:
         "against recorded values), inference (kernels, memory, time and utilisation of a step), training (the same "
         "for the training step), whole (from files to files). With --methods each method of `reconstruct --method` is "
         "such a part: its frames a second at VGGT-1B's size, beside what the originals in PyTorch reach on one H100. "
-        "On a CPU the model is a tiny one, and nothing is compared. Exit code 0: nothing wrong, 1: something is.",
+        "On a CPU the model is a tiny one, and nothing is compared. Exit code 0: nothing wrong, 1: something is, "
+        "or a part did not come to its end in its time.",
     )
     sub.add_argument("--quick", action="store_true", help="environment, parity and inference alone, in a minute")
     sub.add_argument("--methods", action="store_true", help="every method's frames a second instead of the other parts")

@@ -19,7 +19,7 @@ def _live(options: argparse.Namespace) -> int:
     from logvggt_jax.compile import check_devices, enable_compilation_cache
     from logvggt_jax.model.parameters import in_compute_type
     from logvggt_jax.reconstruction.live import LiveSession, OnlineSettings, Recording, online_stream
-    from logvggt_jax.reconstruction.live.follow import follow
+    from logvggt_jax.reconstruction.live.follow import check_answers, follow
     from logvggt_jax.reconstruction.reconstruct import LONGER_EDGE
     from logvggt_jax.reconstruction.request import check_request
     from logvggt_jax.reconstruction.sources import open_source
@@ -41,6 +41,8 @@ def _live(options: argparse.Namespace) -> int:
     if doubt := expectation(provenance.trained_for, "windows"):
         warnings.warn(doubt, stacklevel=1)
     check_devices()
+    if options.reconnect is None:
+        check_answers(source)
     enable_compilation_cache(options.compilation_cache)
     with watched(options) as window:
         model, variables = from_pretrained(checkpoint, dtype=options.dtype)

@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
-from logvggt_jax.doctor.finding import Finding
+from logvggt_jax.doctor.finding import UNFINISHED, Finding
 
 # Seconds that each part is sure of, quick and in full: a minute and five minutes together. What one part does not use
 # is left to those after it.
@@ -51,7 +51,8 @@ def part_findings(part: str, *, tiny: bool, quick: bool) -> Iterator[Finding]:
 
 
 def examine(parts: Sequence[str], *, tiny: bool, quick: bool, show: Callable[[Finding], None]) -> bool:
-    """Runs some parts; `show` gets each finding as it comes. Whether nothing is wrong.
+    """Runs some parts; `show` gets each finding as it comes. Whether nothing is wrong and every part
+    came to its end.
 
     A part that fails or takes too long is a finding of its own, and the others go on.
     """
@@ -61,7 +62,7 @@ def examine(parts: Sequence[str], *, tiny: bool, quick: bool, show: Callable[[Fi
     for index, part in enumerate(parts):
         limit = end - time.monotonic() - sum(shares[index + 1 :])
         for finding in _in_own_process(part, limit, tiny=tiny, quick=quick):
-            sound &= finding.ok is not False
+            sound &= finding.ok is not False and finding.value != UNFINISHED
             show(finding)
     return sound
 
@@ -88,7 +89,9 @@ def _in_own_process(part: str, limit: float, *, tiny: bool, quick: bool) -> Iter
             process.kill()
         errors.seek(0)
         last = next((line.strip() for line in reversed(errors.readlines()) if line.strip()), "no message")
-    if code != 0:
-        reason = f"stopped after its limit of {limit:.0f} s" if over else f"{last:.300}"
-        yield Finding(part, "this part", "failed", ok=False, note=reason)
+    if code != 0 and over:
+        note = f"stopped after its limit of {limit:.0f} s: is the machine busy? --part {part} gives it more time"
+        yield Finding(part, "this part", UNFINISHED, note=note)
+    elif code != 0:
+        yield Finding(part, "this part", "failed", ok=False, note=f"{last:.300}")
     yield Finding(part, "time", time.monotonic() - started, "s")

@@ -5,6 +5,9 @@ from __future__ import annotations
 import dataclasses
 import json
 
+UNFINISHED = "unfinished"
+"""The value of a part that its time did not suffice for: nothing is known to be wrong, nor to be right."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Finding:

@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import signal
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -364,3 +365,14 @@ def test_a_video_without_realtime_is_refused_before_a_model_is_looked_for(
     Image.fromarray(PICTURES[0]).save(tmp_path / "walk" / "0.png")
     assert main(["live", str(tmp_path / "walk"), "--checkpoint", "nowhere"]) == 2
     assert "is no camera: add --realtime" in capsys.readouterr().err
+
+
+def test_an_address_where_nobody_answers_is_told_before_the_weights_are_read(
+    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("logvggt_jax.weights.checkpoints.from_pretrained", lambda *_, **__: pytest.fail("weights read"))
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"http://127.0.0.1:{free.getsockname()[1]}/walk"
+        assert main(["live", address, "--checkpoint", "rooms"]) == 2
+    assert f"{address} cannot be opened" in capsys.readouterr().err

@@ -17,6 +17,16 @@ _ON_TERMINALS, _ELSEWHERE = 0.5, 10.0
 _TICK = 0.05
 
 
+def check_answers(source: Source) -> None:
+    """Opens a camera or stream and looks at one frame, so that a wrong address is told before anything is loaded.
+
+    Raises:
+      InputError: it cannot be opened, or gives no frame.
+    """
+    if next(source.loaders(), None) is None:
+        raise InputError(f"{source.name} gave no frame")
+
+
 def follow(
     source: Source,
     session: LiveSession,
