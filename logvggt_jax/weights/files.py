@@ -1,5 +1,6 @@
 """VGGT checkpoint files: which file a path means, and its tensors read one by one."""
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
@@ -25,6 +26,9 @@ _USUAL_NAMES = (
     "pytorch_model.bin",
     "pytorch_model.bin.index.json",
 )
+# What trainers write beside the model.
+_NO_MODEL = re.compile(r"optim|sched|rng_state|random_state|sampler|scaler|training_args", re.IGNORECASE)
+_DISTRIBUTED = ".distcp"
 _FLOATS = {"F64", "F32", "F16", "BF16"}
 _INTEGERS = {"I64", "I32", "I16", "I8", "U64", "U32", "U16", "U8", "BOOL"}
 
@@ -59,10 +63,16 @@ def choose_weights(names: Sequence[str], where: str, prefix: str) -> str:
     MissingInput if none is a checkpoint, InputError naming them if several are and none has a usual name.
     """
     weights = sorted(name for name in names if _is_weights(name) and not is_shard(name))
+    weights = [name for name in weights if not _NO_MODEL.search(name)] or weights
     usual = [name for name in _USUAL_NAMES if name in weights]
     if usual or len(weights) == 1:
         return (usual or weights)[0]
     if not weights:
+        if any(name.endswith(_DISTRIBUTED) for name in names):
+            raise MissingInput(
+                f"{where}: a distributed checkpoint of PyTorch, which is not read; make one file of it with python -m "
+                f"torch.distributed.checkpoint.format_utils dcp_to_torch {where} model.pt"
+            )
         if shards := sorted(name for name in names if is_shard(name)):
             raise MissingInput(
                 f"{where}: holds shards ({shards[0]} and {len(shards) - 1} more) without their index; put "

@@ -2,6 +2,7 @@
 
 import re
 import warnings
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -11,6 +12,8 @@ from logvggt_jax.errors import InputError
 _DEPTH = 3
 _USUAL_KEYS = ("model", "state_dict", "model_state_dict", "module", "net", "network", "weights", "params")
 _AVERAGED = re.compile(r"(?:^|[_.])ema(?:[_.]|$)|shadow|averag|teacher", re.IGNORECASE)
+# The model's parts, before which wrappers write names of their own.
+_PART = re.compile(r"(?:^|\.)(?P<part>(?:aggregator|camera_head|depth_head|point_head|track_head)\.)")
 # Of DataParallel, trainers and Lightning; of torch.compile and sharding, which also wrap parts of a model.
 _PREFIXES = ("module.", "model.", "net.", "network.", "vggt.", "backbone.")
 _WRAPPED = re.compile(r"(?:^|(?<=\.))(?:_orig_mod|_fsdp_wrapped_module|_checkpoint_wrapped_module)\.")
@@ -54,10 +57,11 @@ def described(tree: Mapping[Any, Any], most: int = 12) -> str:
 def plain_names(names: Sequence[str], where: str) -> dict[str, str]:
     """The names of a state dict without the prefixes that nearly all of them carry, to the names in the file.
 
-    What lacks the prefix stays if its first part is one of the model's (`aggregator`); the rest, a wrapper's own, is
-    left out with a warning. Raises InputError where two names become one; `where` is the file's path.
+    Of a model and its moving average, told apart by their prefixes, the model is taken, with a warning. What lacks the
+    prefix stays if its first part is one of the model's (`aggregator`); the rest, a wrapper's own, is left out with a
+    warning. Raises InputError where two names become one; `where` is the file's path.
     """
-    plain = [(_WRAPPED.sub("", name), name) for name in names]
+    plain = _of_one_model([(_WRAPPED.sub("", name), name) for name in names], where)
     outside: list[str] = []
     while prefix := _common_prefix([name for name, _ in plain]):
         parts = {name.removeprefix(prefix).split(".")[0] for name, _ in plain if name.startswith(prefix)}
@@ -102,8 +106,29 @@ def _shown(path: tuple[str, ...]) -> str:
     return repr(".".join(path)) if path else "the outermost"
 
 
+def _of_one_model(pairs: list[tuple[str, str]], where: str) -> list[tuple[str, str]]:
+    """Of pairs of a name and that in the file, those of one model where the names before its parts tell several."""
+    counts = Counter(_before_parts(name) for name, _ in pairs)
+    del counts[None]
+    largest = max(counts.values(), default=0)
+    rivals = [prefix for prefix, count in counts.items() if prefix is not None and 2 * count >= largest]
+    if len(rivals) < 2:
+        return pairs
+    chosen = min(rivals, key=lambda prefix: (_AVERAGED.search(prefix) is not None, len(prefix)))
+    shown = ", ".join(repr(prefix) for prefix in rivals)
+    warnings.warn(f"{where}: holds several models, named {shown}; {chosen!r} is read", stacklevel=3)
+    return [pair for pair in pairs if _before_parts(pair[0]) in (chosen, None)]
+
+
+def _before_parts(name: str) -> str | None:
+    """What stands before the first part of the model in a name; None where there is no part."""
+    match = _PART.search(name)
+    return None if match is None else name[: match.start("part")]
+
+
 def _common_prefix(names: Sequence[str]) -> str | None:
-    for prefix in _PREFIXES:
+    own = {before for name in names if (before := _before_parts(name))}
+    for prefix in (*_PREFIXES, *own):
         if names and sum(name.startswith(prefix) for name in names) >= _NEARLY_ALL * len(names):
             return prefix
     return None

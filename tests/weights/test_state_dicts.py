@@ -10,7 +10,10 @@ NAMES = [f"aggregator.blocks.{i}.weight" for i in range(30)] + ["camera_head.nor
 
 @pytest.mark.parametrize(
     "prefix",
-    ["", "module.", "model.", "_orig_mod.", "net.", "module._orig_mod.", "model.module.", "_orig_mod.net.module."],
+    [
+        *("", "module.", "model.", "_orig_mod.", "net.", "module._orig_mod.", "model.module.", "_orig_mod.net.module."),
+        *("_forward_module.", "base_model.model.", "student.", "lit.vggt_model."),
+    ],
 )
 def test_prefixes_come_off_whatever_their_order(prefix):
     assert plain_names([prefix + name for name in NAMES], "file") == {name: prefix + name for name in NAMES}
@@ -26,6 +29,17 @@ def test_what_lacks_the_prefix_of_nearly_all_is_left_out_unless_it_is_the_models
     with pytest.warns(UserWarning, match="file: 1 tensors outside of the model are left out, first n_averaged"):
         assert list(plain_names(["n_averaged", *names], "file")) == NAMES
     assert "camera_head.scale" in plain_names(["camera_head.scale", *names], "file")
+
+
+@pytest.mark.parametrize(
+    ("model", "average"),
+    [("model.", "ema_model."), ("online_model.", "ema_model."), ("student.", "teacher."), ("", "shadow.")],
+)
+def test_of_a_model_and_its_average_side_by_side_the_model_is_read(model, average):
+    names = [before + name for before in (average, model) for name in NAMES]
+    with pytest.warns(UserWarning, match=f"holds several models, named '{average}', '{model}'; '{model}' is read"):
+        found = plain_names(names, "file")
+    assert [found[name] for name in NAMES] == [model + name for name in NAMES]
 
 
 def test_a_prefix_of_some_stays():

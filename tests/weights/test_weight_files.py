@@ -29,6 +29,20 @@ def test_a_folder_means_its_only_checkpoint_and_of_several_the_user_chooses(tmp_
         find_weights(tmp_path)
 
 
+@pytest.mark.parametrize("beside", ["optimizer.bin", "rng_state.pth", "training_args.bin", "scheduler.pt"])
+def test_what_trainers_write_beside_a_model_is_no_second_one(tmp_path, beside):
+    for name in ("pytorch_model_fsdp.bin", beside):
+        save_file({"w": np.ones(1, np.float32)}, tmp_path / name)
+    assert find_weights(tmp_path).name == "pytorch_model_fsdp.bin"
+
+
+def test_a_distributed_checkpoint_is_named_with_what_makes_one_file_of_it(tmp_path):
+    for name in (".metadata", "__0_0.distcp"):
+        (tmp_path / name).touch()
+    with pytest.raises(InputError, match=r"distributed checkpoint of PyTorch.*dcp_to_torch"):
+        find_weights(tmp_path)
+
+
 @pytest.mark.parametrize("suffix", [".safetensors", ".pt"])
 def test_both_formats_give_the_same_tensors(tmp_path, write_torch_file, suffix):
     rng = np.random.default_rng(0)
