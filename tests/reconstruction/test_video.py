@@ -620,7 +620,8 @@ def test_an_edited_video_is_whole(tmp_path: Path) -> None:
     frames = list(source)
     assert source.expected_frames == len(frames) == 12
     assert source.notes == [
-        f"{path} shows 12 of the 24 frames in it: it was cut without encoding it anew, or its index is damaged"
+        f"{path} shows 12 of the 24 frames in it: it was cut without encoding it anew, holds empty ones where nothing "
+        "changes, or its index is damaged"
     ]
     assert abs(frames[0].image.mean() - 40 - 8 * 10) < 10
 
@@ -630,6 +631,77 @@ def test_a_matroska_video_cut_short_says_so(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[: packets(path)[12][0]])
     with pytest.warns(UserWarning, match=r"ends early: 1\.\d+ s decoded, its header announces 2\.4 s"):
         assert len(list(open_source(path, most_broken=1.0))) >= 10
+
+
+def test_a_header_that_was_never_filled_in_announces_nothing(tmp_path: Path, library: str) -> None:
+    """As recorders leave it that are cut off, or write to a pipe."""
+    path = write(tmp_path / "killed.avi", [busy(i) for i in range(8)], codec="mjpeg", pixels="yuvj420p")
+    content = bytearray(path.read_bytes())
+    for place in (content.index(b"avih") + 24, content.index(b"strh") + 40):
+        content[place : place + 4] = (1 << 30).to_bytes(4, "little")
+    content[content.index(b"idx1") :] = b""
+    path.write_bytes(content)
+    source = open_source(path)
+    assert source.expected_frames is None
+    assert len(list(source)) == 8
+
+
+@pytest.mark.parametrize("name", ["screen.mkv", "screen.webm"])
+def test_a_last_frame_that_is_shown_for_long_is_no_early_end(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libvpx" if name.endswith("webm") else "mpeg4", rate=10)
+        stream.height, stream.width, stream.pix_fmt = HEIGHT, WIDTH, "yuv420p"
+        stored = [packet for i in range(4) for packet in stream.encode(av.VideoFrame.from_ndarray(grey(i), "rgb24"))]
+        stored += stream.encode(None)
+        stored[-1].duration = round(30 / stored[-1].time_base)
+        container.mux(stored)
+    assert len(list(open_source(path))) == 4
+
+
+def test_a_file_in_fragments_is_expected_whole(tmp_path: Path) -> None:
+    path = tmp_path / "fragments.mp4"
+    images = [grey(i) for i in range(24)]
+    with av.open(str(path), "w", options={"movflags": "frag_keyframe"}) as container:
+        stream = container.add_stream("libx264", rate=10, options={"g": "4", "bf": "0"})
+        stream.height, stream.width, stream.pix_fmt = HEIGHT, WIDTH, "yuv420p"
+        for image in images:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, "rgb24")))
+        container.mux(stream.encode(None))
+    with av.open(str(path)) as container:
+        assert container.streams.video[0].frames == 4, "the header states all frames"
+    assert open_source(path).expected_frames == len(list(open_source(path))) == 24
+
+
+def test_the_unit_of_time_is_no_rate(tmp_path: Path) -> None:
+    path = tmp_path / "tape.dv"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("dvvideo", rate=25)
+        stream.height, stream.width, stream.pix_fmt = 576, 720, "yuv420p"
+        for _ in range(3):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(grey(0, 576, 720), "rgb24")))
+        container.mux(stream.encode(None))
+    source = open_source(path)
+    assert source.expected_frames == 3
+    np.testing.assert_allclose(times(list(source)), np.arange(3) / 25)
+
+
+def test_of_several_videos_in_a_file_the_one_that_is_read_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "two_lenses.mkv"
+    with av.open(str(path), "w") as container:
+        streams = [container.add_stream("mpeg4", rate=10) for _ in range(2)]
+        for stream in streams:
+            stream.height, stream.width, stream.pix_fmt = HEIGHT, WIDTH, "yuv420p"
+        for index in range(4):
+            for stream, level in zip(streams, (0, 10), strict=True):
+                image = av.VideoFrame.from_ndarray(grey(level), "rgb24") if index < 3 else None
+                container.mux(stream.encode(image))
+    source = open_source(path)
+    assert next(iter(source)).image.mean() < 60
+    assert source.notes == [
+        f"{path} holds 2 videos, 64 x 48 (0:0), 64 x 48 (0:1), of which 0:0 is read; for another, ffmpeg -i INPUT "
+        "-map 0:1 -c copy OUTPUT.mkv"
+    ]
 
 
 def test_a_recording_that_begins_in_the_middle(tmp_path: Path) -> None:

@@ -47,5 +47,8 @@ def open_source(path: str | Path, *, masks: str | Path | None = None, **options:
     if pictures:
         return FolderSource(path, chosen, of_frames)
     if path.suffix.lower() in IMAGE_SUFFIXES:
-        raise InputError(f"{path} is a single image: give the folder that holds the sequence, a glob, or a video")
+        raise InputError(
+            f"{path} is a single image, or an animation (make it an mp4 or a GIF): give the folder that holds the "
+            "sequence, a glob, or a video"
+        )
     return VideoSource(path, chosen, of_frames)

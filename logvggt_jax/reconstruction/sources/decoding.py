@@ -38,12 +38,14 @@ class Picture(NamedTuple):
       size: (H, W) as it is shown, after rotation.
       convert: gives the picture as [H, W, 3] uint8 RGB, in any thread.
       damaged: the decoder had to guess parts of it.
+      lasts: seconds for which it is shown; None where the file does not say.
     """
 
     seconds: float | None
     size: tuple[int, int]
     convert: Callable[[], np.ndarray]
     damaged: bool = False
+    lasts: float | None = None
 
 
 class Damage(NamedTuple):

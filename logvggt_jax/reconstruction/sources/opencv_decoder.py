@@ -45,7 +45,7 @@ class OpenCVDecoder:
             read = any(capture.grab() for _ in range(_MOST_FAILURES))
             image = capture.retrieve()[1] if read else None
             count = capture.get(cv2.CAP_PROP_FRAME_COUNT)
-            frames = int(count) if math.isfinite(count) and count > 0 else None
+            frames = int(count) if 0 < count <= self._bytes() else None
             single = frames is None and not capture.grab()
             said = messages()
         codec = _fourcc(capture)
@@ -115,6 +115,12 @@ class OpenCVDecoder:
                 f"{self._name} is interlaced, which OpenCV cannot convert: {_PYAV}, or deinterlace it with "
                 "ffmpeg -i INPUT -vf bwdif=send_frame OUTPUT.mp4"
             )
+
+    def _bytes(self) -> float:
+        """Size of the file, which has no more frames: headers that were never filled in say more."""
+        if isinstance(self._source, int) or self._timeout is not None:
+            return math.inf
+        return Path(self._source).stat().st_size
 
     def _states_frames(self) -> bool:
         """Whether the count is the file's own (mp4, mov, avi); OpenCV multiplies duration and rate elsewhere."""

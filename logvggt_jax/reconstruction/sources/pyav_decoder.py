@@ -67,14 +67,19 @@ class PyAVDecoder:
             if frame is None:
                 codec = stream.codec_context.codec.long_name
                 raise InputError(f"{self._name} holds no frame that can be decoded ({codec}); re-encode the video")
-            rate, seconds = stream.average_rate or stream.guessed_rate, _duration(container, stream)
+            rate, seconds, stated = _rate(stream), _duration(container, stream), stream.frames or None
+            if stated is not None and stated > container.size:
+                # A recorder that was cut off, or wrote to a pipe, never came to fill in its header.
+                seconds = stated = None
+            frames = _likely_frames(stated, seconds, rate)
             return VideoHeader(
                 size=shown_size(frame, display_matrix(frame, stream)),
                 rate=float(rate) if rate else None,
-                frames=_likely_frames(stream.frames, seconds, rate),
-                announced=stream.frames or None,
+                frames=frames,
+                # The first part of a file in fragments states its own frames only.
+                announced=stated if stated is None or frames is None or frames <= stated else None,
                 seconds=seconds if container.format.name.startswith(_STATE_DURATION) else None,
-                notes=tuple(self._notes(frame, stream)),
+                notes=tuple(self._notes(frame, stream, _moving(container))),
             )
 
     def pictures(self) -> Iterator[Picture | Damage]:
@@ -104,6 +109,7 @@ class PyAVDecoder:
             size=shown_size(decoded, matrix),
             convert=partial(self._convert, whole, matrix),
             damaged=decoded.is_corrupt,
+            lasts=float(decoded.duration * stream.time_base) if decoded.duration else None,
         )
 
     def _convert(self, frame: av.VideoFrame, matrix: np.ndarray | None) -> np.ndarray:
@@ -143,9 +149,7 @@ class PyAVDecoder:
         if container.format.name in _NO_VIDEOS or container.format.name.endswith("_pipe"):
             kind = "text" if container.format.name in _NO_VIDEOS[1:] else "a single image"
             raise InputError(f"{self._name} is {kind}, not a video: give a video or the folder that holds the images")
-        # Cover pictures of sound files are streams too.
-        pictures = av.stream.Disposition.attached_pic | av.stream.Disposition.timed_thumbnails
-        streams = [stream for stream in container.streams.video if not stream.disposition & pictures]
+        streams = _moving(container)
         if not streams:
             kinds = sorted({stream.type for stream in container.streams} - {"video"})
             raise InputError(
@@ -261,8 +265,17 @@ class PyAVDecoder:
         empty.stream = stream
         yield empty
 
-    def _notes(self, frame: av.VideoFrame, stream: av.video.stream.VideoStream) -> Iterator[str]:
-        """What the user should know, as far as it shows in the first frame."""
+    def _notes(
+        self, frame: av.VideoFrame, stream: av.video.stream.VideoStream, streams: list[av.video.stream.VideoStream]
+    ) -> Iterator[str]:
+        """What the user should know of a stream among the file's, as far as it shows in the first frame."""
+        if len(streams) > 1:
+            sizes = ", ".join(f"{each.width} x {each.height} (0:{each.index})" for each in streams)
+            other = next(each.index for each in streams if each.index != stream.index)
+            yield (
+                f"{self._name} holds {len(streams)} videos, {sizes}, of which 0:{stream.index} is read; for another, "
+                f"ffmpeg -i INPUT -map 0:{other} -c copy OUTPUT.mkv"
+            )
         if self._lead:
             yield f"{self._name} begins in the middle: {self._lead} frames before its first key frame are left out"
         if is_interlaced(frame, stream):
@@ -296,11 +309,25 @@ def _seconds(waiting: list[int], time_base: Fraction) -> float | None:
     return float(heapq.heappop(waiting) * time_base) if waiting else None
 
 
-def _likely_frames(stated: int, seconds: float | None, rate: Fraction | None) -> int | None:
-    """Number of frames that are shown; an edited file states those as well that it does not show."""
+def _moving(container: av.container.InputContainer) -> list[av.video.stream.VideoStream]:
+    """The video streams but for cover pictures, which are streams too."""
+    pictures = av.stream.Disposition.attached_pic | av.stream.Disposition.timed_thumbnails
+    return [stream for stream in container.streams.video if not stream.disposition & pictures]
+
+
+def _rate(stream: av.video.stream.VideoStream) -> Fraction | None:
+    """Frames a second on average."""
+    # Of some formats the library takes the unit of time for the distance of two frames.
+    return min((rate for rate in (stream.average_rate, stream.guessed_rate) if rate), default=None)
+
+
+def _likely_frames(stated: int | None, seconds: float | None, rate: Fraction | None) -> int | None:
+    """Number of frames that are shown; an edited file states those as well that it does not show, a file in fragments
+    those of the first alone."""
     by_time = max(1, round(seconds * rate)) if seconds and rate else None
-    edited = stated and by_time is not None and by_time < 0.99 * stated - 2
-    return by_time if edited or not stated else stated
+    if stated is None or by_time is None:
+        return stated or by_time
+    return stated if abs(by_time - stated) <= 0.01 * max(by_time, stated) + 2 else by_time
 
 
 def _duration(container: av.container.InputContainer, stream: av.video.stream.VideoStream) -> float | None:

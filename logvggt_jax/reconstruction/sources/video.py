@@ -119,7 +119,7 @@ class VideoSource(Source):
         header = self._header
         clock, selection = FrameClock(header.rate if header else _STREAM_RATE), FrameSelection(self.options)
         size = header.size if header else None
-        taken, guessed, position, seconds = 0, 0, -1, 0.0
+        taken, guessed, position, seconds, lasts = 0, 0, -1, 0.0, None
         for position, picture in enumerate(self._decoder.pictures()):
             name, seconds = f"frame-{position:06d}", clock.time(picture.seconds)
             if selection.is_over(seconds):
@@ -129,7 +129,7 @@ class VideoSource(Source):
                 if wanted:
                     self._skip(name, picture.reason, taken)
             else:
-                size = size or picture.size
+                size, lasts = size or picture.size, picture.lasts
                 if selection.has_begun(seconds) and picture.size != size:
                     self._refuse_size(position, picture.size, size)
                 guessed += picture.damaged
@@ -141,7 +141,7 @@ class VideoSource(Source):
                     if taken == self.options.max_frames:
                         break
         else:
-            self._check_end(position + 1, seconds)
+            self._check_end(position + 1, seconds, lasts)
         if guessed:
             self._add_note(f"{self.name}: frames with damaged parts, which the decoder filled by guesses: {guessed}")
         if not taken:
@@ -184,17 +184,21 @@ class VideoSource(Source):
         if header.seconds is not None and start >= header.seconds:
             raise InputError(f"{self.name} lasts {header.seconds:.3g} s, but start is {start:g} s: choose less")
 
-    def _check_end(self, frames: int, seconds: float) -> None:
-        """Warns of a file that ends before its header says. Headers are often off by a frame or two."""
+    def _check_end(self, frames: int, seconds: float, lasts: float | None) -> None:
+        """Warns of a file that ends before its header says. Headers are often off by a frame or two.
+
+        The last frame, at `seconds`, may be shown for long, as in recordings of a screen.
+        """
         header = self._header
         if header is None or not frames:
             return
         step = 1.0 / header.rate if header.rate else 0.0
         # An edited file announces frames that it does not show; its duration does not count them.
-        lacks_time = header.seconds is not None and seconds + step < 0.99 * header.seconds - 2 * step
+        end = seconds + max(step, lasts or 0.0)
+        lacks_time = header.seconds is not None and end < 0.99 * header.seconds - 2 * step
         if header.announced is None:
             short = lacks_time
-            told = f"{seconds + step:.4g} s decoded, its header announces {header.seconds or 0:.4g} s"
+            told = f"{end:.4g} s decoded, its header announces {header.seconds or 0:.4g} s"
         else:
             lacks_frames = frames < 0.99 * header.announced - 2
             short = lacks_frames and (lacks_time or header.seconds is None)
@@ -202,7 +206,7 @@ class VideoSource(Source):
             if lacks_frames and not short:
                 self._add_note(
                     f"{self.name} shows {frames} of the {header.announced} frames in it: it was cut without encoding "
-                    "it anew, or its index is damaged"
+                    "it anew, holds empty ones where nothing changes, or its index is damaged"
                 )
         if short:
             warnings.warn(f"{self.name} ends early: {told}", stacklevel=3)
