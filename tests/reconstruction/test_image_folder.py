@@ -188,6 +188,21 @@ def test_names_that_are_times_become_time_stamps(tmp_path: Path) -> None:
     assert np.abs(np.subtract(reds(frames), [0, 60, 120, 180])).max() < 8
 
 
+def test_an_order_against_the_cameras_clock_is_told(tmp_path: Path) -> None:
+    """A camera's counter that begins anew after 9999."""
+    names_in_time = ["DSC_9998.jpg", "DSC_9999.jpg", "DSC_0001.jpg", "DSC_0002.jpg"]
+    for second, name in enumerate(names_in_time):
+        exif = Image.Exif()
+        exif.get_ifd(0x8769)[36867] = f"2026:05:01 12:30:0{second}"
+        Image.new("RGB", (30, 20)).save(tmp_path / name, exif=exif)
+    (note,) = open_source(tmp_path).notes
+    assert note.startswith("by the camera's clock DSC_9998.jpg was taken before DSC_0002.jpg (2026:05:01 12:30:00, ")
+    assert "give a list" in note
+    (tmp_path / "list.txt").write_text("\n".join(names_in_time))
+    assert open_source(tmp_path / "list.txt").notes == []
+    assert open_source(tmp_path, pattern="DSC_0*").notes == []
+
+
 def test_times_choose_frames(tmp_path: Path) -> None:
     for index in range(20):
         write_image(tmp_path / f"{100 + index / 10:.1f}.png", index)
@@ -318,6 +333,21 @@ def test_missing_and_wrong_sources_are_named(tmp_path: Path) -> None:
     write_image(tmp_path / "one.png", 1)
     with pytest.raises(ValueError, match="single image"):
         open_source(tmp_path / "one.png")
+
+
+def test_an_empty_path_is_not_the_folder_at_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_numbered(tmp_path, 2)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="path is empty"):
+        open_source("")
+
+
+@pytest.mark.parametrize("address", ["file://{}", "file://localhost{}", "file:{}", "file://{}/*.png"])
+def test_a_files_address_is_its_path(tmp_path: Path, address: str) -> None:
+    folder = tmp_path / "my photos"
+    folder.mkdir()
+    write_numbered(folder, 2)
+    assert len(list(open_source(address.format(str(folder).replace(" ", "%20"))))) == 2
 
 
 def test_two_sizes_are_listed_with_their_counts(tmp_path: Path) -> None:

@@ -40,7 +40,7 @@ FORMATS = ("jpg", "png", "webp", "tif", "avif")
 def tags(orientation: int = 1, **camera: object) -> Image.Exif:
     exif = Image.Exif()
     exif[0x0112] = orientation
-    names = {"length": 37386, "film": 41989, "resolution": 41486, "unit": 41488, "width": 40962}
+    names = {"length": 37386, "film": 41989, "resolution": 41486, "unit": 41488, "width": 40962, "taken": 36867}
     for name, value in camera.items():
         exif.get_ifd(0x8769)[names[name]] = value
     return exif
@@ -252,6 +252,15 @@ def test_focal_length_is_in_pixels(
     Image.fromarray(SCENE).save(tmp_path / "a.jpg", exif=tags(orientation, **values))
     found = read_header(tmp_path / "a.jpg").focal_length
     assert found == (None if expected is None else pytest.approx(expected, rel=1e-4))
+
+
+@pytest.mark.parametrize(
+    ("noted", "expected"),
+    [("2026:05:01 12:30:59", "2026:05:01 12:30:59"), ("0000:00:00 00:00:00", None), ("    :  :     :  :  ", None)],
+)
+def test_the_moment_is_the_cameras(tmp_path: Path, noted: str, expected: str | None) -> None:
+    Image.fromarray(SCENE).save(tmp_path / "a.jpg", exif=tags(taken=noted))
+    assert read_header(tmp_path / "a.jpg").taken == expected
 
 
 def test_a_header_is_read_without_decoding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

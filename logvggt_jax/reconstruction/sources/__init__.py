@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 from logvggt_jax.errors import InputError, MissingInput, disk_errors
 from logvggt_jax.reconstruction.sources.image_folder import FolderSource
@@ -14,6 +16,11 @@ from logvggt_jax.reconstruction.sources.source import SkippedFrame, Source, Sour
 from logvggt_jax.reconstruction.sources.video import VideoSource, is_live
 
 __all__ = ["FolderSource", "SkippedFrame", "Source", "SourceFrame", "SourceOptions", "VideoSource", "open_source"]
+
+
+_EXPECTED = "expected a folder of images or a video file"
+# As file managers give it; a `Path` keeps one slash only.
+_FILE_ADDRESS = re.compile(r"file:(?://(?:localhost)?)?(/[^/].*)")
 
 
 def open_source(path: str | Path, *, masks: str | Path | None = None, **options: Any) -> Source:
@@ -33,6 +40,10 @@ def open_source(path: str | Path, *, masks: str | Path | None = None, **options:
     if is_live(path):
         return VideoSource(path, chosen, of_frames)
     given = path
+    if not str(path):
+        raise InputError(f"the path is empty (a variable without a value?): {_EXPECTED}")
+    if (address := _FILE_ADDRESS.fullmatch(str(path))) and not Path(path).exists():
+        path = unquote(address[1])
     try:
         path = Path(path).expanduser()
         pictures = names_pictures(path)
@@ -40,7 +51,7 @@ def open_source(path: str | Path, *, masks: str | Path | None = None, **options:
             with disk_errors(path):
                 path.stat()
     except MissingInput as error:
-        raise MissingInput(f"{path} does not exist: expected a folder of images or a video file") from error
+        raise MissingInput(f"{path} does not exist: {_EXPECTED}") from error
     except (RuntimeError, ValueError) as error:
         # No such user, or a null character.
         raise error if isinstance(error, InputError) else InputError(f"{given!r} is no path: {error}") from error

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
+import re
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,6 +22,7 @@ from logvggt_jax.reconstruction.sources.pictures import MOST_PIXELS, not_colours
 _FILM_DIAGONAL = math.hypot(36, 24)  # mm; what "equivalent to 35 mm film" refers to (CIPA DCG-001)
 _RESOLUTION_UNITS = {2: 25.4, 3: 10.0, 4: 1.0}  # mm in the unit of FocalPlaneResolutionUnit
 _JPEG_END = b"\xff\xd9"
+_MOMENT = re.compile(r"[12]\d{3}:[01]\d:[0-3]\d [0-2]\d:[0-5]\d:[0-6]\d")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,6 +35,7 @@ class PictureHeader:
       focal_length: pixels of the picture, from EXIF; None where it says nothing.
       deep_grey: one channel of 16 bits, which may be a depth map.
       pages: pictures in the file; the first is the one that is read.
+      taken: when by the camera's clock, as `2026:05:01 12:30:59`; None where it does not say.
     """
 
     size: tuple[int, int]
@@ -40,6 +43,7 @@ class PictureHeader:
     focal_length: float | None
     deep_grey: bool
     pages: int
+    taken: str | None
 
 
 def read_header(path: Path) -> PictureHeader:
@@ -80,6 +84,7 @@ def read_header(path: Path) -> PictureHeader:
             focal_length=_focal_length(exif, width, height),
             deep_grey=picture.mode.startswith("I;16"),
             pages=pages,
+            taken=_taken(exif),
         )
 
 
@@ -89,6 +94,15 @@ def _exif(picture: ImageFile.ImageFile) -> Image.Exif:
         return Image.Image.getexif(picture)
     except Exception:  # Pillow raises whatever its parsing stumbles over
         return Image.Exif()
+
+
+def _taken(exif: Image.Exif) -> str | None:
+    """The moment that EXIF states; without fractions of a second, which only some cameras write."""
+    try:
+        moment = str(exif.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.DateTimeOriginal, ""))
+    except Exception:  # as above
+        return None
+    return moment[:19] if _MOMENT.match(moment) else None
 
 
 def _focal_length(exif: Image.Exif, width: int, height: int) -> float | None:

@@ -76,6 +76,8 @@ class FolderSource(Source):
         pictures = self._with_headers(
             [(name, stamps[position], files[position]) for name, position in zip(names, chosen, strict=True)]
         )
+        if times is None and not listing.in_order:
+            self.notes += _against_clock(pictures)
         self._pictures, self._size = self._of_one_size(pictures)
         if masks is not None:
             if masks.path.resolve() in {picture.file.resolve().parent for picture in self._pictures}:
@@ -259,6 +261,20 @@ def _names(files: list[Path], root: Path) -> list[str]:
                 "rename it"
             )
     return names
+
+
+def _against_clock(pictures: list[_Picture]) -> list[str]:
+    """A line where names put pictures in another order than the camera's clock: counters begin anew after 9999."""
+    dated = [picture for picture in pictures if picture.header.taken is not None]
+    back = [(one, two) for one, two in pairwise(dated) if (two.header.taken or "") < (one.header.taken or "")]
+    if not back:
+        return []
+    one, two = back[0]
+    return [
+        f"by the camera's clock {two.file.name} was taken before {one.file.name} ({two.header.taken}, "
+        f"{one.header.taken}), but follows it by name, {len(back)} times so: if that is wrong, give a list, as "
+        "exiftool -FileOrder DateTimeOriginal -p '$FileName' FOLDER > FOLDER/list.txt writes it"
+    ]
 
 
 def _margins(size: tuple[int, int], wanted: tuple[int, int]) -> tuple[int, int]:
