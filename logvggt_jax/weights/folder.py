@@ -47,7 +47,10 @@ def read_description(path: Path) -> dict[str, Any]:
         raise MissingInput(f"{file}: no such file{_why_no_model(path)}")
     description = read_json(file, MEND)
     if not isinstance(description, dict) or description.get("format") != FORMAT:
-        raise InputError(f"{file}: not the description of a model of this package (format {FORMAT!r})")
+        raise InputError(
+            f"{file}: not the description of a model of this package (format {FORMAT!r}); turn VGGT's weights into one "
+            "with `logvggt convert`"
+        )
     if description.get("version") != VERSION:
         raise InputError(
             f"{file}: format version {description.get('version')!r}, this package reads {VERSION}; "

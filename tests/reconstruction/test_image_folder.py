@@ -466,6 +466,14 @@ def test_heic_without_its_extra_is_left_out_with_a_note(tmp_path: Path, monkeypa
         open_source(tmp_path)
 
 
+def test_pictures_that_look_all_around_are_told(tmp_path: Path) -> None:
+    for name in ("a.jpg", "b.jpg"):
+        xmp = b'<rdf:Description GPano:ProjectionType="equirectangular"/>' if name == "b.jpg" else b""
+        Image.new("RGB", (40, 20)).save(tmp_path / name, xmp=xmp)
+    (note,) = open_source(tmp_path).notes
+    assert "look all around (equirectangular)" in note and note.count("jpg") == 1 and "b.jpg" in note
+
+
 def test_files_of_several_pictures_are_told(tmp_path: Path) -> None:
     pages = [Image.new("RGB", (30, 20)), Image.new("RGB", (30, 20))]
     pages[0].save(tmp_path / "a.tif", save_all=True, append_images=pages[1:])

@@ -489,6 +489,28 @@ def test_hdr_is_told(tmp_path: Path, transfer: int, called: str) -> None:
     np.testing.assert_allclose(corners(next(iter(source)).image), corners(quarters()), atol=12)
 
 
+def test_a_view_all_around_is_told(tmp_path: Path) -> None:
+    path = write(tmp_path / "around.mp4", [grey(0)] * 2)
+    content = bytearray(path.read_bytes())
+    # As cameras and stitching programs note it: a box of its own at the end of the track's.
+    noted = (
+        b'<rdf:SphericalVideo xmlns:GSpherical="http://ns.google.com/videos/1.0/spherical/">'
+        b"<GSpherical:Spherical>true</GSpherical:Spherical><GSpherical:Stitched>true</GSpherical:Stitched>"
+        b"<GSpherical:StitchingSoftware>x</GSpherical:StitchingSoftware>"
+        b"<GSpherical:ProjectionType>equirectangular</GSpherical:ProjectionType></rdf:SphericalVideo>"
+    )
+    box = (24 + len(noted)).to_bytes(4, "big") + b"uuid" + bytes.fromhex("ffcc8263f8554a938814587a02521fdd") + noted
+    starts = [content.index(name) - 4 for name in (b"moov", b"trak")]
+    assert content.index(b"mdat") < starts[0]
+    sizes = [int.from_bytes(content[start : start + 4], "big") for start in starts]
+    content[starts[1] + sizes[1] : starts[1] + sizes[1]] = box
+    for start, size in zip(starts, sizes, strict=True):
+        content[start : start + 4] = (size + len(box)).to_bytes(4, "big")
+    path.write_bytes(content)
+    (note,) = open_source(path).notes
+    assert "looks all around (equirectangular)" in note and "v360" in note
+
+
 def test_pixels_that_are_not_square_are_told(tmp_path: Path) -> None:
     path = write(tmp_path / "wide.mp4", [grey(0)] * 2, context={"sample_aspect_ratio": Fraction(4, 3)})
     assert any("not square (4:3)" in note for note in open_source(path).notes)

@@ -35,6 +35,7 @@ class PictureHeader:
       focal_length: pixels of the picture, from EXIF; None where it says nothing.
       deep_grey: one channel of 16 bits, which may be a depth map.
       pages: pictures in the file; the first is the one that is read.
+      panorama: it is said to look all around, equirectangular.
       taken: when by the camera's clock, as `2026:05:01 12:30:59`; None where it does not say.
     """
 
@@ -43,6 +44,7 @@ class PictureHeader:
     focal_length: float | None
     deep_grey: bool
     pages: int
+    panorama: bool
     taken: str | None
 
 
@@ -84,6 +86,7 @@ def read_header(path: Path) -> PictureHeader:
             focal_length=_focal_length(exif, width, height),
             deep_grey=picture.mode.startswith("I;16"),
             pages=pages,
+            panorama=b"equirectangular" in _xmp(picture),
             taken=_taken(exif),
         )
 
@@ -94,6 +97,12 @@ def _exif(picture: ImageFile.ImageFile) -> Image.Exif:
         return Image.Image.getexif(picture)
     except Exception:  # Pillow raises whatever its parsing stumbles over
         return Image.Exif()
+
+
+def _xmp(picture: ImageFile.ImageFile) -> bytes:
+    """What programs note beside EXIF, as XML."""
+    xmp = picture.info.get("xmp", picture.info.get("XML:com.adobe.xmp", b""))
+    return xmp if isinstance(xmp, bytes) else str(xmp).encode()
 
 
 def _taken(exif: Image.Exif) -> str | None:

@@ -197,6 +197,11 @@ class FolderSource(Source):
             self.notes.append(
                 f"files that hold several pictures, of which the first is taken: {len(several)} ({listed})"
             )
+        if around := [picture.file.name for picture in pictures if picture.header.panorama]:
+            self.notes.append(
+                f"images that look all around (equirectangular), where a pinhole camera is assumed: {len(around)} "
+                f"({some(around)}); cut views out of them beforehand"
+            )
         if not pictures:
             if no_decoder:
                 raise no_decoder[0][1]

@@ -25,6 +25,8 @@ from logvggt_jax.reconstruction.sources.orientation import display_matrix, shown
 _NO_VIDEOS = ("image2", "tty", "bin", "xbin", "adf", "idf")
 # Formats that state their duration; FFmpeg guesses that of others.
 _STATE_DURATION = ("mov", "matroska", "avi", "flv", "asf")
+# FFmpeg's numbers of what a lens or its stitching program projects onto.
+_PROJECTIONS = {0: "equirectangular", 1: "a cube map", 2: "equirectangular", 3: "half equirectangular", 5: "fisheye"}
 _HDR_TRANSFERS = {16: "PQ", 18: "HLG"}
 # Errors in a row after which a file that cannot be read on counts as ended.
 _MOST_READ_ERRORS = 16
@@ -280,6 +282,12 @@ class PyAVDecoder:
             yield f"{self._name} begins in the middle: {self._lead} frames before its first key frame are left out"
         if is_interlaced(frame, stream):
             yield f"{self._name} is interlaced: its frames are deinterlaced (bwdif), and finest lines lose some detail"
+        projections = (int.from_bytes(bytes(d)[:4], "little") for d in frame.side_data if d.type.name == "SPHERICAL")
+        if projection := _PROJECTIONS.get(next(projections, -1)):
+            yield (
+                f"{self._name} looks all around ({projection}), where a pinhole camera is assumed: cut views out of it "
+                "beforehand, with ffmpeg -i INPUT -vf v360=e:flat:h_fov=90:v_fov=60 OUTPUT.mp4 from equirectangular"
+            )
         if transfer := _HDR_TRANSFERS.get(frame.color_trc):
             yield (
                 f"{self._name} is HDR ({transfer}): its frames are reduced to 8 bits without tone mapping, which makes "
