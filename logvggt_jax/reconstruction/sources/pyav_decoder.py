@@ -13,6 +13,7 @@ from functools import partial
 
 import av
 import av.error
+import av.format
 import av.logging
 import numpy as np
 
@@ -69,7 +70,7 @@ class PyAVDecoder:
             if frame is None:
                 codec = stream.codec_context.codec.long_name
                 raise InputError(f"{self._name} holds no frame that can be decoded ({codec}); re-encode the video")
-            rate, seconds, stated = _rate(stream), _duration(container, stream), stream.frames or None
+            rate, seconds, stated = _rate(container, stream), _duration(container, stream), stream.frames or None
             if stated is not None and stated > container.size:
                 # A recorder that was cut off, or wrote to a pipe, never came to fill in its header.
                 seconds = stated = None
@@ -81,7 +82,7 @@ class PyAVDecoder:
                 # The first part of a file in fragments states its own frames only.
                 announced=stated if stated is None or frames is None or frames <= stated else None,
                 seconds=seconds if container.format.name.startswith(_STATE_DURATION) else None,
-                notes=tuple(self._notes(frame, stream, _moving(container))),
+                notes=tuple(self._notes(container, stream, frame)),
             )
 
     def pictures(self) -> Iterator[Picture | Damage]:
@@ -268,15 +269,22 @@ class PyAVDecoder:
         yield empty
 
     def _notes(
-        self, frame: av.VideoFrame, stream: av.video.stream.VideoStream, streams: list[av.video.stream.VideoStream]
+        self, container: av.container.InputContainer, stream: av.video.stream.VideoStream, frame: av.VideoFrame
     ) -> Iterator[str]:
-        """What the user should know of a stream among the file's, as far as it shows in the first frame."""
+        """What the user should know, as far as it shows in the header and the first frame."""
+        streams = _moving(container)
         if len(streams) > 1:
             sizes = ", ".join(f"{each.width} x {each.height} (0:{each.index})" for each in streams)
             other = next(each.index for each in streams if each.index != stream.index)
             yield (
                 f"{self._name} holds {len(streams)} videos, {sizes}, of which 0:{stream.index} is read; for another, "
                 f"ffmpeg -i INPUT -map 0:{other} -c copy OUTPUT.mkv"
+            )
+        if _has_no_times(container):
+            rate = float(_rate(container, stream) or 1)
+            yield (
+                f"{self._name} states no times: {rate:.4g} frames a second are assumed; if that is wrong, make a video "
+                "that states them with ffmpeg -r RATE -i INPUT OUTPUT.mp4"
             )
         if self._lead:
             yield f"{self._name} begins in the middle: {self._lead} frames before its first key frame are left out"
@@ -323,8 +331,16 @@ def _moving(container: av.container.InputContainer) -> list[av.video.stream.Vide
     return [stream for stream in container.streams.video if not stream.disposition & pictures]
 
 
-def _rate(stream: av.video.stream.VideoStream) -> Fraction | None:
+def _has_no_times(container: av.container.InputContainer) -> bool:
+    """Whether the format states none, as a bare H.264 stream."""
+    return bool(container.format.flags & av.format.Flags.no_timestamps.value)
+
+
+def _rate(container: av.container.InputContainer, stream: av.video.stream.VideoStream) -> Fraction | None:
     """Frames a second on average."""
+    if _has_no_times(container):
+        # What the codec states; the average is a default.
+        return stream.guessed_rate or stream.average_rate
     # Of some formats the library takes the unit of time for the distance of two frames.
     return min((rate for rate in (stream.average_rate, stream.guessed_rate) if rate), default=None)
 
