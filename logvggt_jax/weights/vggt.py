@@ -285,6 +285,11 @@ def config_from_vggt(state_dict: Mapping[str, np.ndarray], *, point_head: bool =
         if name not in state_dict:
             raise InputError(f"the state dict lacks {name}, which VGGT has; {_seen(state_dict)}")
         found = np.shape(state_dict[name])
+        if 0 in found:
+            raise InputError(
+                f"{name} is empty, as in one process's share of a training in shards; make one file of all shares first, "
+                "as DeepSpeed's zero_to_fp32.py does"
+            )
         if len(found) != rank:
             raise InputError(f"{name} has shape {found}, VGGT's has {rank} axes")
         return found

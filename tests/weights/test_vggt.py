@@ -196,6 +196,12 @@ def test_sizes_that_cannot_be_read_are_errors(vggt_state_dict):
         config_from_vggt(oblong)
 
 
+def test_one_share_of_a_training_in_shards_is_named(vggt_state_dict):
+    shares = {name: np.zeros(0, np.float32) for name in vggt_state_dict}
+    with pytest.raises(InputError, match=r"is empty, as in one process's share.*zero_to_fp32"):
+        config_from_vggt(shares)
+
+
 def test_a_state_dict_without_point_head_gives_none(vggt_state_dict):
     without = {n: t for n, t in vggt_state_dict.items() if not n.startswith("point_head.")}
     with pytest.raises(ValueError, match=r"lacks point_head\."):
