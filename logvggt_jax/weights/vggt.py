@@ -287,7 +287,7 @@ def config_from_vggt(state_dict: Mapping[str, np.ndarray], *, point_head: bool =
         found = np.shape(state_dict[name])
         if 0 in found:
             raise InputError(
-                f"{name} is empty, as in one process's share of a training in shards; make one file of all shares first, "
+                f"{name} is empty, as in one process's share of a training in shards; make one file of all shares, "
                 "as DeepSpeed's zero_to_fp32.py does"
             )
         if len(found) != rank:
