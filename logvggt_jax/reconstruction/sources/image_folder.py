@@ -278,7 +278,8 @@ def _against_clock(pictures: list[_Picture]) -> list[str]:
     return [
         f"by the camera's clock {two.file.name} was taken before {one.file.name} ({two.header.taken}, "
         f"{one.header.taken}), but follows it by name, {len(back)} times so: if that is wrong, give a list, as "
-        "exiftool -FileOrder DateTimeOriginal -p '$FileName' FOLDER > FOLDER/list.txt writes it"
+        "exiftool -if '$DateTimeOriginal' -FileOrder DateTimeOriginal -p '$Directory/$FileName' FOLDER > list.txt "
+        "writes it"
     ]
 
 
