@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import re
 from typing import Any
 
 import jax
@@ -14,12 +15,16 @@ from logvggt_jax.geometry.pose_encoding import decode_poses
 from logvggt_jax.model.checks import check_images, checked_mask
 from logvggt_jax.model.cross_window import CrossWindowMemory
 from logvggt_jax.model.explicit_axes import splits_as_its_batch
-from logvggt_jax.model.parameters import Variables, stack_layers
+from logvggt_jax.model.parameters import Variables, stack_layers, unstack_layers
 from logvggt_jax.model.refinement import Refinement
 from logvggt_jax.model.windows import Windows, WindowState
 from logvggt_jax.types import Predictions, WindowOutput
 
-__all__ = ["LogVGGT", "Variables", "variable_shapes"]
+__all__ = ["LogVGGT", "Variables", "shallow", "variable_shapes"]
+
+
+# Names of layers after the first.
+_LATER = r"block_[1-9]\d*$"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -186,11 +191,26 @@ class LogVGGT:
         return self.refinement.refine(variables, camera_tokens, register_tokens, camera_mask, register_mask)
 
 
+def shallow(config: ModelConfig) -> ModelConfig:
+    """The model with as few layers as there can be, which is traced in a fraction of the time. Layers of a stack are
+    alike, and all other parameters have the same shapes and are drawn the same by `init`."""
+    levels = tuple(range(len(config.aggregator.key_layers)))
+    encoder = dataclasses.replace(config.encoder, depth=1)
+    aggregator = dataclasses.replace(config.aggregator, depth=len(levels), key_layers=levels)
+    return dataclasses.replace(config, encoder=encoder, aggregator=aggregator)
+
+
 @functools.lru_cache(maxsize=8)
 def variable_shapes(config: ModelConfig) -> Variables:
     """{"params": …} of a model as `jax.ShapeDtypeStruct`s; traced once for each configuration, nothing is allocated."""
-    # They do not depend on the form of attention, and tracing cuDNN's asks for a GPU.
-    model, patch = LogVGGT(dataclasses.replace(config, attention="xla")), config.encoder.patch_size
+    # Shapes do not depend on the form of attention, and tracing cuDNN's asks for a GPU.
+    model, patch = LogVGGT(dataclasses.replace(shallow(config), attention="xla")), config.encoder.patch_size
     images = jax.ShapeDtypeStruct((1, 1, patch, patch, 3), jnp.uint8)
-    variables: Variables = jax.eval_shape(model.init, jax.random.key(0), images)
-    return variables
+    params = jax.eval_shape(model.init, jax.random.key(0), images)["params"]
+
+    def stacked(layers: Any) -> Any:
+        """One layer of each family in place of the stack."""
+        return {re.sub(r"block_0$", "blocks", name): x for name, x in layers.items() if not re.search(_LATER, name)}
+
+    one_of_each = {**params, "encoder": stacked(params["encoder"]), "aggregator": stacked(params["aggregator"])}
+    return unstack_layers({"params": one_of_each}, config, take=lambda layer, _: layer)
