@@ -66,7 +66,7 @@ class LogVGGT:
             keys = iter(jax.random.split(key, 6))
             lengths, first = jnp.ones(1, jnp.int32), jnp.ones(1, bool)
             cached = jnp.zeros((1, len(config.aggregator.key_layers), 1, patches + 1 + registers, width))
-            memory = CrossWindowMemory(cached, lengths, config.aggregator.key_layers)  # type: ignore[arg-type]
+            memory = CrossWindowMemory(cached, lengths, config.aggregator.key_layers)
             camera, levels = jnp.zeros((1, 1, 2 * width)), [jnp.zeros((1, patches, 2 * width))] * 4
             dense: Any = {"grid": grid, "image_size": image_size}
             modules = {
