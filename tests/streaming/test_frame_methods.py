@@ -311,6 +311,11 @@ def test_a_budget_below_a_frame(anchor: int, small_config: ModelConfig, small_va
     stream = opened("rolling", small_config, small_variables, RollingSettings(budget=least - 1, anchor=anchor))
     with pytest.raises(InputError, match=rf"budget: {least - 1} tokens leave .* take at least {least}$"):
         stream.push(IMAGES[0])
+
+
+@pytest.mark.parametrize("anchor", [1, *(pytest.param(anchor, marks=pytest.mark.slow) for anchor in (0, 3))])
+def test_the_least_budget_runs(anchor: int, small_config: ModelConfig, small_variables: dict) -> None:
+    least = max(1, anchor) * TOKENS * LAYERS
     stream = opened("rolling", small_config, small_variables, RollingSettings(budget=least, anchor=anchor))
     stream.push(IMAGES[:2])
     assert len(stream.close()) >= 1
