@@ -5,11 +5,12 @@ import importlib
 import math
 import os
 import subprocess
-import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
 import pytest
+from root_programs import RootPrograms, loaded
 
 from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.data.feeding.holdouts import PUBLISHED
@@ -225,6 +226,12 @@ def _check_step(
     assert program.count(backward) >= 2 and program.count(forward) >= 2
 
 
+@pytest.fixture(scope="module")
+def programs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RootPrograms]:
+    with loaded(tmp_path_factory.mktemp("programs"), "logvggt_jax.training.loop") as programs:
+        yield programs
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -233,9 +240,10 @@ def _check_step(
         (["--config=configs/none.py"], "configs/none.py"),
     ],
 )
-def test_command_line_mistakes_are_one_line(arguments: list[str], message: str, tmp_path: Path) -> None:
-    command = [sys.executable, "train.py", "--config=configs/tiny.py", f"--workdir={tmp_path / 'run'}", *arguments]
-    finished = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
+def test_command_line_mistakes_are_one_line(
+    programs: RootPrograms, arguments: list[str], message: str, tmp_path: Path
+) -> None:
+    finished = programs("train.py", "--config=configs/tiny.py", f"--workdir={tmp_path / 'run'}", *arguments)
     assert finished.returncode != 0 and message in finished.stderr
     assert "Traceback" not in finished.stderr and not (tmp_path / "run").exists()
 

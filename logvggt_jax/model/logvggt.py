@@ -4,22 +4,28 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import re
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.interpreters.partial_eval import dce_jaxpr
 
 from logvggt_jax.config import ModelConfig
 from logvggt_jax.geometry.pose_encoding import decode_poses
 from logvggt_jax.model.checks import check_images, checked_mask
 from logvggt_jax.model.cross_window import CrossWindowMemory
 from logvggt_jax.model.explicit_axes import splits_as_its_batch
-from logvggt_jax.model.parameters import Variables, stack_layers
+from logvggt_jax.model.parameters import Variables, stack_layers, unstack_layers
 from logvggt_jax.model.refinement import Refinement
 from logvggt_jax.model.windows import Windows, WindowState
 from logvggt_jax.types import Predictions, WindowOutput
 
-__all__ = ["LogVGGT", "Variables", "variable_shapes"]
+__all__ = ["LogVGGT", "Variables", "shallow", "variable_shapes"]
+
+
+# Names of layers after the first.
+_LATER = r"block_[1-9]\d*$"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,38 +55,39 @@ class LogVGGT:
         return Refinement(self.config)
 
     def init(self, key: jax.Array, images: jax.Array) -> Variables:
-        """Random parameters {"params": …}, float32; `images` [B, T, H, W, 3] are checked, not read.
-
-        The modules see abstract inputs: eager generators for the parameters compile once a shape, where a
-        jitted program would inline one for each parameter.
-        """
+        """Random parameters {"params": …}, float32; `images` [B, T, H, W, 3] are checked, not read."""
         config, windows, refinement = self.config, self.windows, self.refinement
         check_images(images, config.encoder.patch_size)
         image_size = images.shape[2], images.shape[3]
         grid = windows.grid(image_size)
         width, patches, registers = config.encoder.embed_dim, grid[0] * grid[1], config.aggregator.num_registers
-        keys = iter(jax.random.split(key, 6))
 
-        def floats(*shape: int) -> jax.ShapeDtypeStruct:
-            return jax.ShapeDtypeStruct(shape, jnp.float32)
+        def draw(key: jax.Array) -> Variables:
+            keys = iter(jax.random.split(key, 6))
+            lengths, first = jnp.ones(1, jnp.int32), jnp.ones(1, bool)
+            cached = jnp.zeros((1, len(config.aggregator.key_layers), 1, patches + 1 + registers, width))
+            memory = CrossWindowMemory(cached, lengths, config.aggregator.key_layers)
+            camera, levels = jnp.zeros((1, 1, 2 * width)), [jnp.zeros((1, patches, 2 * width))] * 4
+            dense: Any = {"grid": grid, "image_size": image_size}
+            modules = {
+                "encoder": windows.encoder.init(next(keys), jnp.zeros((1, *image_size, 3))),
+                "aggregator": windows.aggregator.init(
+                    next(keys), jnp.zeros((1, 1, patches, width)), lengths, first, memory, grid=grid
+                ),
+                "camera_head": refinement.camera_head.init(next(keys), camera, lengths),
+                "depth_head": windows.depth_head.init(next(keys), levels, **dense),
+                "gccr": refinement.gccr.init(next(keys), camera, jnp.zeros((1, 1, registers, 2 * width)), lengths),
+            }
+            if config.point_head is not None:
+                modules["point_head"] = windows.point_head.init(next(keys), levels, **dense)
+            return {"params": {name: variables["params"] for name, variables in modules.items()}}
 
-        lengths, first = jax.ShapeDtypeStruct((1,), jnp.int32), jax.ShapeDtypeStruct((1,), bool)
-        cached = floats(1, len(config.aggregator.key_layers), 1, patches + 1 + registers, width)
-        memory = CrossWindowMemory(cached, lengths, config.aggregator.key_layers)  # type: ignore[arg-type]
-        camera, levels = floats(1, 1, 2 * width), [floats(1, patches, 2 * width)] * 4
-        dense: Any = {"grid": grid, "image_size": image_size}
-        modules = {
-            "encoder": windows.encoder.lazy_init(next(keys), floats(1, *image_size, 3)),
-            "aggregator": windows.aggregator.lazy_init(
-                next(keys), floats(1, 1, patches, width), lengths, first, memory, grid=grid
-            ),
-            "camera_head": refinement.camera_head.lazy_init(next(keys), camera, lengths),
-            "depth_head": windows.depth_head.lazy_init(next(keys), levels, **dense),
-            "gccr": refinement.gccr.lazy_init(next(keys), camera, floats(1, 1, registers, 2 * width), lengths),
-        }
-        if config.point_head is not None:
-            modules["point_head"] = windows.point_head.lazy_init(next(keys), levels, **dense)
-        return {"params": {name: variables["params"] for name, variables in modules.items()}}
+        # What the parameters need of it runs, operation by operation: generators are compiled once a shape, where a
+        # jitted program would inline one for each parameter.
+        traced, shapes = jax.make_jaxpr(draw, return_shape=True)(key)
+        needed, _ = dce_jaxpr(traced.jaxpr, [True] * len(traced.jaxpr.outvars))
+        leaves = jax.core.eval_jaxpr(needed, traced.consts, key)
+        return jax.tree.unflatten(jax.tree.structure(shapes), leaves)
 
     @splits_as_its_batch
     def apply(
@@ -186,11 +193,26 @@ class LogVGGT:
         return self.refinement.refine(variables, camera_tokens, register_tokens, camera_mask, register_mask)
 
 
+def shallow(config: ModelConfig) -> ModelConfig:
+    """The model with as few layers as there can be, which is traced in a fraction of the time. Layers of a stack are
+    alike, and all other parameters have the same shapes and are drawn the same by `init`."""
+    levels = tuple(range(len(config.aggregator.key_layers)))
+    encoder = dataclasses.replace(config.encoder, depth=1)
+    aggregator = dataclasses.replace(config.aggregator, depth=len(levels), key_layers=levels)
+    return dataclasses.replace(config, encoder=encoder, aggregator=aggregator)
+
+
 @functools.lru_cache(maxsize=8)
 def variable_shapes(config: ModelConfig) -> Variables:
     """{"params": …} of a model as `jax.ShapeDtypeStruct`s; traced once for each configuration, nothing is allocated."""
-    # They do not depend on the form of attention, and tracing cuDNN's asks for a GPU.
-    model, patch = LogVGGT(dataclasses.replace(config, attention="xla")), config.encoder.patch_size
+    # Shapes do not depend on the form of attention, and tracing cuDNN's asks for a GPU.
+    model, patch = LogVGGT(dataclasses.replace(shallow(config), attention="xla")), config.encoder.patch_size
     images = jax.ShapeDtypeStruct((1, 1, patch, patch, 3), jnp.uint8)
-    variables: Variables = jax.eval_shape(model.init, jax.random.key(0), images)
-    return variables
+    params = jax.eval_shape(model.init, jax.random.key(0), images)["params"]
+
+    def stacked(layers: Any) -> Any:
+        """One layer of each family in place of the stack."""
+        return {re.sub(r"block_0$", "blocks", name): x for name, x in layers.items() if not re.search(_LATER, name)}
+
+    one_of_each = {**params, "encoder": stacked(params["encoder"]), "aggregator": stacked(params["aggregator"])}
+    return unstack_layers({"params": one_of_each}, config, take=lambda layer, _: layer)

@@ -22,7 +22,7 @@ from logvggt_jax.config import (
     RefinementConfig,
 )
 from logvggt_jax.errors import InputError
-from logvggt_jax.model.logvggt import LogVGGT, variable_shapes
+from logvggt_jax.model.logvggt import LogVGGT, shallow, variable_shapes
 from logvggt_jax.weights.digests import non_finite
 
 ParamPath = tuple[str, ...]
@@ -391,9 +391,9 @@ def _insert(tree: dict[str, Any], path: ParamPath, value: jax.Array) -> None:
 
 
 def _initial(config: ModelConfig, params: dict[str, Any]) -> dict[ParamPath, jax.Array]:
-    """Initial values of the model's parameters that `params` lacks."""
+    """Initial values of the model's parameters that `params` lacks, which are none of a layer's."""
     known = frozenset(_path(path) for path, _ in jax.tree_util.tree_leaves_with_path(params))
-    return {tuple(name.split("/")): leaf for name, leaf in _drawn(jax.random.key(0), config, known).items()}
+    return {tuple(name.split("/")): leaf for name, leaf in _drawn(jax.random.key(0), shallow(config), known).items()}
 
 
 # Under jit the initial values that nobody asks for are never computed.

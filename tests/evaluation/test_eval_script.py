@@ -1,12 +1,14 @@
 """The command line: one evaluation from its flags to its tables, and what a user types wrong."""
 
+import functools
 import json
-import os
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+import root_programs
 
 from logvggt_jax.config import ModelConfig
 from logvggt_jax.weights import save_model
@@ -14,21 +16,23 @@ from logvggt_jax.weights import save_model
 ROOT = Path(__file__).parents[2]
 
 
-def run_eval(*arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "eval.py", *arguments]
-    environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
-    return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=500, check=False)
+@pytest.fixture(scope="module")
+def run_eval(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., subprocess.CompletedProcess[str]]]:
+    """`eval.py` with the given arguments, on the CPU."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("JAX_PLATFORMS", "cpu")
+        with root_programs.loaded(tmp_path_factory.mktemp("programs"), "logvggt_jax.evaluation.run") as run:
+            yield functools.partial(run, "eval.py")
 
 
 def test_an_evaluation_leaves_tables_json_and_figures(
-    small_config: ModelConfig, small_variables: dict, tmp_path: Path
+    run_eval: Callable, small_config: ModelConfig, small_variables: dict, tmp_path: Path
 ) -> None:
     save_model(tmp_path / "model", small_config, small_variables["params"])
     result = run_eval(
         "--config=configs/eval/rooms.py",
         f"--checkpoint={tmp_path / 'model'}",
         f"--output={tmp_path / 'out'}",
-        "--compilation_cache=none",
         "--config.methods=('windows',)",
         "--config.baselines=False",
         "--config.options.num_rooms=1",
@@ -52,7 +56,9 @@ def test_an_evaluation_leaves_tables_json_and_figures(
         (["--data_root=d", "--config.evaluation.image_size=(28, 42)"], "leave --data_root=d out"),
     ],
 )
-def test_what_cannot_be_used_is_one_line(arguments: list[str], message: str, tmp_path: Path) -> None:
+def test_what_cannot_be_used_is_one_line(
+    run_eval: Callable, arguments: list[str], message: str, tmp_path: Path
+) -> None:
     output = tmp_path / "out"
     result = run_eval("--config=configs/eval/rooms.py", "--checkpoint=c", f"--output={output}", *arguments)
     assert result.returncode == 1 and result.stderr.startswith("eval.py: ")
@@ -76,7 +82,7 @@ script.app.run(script.main, flags_parser=script.parse_flags)
     assert "Traceback" in result.stderr and "ValueError: a bug" in result.stderr
 
 
-def test_missing_flags_are_named() -> None:
+def test_missing_flags_are_named(run_eval: Callable) -> None:
     result = run_eval("--config=configs/eval/rooms.py", "--output=nowhere")
     assert result.returncode != 0
     assert "Flag --checkpoint must have a value" in result.stderr + result.stdout
@@ -85,7 +91,7 @@ def test_missing_flags_are_named() -> None:
 
 @pytest.mark.slow
 def test_real_frames_are_evaluated(
-    small_config: ModelConfig, small_variables: dict, tmp_path: Path, seven_scenes_dir: Path
+    run_eval: Callable, small_config: ModelConfig, small_variables: dict, tmp_path: Path, seven_scenes_dir: Path
 ) -> None:
     save_model(tmp_path / "model", small_config, small_variables["params"])
     size = ["--config.evaluation.image_size=(28, 42)", "--config.evaluation.clip_lengths=(4, 6)"]
@@ -104,7 +110,7 @@ def test_real_frames_are_evaluated(
 
 @pytest.mark.slow
 def test_the_papers_benchmarks_run_on_real_frames_and_go_on_after_a_kill(
-    small_config: ModelConfig, small_variables: dict, tmp_path: Path, seven_scenes_dir: Path
+    run_eval: Callable, small_config: ModelConfig, small_variables: dict, tmp_path: Path, seven_scenes_dir: Path
 ) -> None:
     save_model(tmp_path / "model", small_config, small_variables["params"])
     (tmp_path / "data").mkdir()

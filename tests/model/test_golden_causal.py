@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import functools
 from typing import Any
 
 import golden_methods
@@ -12,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from golden_methods import POSES, TOKENS, Golden, assert_depth
+from golden_methods import POSES, TOKENS, Golden, assert_depth, layers_compiled_once
 
 from logvggt_jax.model.aggregator import WindowTokens
 from logvggt_jax.model.frame_by_frame import CausalMask, FrameByFrame
@@ -38,10 +37,9 @@ def streamed(golden: Golden) -> dict[str, Any]:
     keeping = KeepAll(CausalSettings(first_capacity=frames), golden.config.camera_head.iterations)
     blocks, per_round = keeping.start(golden.config, tokens)
     single = camera_memory(golden.config, GrowingCache, frames, per_round=False)
-    step = jax.jit(functools.partial(_step, golden))
     found = []
     for index, image in enumerate(images):
-        blocks, per_round, single, numbers = step(blocks, per_round, single, image, jnp.array([index == 0]))
+        blocks, per_round, single, numbers = _step(golden, blocks, per_round, single, image, jnp.array([index == 0]))
         lengths = {
             "cache_len": [layer.length for layer in blocks.layers],
             "camera_cache_len": [cache.length for cache in single.trunk.shared.layers],
@@ -67,6 +65,7 @@ def _tokens(golden: Golden, form: str, *given: Any) -> tuple[WindowTokens, Windo
     return tokens, tokens._replace(key=tokens.key[:, chosen]), memory
 
 
+@layers_compiled_once()
 def _step(
     golden: Golden, blocks: Memory, per_round: CameraMemory, single: CameraMemory, image: jax.Array, first: jax.Array
 ) -> tuple[Memory, CameraMemory, CameraMemory, dict[str, jax.Array]]:

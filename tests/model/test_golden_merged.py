@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import struct
-from golden_methods import POSES, TOKENS, Golden, assert_depth
+from golden_methods import POSES, TOKENS, Golden, assert_depth, layers_compiled_once
 
 from logvggt_jax import LogVGGT
 from logvggt_jax.model import merging as merging_module
 from logvggt_jax.model.memory import Attend, Keys, OwnTokens, Project
 from logvggt_jax.model.merging import TokenMerging
-from logvggt_jax.model.parameters import run
 from logvggt_jax.streaming import MergedSettings
 from logvggt_jax.streaming.merged import merging_for
 from logvggt_jax.streaming.offline import plain_vggt
@@ -33,25 +31,32 @@ class Recorded(TokenMerging):
     """A merging that notes what every layer does.
 
     Attributes:
-      layer: static, of the block at hand.
-      notes: static, a function of the layer and of arrays by name.
+      layer: number of the block at hand; no static field, so that one program serves all layers.
+      notes: static, a function of arrays by name, the layer among them.
     """
 
-    layer: int = struct.field(pytree_node=False, default=-1)
+    layer: Any = -1
     notes: Any = struct.field(pytree_node=False, default=None)
 
     def at(self, layer: int) -> Recorded:
-        return dataclasses.replace(self, layer=layer)
+        return dataclasses.replace(self, layer=jnp.int32(layer))
 
     def attend(self, own: OwnTokens, attention: Attend, project: Project) -> tuple[jax.Array, TokenMerging]:
         place, cosine = self.nearest(own.normed[0])
         kept, merged, _ = self._assignment(own.normed[0])
 
         def noted(query: jax.Array, keys: Keys) -> jax.Array:
-            arrays = {"place": place, "cosine": cosine, "kept": kept, "merged": merged, "normed": own.normed[0]}
+            arrays = {
+                "layer": self.layer,
+                "place": place,
+                "cosine": cosine,
+                "kept": kept,
+                "merged": merged,
+                "normed": own.normed[0],
+            }
             rows = {"q": query, "k": keys.key, "v": keys.value}
             arrays |= {f"{name}_merged": x[0].reshape(x.shape[1], -1) for name, x in rows.items()}
-            jax.debug.callback(functools.partial(self.notes, self.layer), **arrays)
+            jax.debug.callback(self.notes, **arrays)
             return attention(query, keys)
 
         return super().attend(own, noted, project)
@@ -89,25 +94,18 @@ def test_golden_values(golden: Golden, name: str) -> None:
     model, params, merging = plain_vggt(LogVGGT(golden.config), len(images)), golden.variables, _merging(golden, name)
     windows, size = model.windows, images.shape[1:3]
 
-    @jax.jit
+    @layers_compiled_once()
     def run_model(params, images, merging):
         patches, mask = windows.encode(params, images[None]), jnp.ones((1, len(images)), bool)
-        tokens, _ = run(
-            windows.aggregator,
-            params["params"]["aggregator"],
-            patches,
-            None,
-            mask[:, 0],
-            merging,
-            grid=windows.grid(size),
-        )
+        aggregator = {"params": params["params"]["aggregator"]}
+        tokens, _ = windows.aggregator.apply(aggregator, patches, None, mask[:, 0], merging, grid=windows.grid(size))
         out = windows.decode_dense(params, tokens, mask, size)
         return tokens.key[0], model.refinement.decode_cameras(params, out.camera_tokens, mask)[0], out
 
     notes: dict[int, dict[str, np.ndarray]] = {}
     if merging is not None:
         fields = {field.name: getattr(merging, field.name) for field in dataclasses.fields(merging)}
-        merging = Recorded(**fields, notes=lambda layer, **arrays: notes.update({layer: arrays}))
+        merging = Recorded(**fields, notes=lambda layer, **arrays: notes.update({int(layer): arrays}))
     key, poses, out = jax.device_get(run_model(params, images, merging))
     jax.effects_barrier()
     if merging is not None:

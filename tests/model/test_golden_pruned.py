@@ -69,9 +69,6 @@ def _record_choices() -> Iterator[None]:
         yield
 
 
-_step = jax.jit(frame_step, static_argnums=0)
-
-
 def _streamed(golden: Golden, settings: PrunedSettings) -> Any:
     """Numbers of all frames, what was kept after each, and the choices of each frame by layer."""
     images, config, tokens = golden.arrays["images_u8"], golden.config, golden.settings["tokens_per_frame"]
@@ -80,7 +77,7 @@ def _streamed(golden: Golden, settings: PrunedSettings) -> Any:
     for index, image in enumerate(images):
         memory = keeping.make_room(memory, tokens, index)
         _choices.clear()
-        memory, found = _step(config, golden.variables, memory, image, jnp.array([index == 0]))
+        memory, found = frame_step(config, golden.variables, memory, image, jnp.array([index == 0]))
         numbers.append(jax.device_get(found))
         kept.append(jax.device_get(memory))
         jax.effects_barrier()

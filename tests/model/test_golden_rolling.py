@@ -37,7 +37,6 @@ class Stream:
             jax.debug.callback(lambda *x: self.evictions.append(x), kept[0], scores[0], length, ordered=True)
             return kept, mean
 
-        @jax.jit
         def step(memory: StreamMemory, image: jax.Array, first: jax.Array) -> tuple[StreamMemory, dict[str, Any]]:
             after, numbers = frame_step(golden.config, golden.variables, memory, image, first)
             layers, entries = after.blocks.layers, after.camera.trunk.shared.layers

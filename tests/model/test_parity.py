@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from golden_methods import weight_maker
+from golden_methods import layers_compiled_once, weight_maker
 
 from logvggt_jax.config import WindowConfig
 from logvggt_jax.geometry import (
@@ -29,6 +29,7 @@ from logvggt_jax.model.dinov2 import DinoV2
 from logvggt_jax.model.dpt_head import DPTHead
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.model.rope import apply_rope, rope_table
+from logvggt_jax.types import Predictions
 from logvggt_jax.weights import config_from_vggt, params_from_vggt
 
 TOKENS, DENSE, SIZE, GRID = 2e-6, 5e-6, (56, 70), (4, 5)
@@ -55,11 +56,33 @@ def converted(golden_dir):
     return config, params_from_vggt(state_dict, config)[0]
 
 
+@layers_compiled_once()
+def one_window(model, variables, images):
+    """A sequence of one window, all of whose frames are decoded: the last state, outputs of all frames, the poses."""
+    overlap = model.config.windows.size - model.config.windows.stride
+    state, out = model.step(variables, model.start(variables, images[:, :overlap]), images[:, overlap:])
+    out = jax.tree.map(lambda *x: jnp.concatenate(x, axis=1), out, model.finish(variables, state))
+    poses = model.refine(variables, out.camera_tokens, out.register_tokens, out.frame_mask, out.frame_mask)
+    return jax.device_get((state, out, poses))
+
+
 @pytest.fixture(scope="module")
 def predictions(golden, converted):
     config, params = converted
-    images = golden["images_u8"][None]
-    return jax.device_get(jax.jit(LogVGGT(config).apply)({"params": params}, images))
+    _, out, poses = one_window(LogVGGT(config), {"params": params}, golden["images_u8"][None])
+    extrinsics, intrinsics = decode_poses(poses[:, :, -1], SIZE)
+    return Predictions(
+        pose_encoding=poses[:, :, -1],
+        pose_encodings=poses,
+        extrinsics=extrinsics,
+        intrinsics=intrinsics,
+        depth=out.depth,
+        depth_confidence=out.depth_confidence,
+        camera_tokens=out.camera_tokens,
+        register_tokens=out.register_tokens,
+        points=out.points,
+        points_confidence=out.points_confidence,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -112,16 +135,11 @@ def layers(modules, converted):
 def _stages(module, params, *args, **kwargs):
     """Outputs of all of a module's layers, by path, the module's own under ""."""
 
-    @jax.jit
-    def run(params):
-        out, state = module.apply(
-            {"params": params}, *args, capture_intermediates=True, mutable=["intermediates"], **kwargs
-        )
-        return out, state["intermediates"]
-
-    out, state = run(params)
+    out, state = module.apply(
+        {"params": params}, *args, capture_intermediates=True, mutable=["intermediates"], **kwargs
+    )
     stages = {"": out}
-    for path, leaf in jax.tree_util.tree_leaves_with_path(state):
+    for path, leaf in jax.tree_util.tree_leaves_with_path(state["intermediates"]):
         names = [key.key for key in path if hasattr(key, "key")]
         stages["/".join(names[:-1])] = leaf  # the last one is "__call__"
     return jax.device_get(stages)
@@ -179,6 +197,15 @@ def test_cameras(predictions, golden):
 
 
 @pytest.mark.slow
+def test_one_program_of_the_whole_sequence_gives_the_same(predictions, golden, converted):
+    """`apply` compiled as users compile it, in which every layer stands in its own place."""
+    config, params = converted
+    found = jax.jit(LogVGGT(config).apply)({"params": params}, golden["images_u8"][None])
+    for field in dataclasses.fields(Predictions):
+        assert relative_error(getattr(found, field.name), getattr(predictions, field.name)) <= DENSE, field.name
+
+
+@pytest.mark.slow
 def test_bfloat16_stays_close_to_float32(predictions, golden, converted):
     config, params = converted
     model = LogVGGT(dataclasses.replace(config, dtype="bfloat16"))
@@ -192,20 +219,10 @@ def test_the_first_window_is_vggt_on_its_frames(golden, converted):
     model = LogVGGT(dataclasses.replace(config, point_head=None, windows=WindowConfig(size=4, stride=2)))
     variables, images = {"params": params}, golden["images_u8"][None]
 
-    @jax.jit
-    def first_window(variables, images):
-        state, out = model.step(variables, model.start(variables, images[:, :2]), images[:, 2:4])
-        held = model.finish(variables, state)
-        camera = jnp.concatenate([out.camera_tokens, held.camera_tokens], axis=1)
-        register = jnp.concatenate([out.register_tokens, held.register_tokens], axis=1)
-        mask = jnp.ones((1, 4), bool)
-        return state, out, held, model.refine(variables, camera, register, mask, mask)
-
-    state, out, held, poses = jax.device_get(first_window(variables, images))
-    assert relative_error(np.concatenate([out.depth, held.depth], 1)[0], golden["win0_depth"][..., 0]) <= DENSE
-    confidence = np.concatenate([out.depth_confidence, held.depth_confidence], 1)[0]
-    assert relative_error(confidence, golden["win0_depth_conf"]) <= DENSE
-    assert relative_error(out.camera_tokens[0], golden["win0_agg_23"][:2, 0]) <= TOKENS
+    state, out, poses = one_window(model, variables, images[:, :4])
+    assert relative_error(out.depth[0], golden["win0_depth"][..., 0]) <= DENSE
+    assert relative_error(out.depth_confidence[0], golden["win0_depth_conf"]) <= DENSE
+    assert relative_error(out.camera_tokens[0], golden["win0_agg_23"][:, 0]) <= TOKENS
     assert relative_error(poses[0, :, -1], golden["win0_pose_enc"]) <= TOKENS
     for i, layer in enumerate((4, 11, 17, 23)):
         assert relative_error(state.key_tokens[0, i], golden[f"win0_agg_{layer:02d}"][2:]) <= TOKENS

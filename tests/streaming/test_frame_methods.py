@@ -84,7 +84,7 @@ def test_causal_is_the_mask_form(small_config: ModelConfig, small_variables: dic
 def test_buffers_that_double_change_nothing(
     small_config: ModelConfig, small_variables: dict, causal: list[FrameResult]
 ) -> None:
-    assert_alike(run("causal", small_config, small_variables, CausalSettings(first_capacity=1)), causal)
+    assert_alike(run("causal", small_config, small_variables, CausalSettings(first_capacity=2)), causal)
 
 
 def test_one_camera_cache_is_another_model(
@@ -119,7 +119,7 @@ def test_rolling_is_causal_until_it_evicts(
 def test_pruned_is_causal_until_it_prunes(
     small_config: ModelConfig, small_variables: dict, causal: list[FrameResult]
 ) -> None:
-    whole = PrunedSettings(cap=FRAMES * TOKENS, bits=16, first_capacity=2)
+    whole = PrunedSettings(cap=FRAMES * TOKENS, bits=16, first_capacity=5)
     assert_alike(run("pruned", small_config, small_variables, whole), causal)
     found = run("pruned", small_config, small_variables, PrunedSettings(SMALL_CAP, 16))
     assert_alike(found[:3], causal[:3])
@@ -181,13 +181,15 @@ def test_bytes_of_the_state(small_config: ModelConfig, small_variables: dict) ->
         return tuple(map(list, zip(*found, strict=True)))  # type: ignore[return-value]
 
     counts = range(1, FRAMES + 1)
-    state, allocated = bytes_by_frame("causal", CausalSettings(first_capacity=4))
+    state, allocated = bytes_by_frame("causal", CausalSettings(first_capacity=2))
     assert state == [n * TOKENS * a_token + camera_bytes(small_config, n) for n in counts]
     camera = camera_bytes(small_config, frame_session.CAMERA_CAPACITY)
-    assert allocated == [(4 if n <= 4 else 8 if n <= 8 else 16) * TOKENS * a_token + camera for n in counts]
+    assert allocated == [
+        (2 if n <= 2 else 4 if n <= 4 else 8 if n <= 8 else 16) * TOKENS * a_token + camera for n in counts
+    ]
 
-    state, allocated = bytes_by_frame("anchored-window", AnchoredWindowSettings(window=3))
-    kept = [min(n, 4) for n in counts]
+    state, allocated = bytes_by_frame("anchored-window", AnchoredWindowSettings(window=2))
+    kept = [min(n, 3) for n in counts]
     assert state == [n * TOKENS * a_token + camera_bytes(small_config, n) for n in kept]
     assert set(allocated) == {state[-1]}
 
@@ -309,6 +311,11 @@ def test_a_budget_below_a_frame(anchor: int, small_config: ModelConfig, small_va
     stream = opened("rolling", small_config, small_variables, RollingSettings(budget=least - 1, anchor=anchor))
     with pytest.raises(InputError, match=rf"budget: {least - 1} tokens leave .* take at least {least}$"):
         stream.push(IMAGES[0])
+
+
+@pytest.mark.parametrize("anchor", [1, *(pytest.param(anchor, marks=pytest.mark.slow) for anchor in (0, 3))])
+def test_the_least_budget_runs(anchor: int, small_config: ModelConfig, small_variables: dict) -> None:
+    least = max(1, anchor) * TOKENS * LAYERS
     stream = opened("rolling", small_config, small_variables, RollingSettings(budget=least, anchor=anchor))
     stream.push(IMAGES[:2])
     assert len(stream.close()) >= 1

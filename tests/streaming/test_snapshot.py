@@ -27,6 +27,8 @@ from logvggt_jax.streaming import (
 )
 
 COUNT = 11
+# Sizes of caches are those of `test_frame_methods.py`, with which the programs are shared: three frames and a bit.
+SMALL_CAP = 3 * 11 + 2
 LOOPS = LoopSettings(spacing=2, gap=4, similarity=-1.0, frames=1)
 CASES = {
     "windows": ("windows", None, RefinementConfig()),
@@ -40,9 +42,9 @@ CASES = {
     "merged": ("merged", None, RefinementConfig()),
     "causal": ("causal", CausalSettings(first_capacity=2), RefinementConfig()),
     "causal with one camera cache": ("causal", CausalSettings("single"), RefinementConfig(enabled=False)),
-    "anchored-window": ("anchored-window", AnchoredWindowSettings(window=3), RefinementConfig()),
-    "pruned": ("pruned", PrunedSettings(cap=25, first_capacity=1), RefinementConfig()),
-    "pruned in 16 bits": ("pruned", PrunedSettings(30, 16, "single"), RefinementConfig(enabled=False)),
+    "anchored-window": ("anchored-window", AnchoredWindowSettings(window=2), RefinementConfig()),
+    "pruned": ("pruned", PrunedSettings(SMALL_CAP, first_capacity=2), RefinementConfig()),
+    "pruned in 16 bits": ("pruned", PrunedSettings(SMALL_CAP, 16, "single"), RefinementConfig(enabled=False)),
     "rolling": ("rolling", RollingSettings(budget=4 * 25, first_capacity=2), RefinementConfig()),
 }
 

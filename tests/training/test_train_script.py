@@ -4,10 +4,12 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+import root_programs
 
 from logvggt_jax.training.reporting.metrics_log import read_metrics
 from logvggt_jax.weights.checkpoints import load_model, read_provenance
@@ -29,13 +31,15 @@ SETTINGS = (
 )
 
 
-def run_train(workdir: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "train.py", *SETTINGS, f"--workdir={workdir}", *arguments]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600, check=False)
+@pytest.fixture(scope="module")
+def run_train(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., subprocess.CompletedProcess[str]]]:
+    """`train.py` with `SETTINGS`, a folder and other arguments."""
+    with root_programs.loaded(tmp_path_factory.mktemp("programs"), "logvggt_jax.training.loop") as run:
+        yield lambda workdir, *arguments: run("train.py", *SETTINGS, f"--workdir={workdir}", *arguments)
 
 
 @pytest.fixture(scope="module")
-def begun(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def begun(run_train: Callable, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a run that its time limit has ended after the first step."""
     workdir = tmp_path_factory.mktemp("real") / "run"
     finished = run_train(workdir, "--config.max_minutes=1e-9")
@@ -57,7 +61,7 @@ def test_a_real_model_is_trained_validated_and_saved(begun: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_same_command_goes_on_with_parameters_in_parts(begun: Path, tmp_path: Path) -> None:
+def test_the_same_command_goes_on_with_parameters_in_parts(run_train: Callable, begun: Path, tmp_path: Path) -> None:
     workdir = Path(shutil.copytree(begun, tmp_path / "run"))
     finished = run_train(workdir, "--config.shard_parameters=True")
     assert finished.returncode == 0, finished.stderr
@@ -84,7 +88,7 @@ def test_a_fault_of_ours_keeps_its_traceback(tmp_path: Path) -> None:
     assert "Traceback" in finished.stderr and "ValueError: a bug" in finished.stderr
 
 
-def test_an_argument_that_is_no_flag_is_one_line(tmp_path: Path) -> None:
+def test_an_argument_that_is_no_flag_is_one_line(run_train: Callable, tmp_path: Path) -> None:
     finished = run_train(tmp_path, "configs/h20.py")
     assert finished.returncode == 1
     expected = "train.py: unknown argument 'configs/h20.py'; settings are given as --config.NAME=VALUE\n"
