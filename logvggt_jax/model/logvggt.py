@@ -9,7 +9,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.interpreters.partial_eval import dce_jaxpr
 
 from logvggt_jax.config import ModelConfig
 from logvggt_jax.geometry.pose_encoding import decode_poses
@@ -55,39 +54,38 @@ class LogVGGT:
         return Refinement(self.config)
 
     def init(self, key: jax.Array, images: jax.Array) -> Variables:
-        """Random parameters {"params": …}, float32; `images` [B, T, H, W, 3] are checked, not read."""
+        """Random parameters {"params": …}, float32; `images` [B, T, H, W, 3] are checked, not read.
+
+        The modules see abstract inputs: eager generators for the parameters compile once a shape, where a
+        jitted program would inline one for each parameter.
+        """
         config, windows, refinement = self.config, self.windows, self.refinement
         check_images(images, config.encoder.patch_size)
         image_size = images.shape[2], images.shape[3]
         grid = windows.grid(image_size)
         width, patches, registers = config.encoder.embed_dim, grid[0] * grid[1], config.aggregator.num_registers
+        keys = iter(jax.random.split(key, 6))
 
-        def draw(key: jax.Array) -> Variables:
-            keys = iter(jax.random.split(key, 6))
-            lengths, first = jnp.ones(1, jnp.int32), jnp.ones(1, bool)
-            cached = jnp.zeros((1, len(config.aggregator.key_layers), 1, patches + 1 + registers, width))
-            memory = CrossWindowMemory(cached, lengths, config.aggregator.key_layers)
-            camera, levels = jnp.zeros((1, 1, 2 * width)), [jnp.zeros((1, patches, 2 * width))] * 4
-            dense: Any = {"grid": grid, "image_size": image_size}
-            modules = {
-                "encoder": windows.encoder.init(next(keys), jnp.zeros((1, *image_size, 3))),
-                "aggregator": windows.aggregator.init(
-                    next(keys), jnp.zeros((1, 1, patches, width)), lengths, first, memory, grid=grid
-                ),
-                "camera_head": refinement.camera_head.init(next(keys), camera, lengths),
-                "depth_head": windows.depth_head.init(next(keys), levels, **dense),
-                "gccr": refinement.gccr.init(next(keys), camera, jnp.zeros((1, 1, registers, 2 * width)), lengths),
-            }
-            if config.point_head is not None:
-                modules["point_head"] = windows.point_head.init(next(keys), levels, **dense)
-            return {"params": {name: variables["params"] for name, variables in modules.items()}}
+        def floats(*shape: int) -> jax.ShapeDtypeStruct:
+            return jax.ShapeDtypeStruct(shape, jnp.float32)
 
-        # What the parameters need of it runs, operation by operation: generators are compiled once a shape, where a
-        # jitted program would inline one for each parameter.
-        traced, shapes = jax.make_jaxpr(draw, return_shape=True)(key)
-        needed, _ = dce_jaxpr(traced.jaxpr, [True] * len(traced.jaxpr.outvars))
-        leaves = jax.core.eval_jaxpr(needed, traced.consts, key)
-        return jax.tree.unflatten(jax.tree.structure(shapes), leaves)
+        lengths, first = jax.ShapeDtypeStruct((1,), jnp.int32), jax.ShapeDtypeStruct((1,), bool)
+        cached = floats(1, len(config.aggregator.key_layers), 1, patches + 1 + registers, width)
+        memory = CrossWindowMemory(cached, lengths, config.aggregator.key_layers)  # type: ignore[arg-type]
+        camera, levels = floats(1, 1, 2 * width), [floats(1, patches, 2 * width)] * 4
+        dense: Any = {"grid": grid, "image_size": image_size}
+        modules = {
+            "encoder": windows.encoder.lazy_init(next(keys), floats(1, *image_size, 3)),
+            "aggregator": windows.aggregator.lazy_init(
+                next(keys), floats(1, 1, patches, width), lengths, first, memory, grid=grid
+            ),
+            "camera_head": refinement.camera_head.lazy_init(next(keys), camera, lengths),
+            "depth_head": windows.depth_head.lazy_init(next(keys), levels, **dense),
+            "gccr": refinement.gccr.lazy_init(next(keys), camera, floats(1, 1, registers, 2 * width), lengths),
+        }
+        if config.point_head is not None:
+            modules["point_head"] = windows.point_head.lazy_init(next(keys), levels, **dense)
+        return {"params": {name: variables["params"] for name, variables in modules.items()}}
 
     @splits_as_its_batch
     def apply(
