@@ -385,6 +385,16 @@ def test_interlaced_pictures_are_made_whole(tmp_path: Path, name: str) -> None:
     np.testing.assert_array_equal(tail[0].image, frames[4].image)
 
 
+def test_another_release_of_pyav_leaves_videos_to_opencv_and_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write(tmp_path / "walk.mp4", [grey(i) for i in range(3)])
+    monkeypatch.setattr(av, "__version__", "19.0.2")
+    with pytest.warns(UserWarning, match=r"PyAV 19\.0\.2 .* OpenCV reads .*walk\.mp4 .*logvggt-jax\[video\]"):
+        source = open_source(path)
+    assert len(list(source)) == 3
+
+
 def test_frames_that_stay_the_same_are_taken_by_opencv(tmp_path: Path, opencv_only: None) -> None:
     path = write(tmp_path / "still.avi", [grey(0)] * 5, codec="huffyuv", pixels="yuv422p")
     assert len(list(open_source(path))) == 5

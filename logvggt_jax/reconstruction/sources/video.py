@@ -27,6 +27,8 @@ from logvggt_jax.reconstruction.sources.source import (
 )
 
 _STREAM = re.compile(r"(rtsps?|rtmps?|https?|udp|tcp|rtp|srt|mms):/{1,2}(?=[^/])", re.IGNORECASE)
+# The release of PyAV whose interface is used; the extra `video` asks for it.
+_PYAV_MAJOR = "18"
 # Seconds until a network stream that says nothing is given up.
 _TIMEOUT = 10.0
 # Frames a second, for those at the beginning of a stream that come before its clock is known; they are few.
@@ -217,12 +219,19 @@ class VideoSource(Source):
 
 
 def _decoder(source: str | Path, name: str, timeout: float | None = None) -> VideoDecoder:
-    """PyAV's decoder where it is installed, else OpenCV's."""
+    """PyAV's decoder where a release is installed whose interface is known, else OpenCV's."""
     # FFmpeg takes `a:b.mp4` for a protocol, not so an absolute path.
     url = source if isinstance(source, str) else str(source.absolute())
     try:
-        import av  # noqa: F401
+        import av
     except ImportError:
+        return OpenCVDecoder(url, name, timeout)
+    if av.__version__.split(".")[0] != _PYAV_MAJOR:
+        warnings.warn(
+            f"PyAV {av.__version__} has another interface than the {_PYAV_MAJOR} that is known here; OpenCV reads "
+            f'{name} with fewer checks: pip install "logvggt-jax[video]" brings the right one',
+            stacklevel=2,
+        )
         return OpenCVDecoder(url, name, timeout)
     from logvggt_jax.reconstruction.sources.pyav_decoder import PyAVDecoder
 
