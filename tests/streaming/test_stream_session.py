@@ -64,7 +64,8 @@ def assert_equals_whole(
         np.testing.assert_allclose([r.confidence for r in results], confidence[:count], rtol=2e-5, atol=2e-5)
         cameras = session.cameras()
         assert cameras.is_final.all()
-        np.testing.assert_allclose(cameras.pose_encoding, encodings[:count, -1], rtol=1e-4, atol=2e-5)
+        # These encodings are up to 7 in size; what releases of XLA round differently adds up over four rounds.
+        np.testing.assert_allclose(cameras.pose_encoding, encodings[:count, -1], rtol=1e-4, atol=5e-5)
 
 
 def test_stream_equals_apply_for_every_length(
