@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import av
+import av.subtitles.stream  # which PyAV would import when the package is hidden already
 import cv2
 import numpy as np
 import pytest
