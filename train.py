@@ -71,6 +71,9 @@ _CACHE = flags.DEFINE_string(
     "compilation_cache", None, "Folder that keeps compiled programs, `none` for none; by default the user's cache."
 )
 
+# As shells count what Ctrl-C ended.
+_INTERRUPTED = 130
+
 
 def main(arguments: Sequence[str]) -> None:
     """Settings, devices, training."""
@@ -118,6 +121,8 @@ def _fail(error: BaseException, watched: Lifeline | None) -> NoReturn:
     several = jax.distributed.is_initialized()
     if isinstance(error, InputError | NonFiniteTraining) and flags.FLAGS.verbosity <= 0:
         message = f"train.py: {one_line(error)}"
+    elif isinstance(error, KeyboardInterrupt) and flags.FLAGS.verbosity <= 0:
+        message = "train.py: interrupted; the same command goes on from the last checkpoint, if there is one"
     elif several:
         message = "".join(traceback.format_exception(error))
     else:
@@ -131,6 +136,9 @@ def _fail(error: BaseException, watched: Lifeline | None) -> NoReturn:
         # At once: the others wait for this process's share of a step, and it would wait for them at the exit.
         print(f"process {os.getpid()} on {platform.node()}: {message}", file=sys.stderr, flush=True)
         os._exit(1)
+    if isinstance(error, KeyboardInterrupt):
+        print(message, file=sys.stderr)
+        sys.exit(_INTERRUPTED)
     sys.exit(message)
 
 

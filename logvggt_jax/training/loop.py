@@ -76,9 +76,9 @@ def train(
         load_wandb()
     check_shared(workdir)
     with contextlib.ExitStack() as stack:
-        watched = stack.enter_context(Watchdog(watchdog))
-        # Before gigabytes of weights are read.
+        # Before gigabytes of weights are read, and unwatched: to label all clips, or to list a disk, takes hours.
         datasets, validated = open_data(config)
+        watched = stack.enter_context(Watchdog(watchdog))
         run = _Run(config, workdir, mesh, watched, validated)
         run.profiler = stack.enter_context(Profiler(profile, workdir / "profile"))
         stack.enter_context(run.checkpoints)

@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 import signal
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -221,8 +222,8 @@ def test_changed_leaf_is_refused_by_its_digest(
 
 
 def test_checkpoint_of_another_configuration_is_refused(run_config: TrainConfig, finished: Path) -> None:
-    other = dataclasses.replace(run_config, loss=dataclasses.replace(run_config.loss, alpha=0.5))
-    with pytest.raises(ValueError, match=r"was written with loss\.alpha=0\.2, the configuration says 0\.5"):
+    other = dataclasses.replace(run_config, loss=dataclasses.replace(run_config.loss, alpha=0.5), seed=1)
+    with pytest.raises(ValueError, match=r"other settings: loss\.alpha=0\.2, now 0\.5; seed=0, now 1\. Set them back"):
         train(other, finished, mesh=data_mesh(1))
 
 
@@ -300,6 +301,21 @@ def test_the_data_are_looked_for_before_the_weights_are_read(
     data = dataclasses.replace(run_config.data, sources=(source,))
     with pytest.raises(InputError, match="scannet"):
         train(dataclasses.replace(run_config, data=data), tmp_path / "run", mesh=data_mesh(1))
+
+
+def test_the_watchdog_sleeps_while_the_data_are_opened(
+    run_config: TrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A teacher labels for hours before the first step."""
+
+    def opened(config: TrainConfig) -> None:
+        del config
+        threads = {thread.name for thread in threading.enumerate()}
+        raise InputError(f"watched: {'watchdog' in threads}")
+
+    monkeypatch.setattr(loop, "open_data", opened)
+    with pytest.raises(InputError, match="watched: False"):
+        train(run_config, tmp_path, mesh=data_mesh(1), watchdog=30.0)
 
 
 @pytest.mark.parametrize("reason", ["RESOURCE_EXHAUSTED: Out of memory while trying to allocate", "INTERNAL: broken"])
@@ -511,7 +527,7 @@ def test_workers_may_change_when_a_run_goes_on(
     _same(train(threads, finished, mesh=data_mesh(2), resume_step=4), straight[0])
     assert all(entry["broken_clips"] == 0 for entry in _numbers(finished))
     backwards = dataclasses.replace(run_config, data=dataclasses.replace(run_config.data, reverse=1.0))
-    with pytest.raises(ValueError, match=r"was written with data\.reverse=0\.5, the configuration says 1\.0"):
+    with pytest.raises(ValueError, match=r"other settings: data\.reverse=0\.5, now 1\.0"):
         train(backwards, finished, mesh=data_mesh(2))
 
 

@@ -3,34 +3,36 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from logvggt_jax.errors import InputError
 from logvggt_jax.training.checkpoints.checkpoint_files import StoredCheckpoint
 from logvggt_jax.training.config import TrainConfig
 
+_NAMED = 5
 # How fast, from where and with how many broken clips the data come; the data stream checks that they are the same.
 _FREE_DATA_SETTINGS = ("worker_count", "num_threads", "cache_dir", "max_broken")
 
 
 def check_configuration(stored: StoredCheckpoint, config: TrainConfig) -> None:
-    """Raises InputError naming the first setting, of those that decide what is learned, in which they differ."""
+    """Raises InputError naming the settings, of those that decide what is learned, in which they differ."""
     ours, written = config.to_dict(), stored.config
     with contextlib.suppress(InputError):  # with what an earlier version had no field for
         # Validation may change, and is not to keep the rest from being read where its fields did.
         written = TrainConfig.from_dict({**written, "validation": None}).to_dict()
+    found: list[str] = []
     for part in ("model", "stages", "data", "loss", "optimizer", "seed", "average"):
         then, now = written.get(part), ours[part]
         if part == "data" and then is not None:
             then, now = _what_decides_clips(then), _what_decides_clips(now)
-        difference = _first_difference(then, now, part)
-        if difference is not None:
-            name, theirs, mine = difference
-            raise InputError(
-                f"{stored.where} was written with {name}={theirs!r}, the configuration says {mine!r}; "
-                "set it back or start a new --workdir"
-            )
+        found += [f"{name}={theirs!r}, now {mine!r}" for name, theirs, mine in _differences(then, now, part)]
+    if found:
+        more = f"; and {len(found) - _NAMED} more" if len(found) > _NAMED else ""
+        raise InputError(
+            f"{stored.where} was written with other settings: {'; '.join(found[:_NAMED])}{more}. Set them back, or "
+            "start a new --workdir, which --config.initial_weights lets begin with the model of this one"
+        )
 
 
 def _what_decides_clips(data: Mapping[str, Any]) -> dict[str, Any]:
@@ -40,13 +42,13 @@ def _what_decides_clips(data: Mapping[str, Any]) -> dict[str, Any]:
     return kept
 
 
-def _first_difference(theirs: Any, ours: Any, name: str) -> tuple[str, Any, Any] | None:
-    """The name of the first leaf in which trees of JSON types differ, and both values."""
-    pairs: list[tuple[Any, Any, str]] = []
+def _differences(theirs: Any, ours: Any, name: str) -> Iterator[tuple[str, Any, Any]]:
+    """The names of the leaves in which trees of JSON types differ, and both values."""
     if isinstance(theirs, dict) and isinstance(ours, dict):
-        pairs = [(theirs.get(key), ours.get(key), f"{name}.{key}") for key in sorted(theirs.keys() | ours.keys())]
+        for key in sorted(theirs.keys() | ours.keys()):
+            yield from _differences(theirs.get(key), ours.get(key), f"{name}.{key}")
     elif isinstance(theirs, list) and isinstance(ours, list) and len(theirs) == len(ours):
-        pairs = [(a, b, f"{name}[{i}]") for i, (a, b) in enumerate(zip(theirs, ours, strict=True))]
+        for i, (a, b) in enumerate(zip(theirs, ours, strict=True)):
+            yield from _differences(a, b, f"{name}[{i}]")
     elif theirs != ours:
-        return name, theirs, ours
-    return next((found for pair in pairs if (found := _first_difference(*pair)) is not None), None)
+        yield name, theirs, ours

@@ -6,14 +6,16 @@ import json
 import math
 import time
 from collections.abc import Mapping
+from io import FileIO
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import numpy as np
 from rich.console import Console
-from tensorboardX import SummaryWriter
 
+from logvggt_jax.errors import disk_errors
 from logvggt_jax.files import write_text
+from logvggt_jax.training.reporting.event_file import EventFile
 from logvggt_jax.training.reporting.wandb_run import WandbRun
 
 FILE_NAME = "metrics.jsonl"
@@ -29,7 +31,8 @@ class MetricsLog:
       productive_seconds: what earlier sessions spent on the steps that are left of them.
 
     On a run that resumes at `first_step`, lines of later steps (of the run that was interrupted) are dropped, so
-    that the file reads like one uninterrupted run.
+    that the file reads like one uninterrupted run. Raises DiskError where one of the files cannot be written, at once:
+    a run whose metrics have a hole is not one that was left alone.
     """
 
     def __init__(
@@ -50,12 +53,14 @@ class MetricsLog:
         self.started, self.productive_seconds = time.time(), 0.0
         if silent:
             return
-        workdir.mkdir(parents=True, exist_ok=True)
         times = workdir / TIMES_NAME
-        for path in (self.path, times):
-            _drop_later_lines(path, first_step)
-        self._file, self._times = self.path.open("a"), times.open("a")
-        self._tensorboard = SummaryWriter(str(workdir / "tensorboard"), purge_step=first_step + 1)
+        with disk_errors(workdir):
+            workdir.mkdir(parents=True, exist_ok=True)
+            for path in (self.path, times):
+                _drop_later_lines(path, first_step)
+            # Without a buffer, which would fail once more when it is closed.
+            self._file, self._times = self.path.open("ab", buffering=0), times.open("ab", buffering=0)
+        self._events = EventFile(workdir / "tensorboard", purge_step=first_step + 1)
         known = read_metrics(times)
         if known:
             self.started = known[0]["time"]
@@ -70,7 +75,7 @@ class MetricsLog:
         if not self.silent:
             self._file.close()
             self._times.close()
-            self._tensorboard.close()
+            self._events.close()
 
     def write(self, step: int, values: dict[str, float]) -> None:
         """Appends one line {"step", "time" (seconds since 1970), …}; non-finite values become null."""
@@ -89,19 +94,21 @@ class MetricsLog:
         if self.silent:
             return
         for name, picture in pictures.items():
-            self._tensorboard.add_image(name, picture, step, dataformats="HWC")
+            self._events.add_picture(step, name, picture)
         if self._wandb is not None:
             self._wandb.show(step, pictures)
 
-    def _append(self, file: TextIO, step: int, values: dict[str, float]) -> None:
+    def _append(self, file: FileIO, step: int, values: dict[str, float]) -> None:
         finite = {name: value if math.isfinite(value) else None for name, value in values.items()}
-        file.write(json.dumps({"step": step, "time": round(time.time(), 3), **finite}) + "\n")
-        file.flush()
+        line = (json.dumps({"step": step, "time": round(time.time(), 3), **finite}) + "\n").encode()
+        with disk_errors(file.name):
+            while line:  # what a disk takes before it is full is no error
+                line = line[file.write(line) :]
 
     def _draw(self, step: int, values: dict[str, float]) -> None:
         finite = {name: value for name, value in values.items() if math.isfinite(value)}
         for name, value in finite.items():
-            self._tensorboard.add_scalar(name, value, step)
+            self._events.add_scalar(step, name, value)
         if self._wandb is not None:
             self._wandb.write(step, finite)
 

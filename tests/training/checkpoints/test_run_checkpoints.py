@@ -138,7 +138,7 @@ def test_a_checkpoint_with_settings_of_an_earlier_form_is_restored(
     _edit(saved / "checkpoints" / "0" / "meta" / "metadata", as_before)
     assert _restore(saved, run_config, state)[1] == POSITION
     other = dataclasses.replace(run_config, seed=1)
-    with pytest.raises(InputError, match="was written with seed=0, the configuration says 1"):
+    with pytest.raises(InputError, match="other settings: seed=0, now 1"):
         _restore(saved, other, state)
 
 

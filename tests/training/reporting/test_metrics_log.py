@@ -1,14 +1,17 @@
 """The metrics file: one line a step, readable after a crash, continued without duplicates."""
 
 import io
+import os
 import struct
 from pathlib import Path
 
 import numpy as np
+import pytest
 from PIL import Image
 from rich.console import Console
 from tensorboardX.proto.event_pb2 import Event
 
+from logvggt_jax.errors import DiskError
 from logvggt_jax.training.reporting.metrics_log import FILE_NAME, MetricsLog, read_metrics
 
 
@@ -29,8 +32,10 @@ def test_pictures_are_shown_by_tensorboard(tmp_path: Path) -> None:
     with _log(tmp_path, 0) as log:
         log.show(3, {"validation/rooms/clip": picture})
     (file,) = (tmp_path / "tensorboard").iterdir()
-    found = {}
-    for event in _events(file.read_bytes()):
+    found, events = {}, _events(file.read_bytes())
+    assert events[0].file_version == "brain.Event:2"
+    assert [event.step for event in events if event.HasField("session_log")] == [1], "where later ones take over"
+    for event in events:
         found |= {value.tag: (event.step, value.image) for value in event.summary.value if value.HasField("image")}
     ((tag, (step, image)),) = found.items()
     assert (tag, step) == ("validation/rooms/clip", 3)
@@ -45,6 +50,18 @@ def _events(records: bytes) -> list[Event]:
         events.append(Event.FromString(records[place + 12 : place + 12 + length]))
         place += 12 + length + 4
     return events
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no disk that is always full")
+@pytest.mark.parametrize("full", ["metrics", "events"])
+def test_a_full_disk_is_one_line_and_keeps_nobody_waiting(tmp_path: Path, full: str) -> None:
+    with pytest.raises(DiskError, match=r": No space left on device$"), _log(tmp_path, 0) as log:
+        file = {"metrics": log._file, "events": log._events._records._writer}[full]
+        disk = os.open("/dev/full", os.O_WRONLY)
+        os.dup2(disk, file.fileno())
+        os.close(disk)
+        for step in range(1000):
+            log.write(step, {"loss": 1.0})
 
 
 def test_resumed_run_replaces_later_lines_and_an_unfinished_one(tmp_path: Path) -> None:
