@@ -21,7 +21,7 @@ from logvggt_jax.compile import check_devices, enable_compilation_cache
 from logvggt_jax.errors import InputError, one_line, printable
 from logvggt_jax.evaluation.report.report import print_report
 from logvggt_jax.evaluation.run import run_evaluation
-from logvggt_jax.terminal import forgiving_streams
+from logvggt_jax.terminal import forgiving_streams, one_log_handler
 
 _CONFIG = config_flags.DEFINE_config_file("config", None, "what to evaluate: a file of configs/eval", lock_config=True)
 _CHECKPOINT = flags.DEFINE_string(
@@ -84,5 +84,6 @@ def parse_flags(arguments: list[str]) -> list[str]:
 
 if __name__ == "__main__":
     flags.mark_flags_as_required(["config", "checkpoint", "output"])
+    one_log_handler()
     with forgiving_streams():
         app.run(main, flags_parser=parse_flags)

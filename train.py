@@ -26,7 +26,7 @@ from ml_collections import config_flags
 
 from logvggt_jax.compile import check_devices, check_nccl, enable_compilation_cache
 from logvggt_jax.errors import InputError, one_line
-from logvggt_jax.terminal import forgiving_streams
+from logvggt_jax.terminal import forgiving_streams, one_log_handler
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.dry_run import described_mesh, dry_run
 from logvggt_jax.training.loop import NonFiniteTraining, train
@@ -175,5 +175,6 @@ if __name__ == "__main__":
         lambda given: given["dry_run"] or (given["workdir"] is not None and given["described"] is None),
         "a run needs --workdir; --described goes with --dry_run",
     )
+    one_log_handler()
     with forgiving_streams():
         app.run(main, flags_parser=parse_flags)

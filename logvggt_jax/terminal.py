@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, TextIO
+
+from absl import logging as absl_logging
 
 
 class ForgivingStream:
@@ -76,6 +79,17 @@ def forgiving_streams() -> Iterator[ForgivingStream]:
         output.flush()
         errors.flush()
         sys.stdout, sys.stderr = before
+
+
+def one_log_handler() -> None:
+    """Lets absl alone say what is logged, with the time before it.
+
+    Orbax logs while it is imported, for which absl gives Python's logging a handler of its own; the one of `app.run`
+    would come beside it, and every warning twice.
+    """
+    for handler in tuple(logging.root.handlers):
+        logging.root.removeHandler(handler)
+    absl_logging.use_absl_handler()
 
 
 def _fill_closed_descriptors() -> None:

@@ -29,6 +29,18 @@ class Broken(io.StringIO):
         return True
 
 
+def test_a_warning_comes_once_although_libraries_log_while_they_are_imported() -> None:
+    program = (
+        "from absl import app, logging\n"
+        "logging.warning('imported')\n"
+        "from logvggt_jax.terminal import one_log_handler\n"
+        "one_log_handler()\n"
+        "app.run(lambda _: logging.warning('a warning'))\n"
+    )
+    finished = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert finished.stderr.count("a warning") == 1
+
+
 @pytest.mark.parametrize("error", [OSError(5, "Input/output error"), BrokenPipeError(), ValueError("closed")])
 def test_the_first_failure_is_remembered_and_nothing_more_is_tried(error: Exception) -> None:
     broken = Broken(error)

@@ -111,6 +111,7 @@ class Reader(Dataset):
       about: where it comes from.
       needs_root: whether it lies in a folder, the constructor's argument `root`; the others are made when read.
       own: whether it is a form of recordings of one's own: sequences have their folders' names, which others may have.
+      truth: whether its frames have poses and depth, which training without a teacher needs.
     """
 
     name: ClassVar[str]
@@ -121,6 +122,7 @@ class Reader(Dataset):
     about: ClassVar[About]
     needs_root: ClassVar[bool] = True
     own: ClassVar[bool] = False
+    truth: ClassVar[bool] = True
     sequences: Sequence[str] = ()
 
     @property

@@ -32,6 +32,7 @@ class Images(FolderDataset):
     metric = False
     splits = ("all",)
     own = True
+    truth = False
     about = About(source="film it", licence="your own", size="your own", roles=(TRAINING,))
 
     def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:

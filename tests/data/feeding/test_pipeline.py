@@ -13,6 +13,7 @@ from logvggt_jax.data.feeding import batches as feeding
 from logvggt_jax.data.feeding.augmentation import ColourAugmentation
 from logvggt_jax.data.feeding.batches import training_batches
 from logvggt_jax.data.feeding.broken_clips import TooManyBrokenClips
+from logvggt_jax.data.feeding.frame_range import FrameRange
 from logvggt_jax.data.rooms.rooms import Rooms
 from logvggt_jax.errors import InputError
 from logvggt_jax.frames import Frames
@@ -508,8 +509,10 @@ def test_sequences_too_short_for_a_clip_are_left_out_or_refused():
 
     with batches({"uneven": Uneven(4)}) as iterator:
         assert {clip[0] for clip in clips(iterator, 6)} == {1, 2, 3}
-    with pytest.raises(ValueError, match="short: none of 3 sequences has the 3 frames"):
+    with pytest.raises(ValueError, match=r"short: none of 3 sequences has the 3 frames .*; the longest has 2: shorten"):
         batches({"short": Numbered(3, num_frames=2)})
+    with pytest.raises(ValueError, match=r"the longest has 0 of the frames that are asked for: shorten the clips, or"):
+        batches({"short": FrameRange(Numbered(3, num_frames=9), (None, -200), "short")})
 
 
 @pytest.mark.parametrize(
