@@ -67,6 +67,12 @@ class FrameRange(Dataset):
         return [frames[i] for i in check_indices(indices, len(frames), f"{sequence}, frames {self._frames}")]
 
 
+def longest(dataset: Dataset) -> str:
+    """How many frames the longest sequence has, in words: of a range that leaves none one sees it here."""
+    count = max((dataset.num_frames(sequence) for sequence in dataset.sequences), default=0)
+    return f"the longest has {count}{' of the frames that are asked for' if isinstance(dataset, FrameRange) else ''}"
+
+
 def shared_frames(trained: Dataset, evaluated: Dataset, sequence: str) -> bool:
     """Whether two views of one data set, each the whole or a range of it, share frames of `sequence`."""
     ranges = [

@@ -14,7 +14,7 @@ from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.data.feeding.augmentation import ColourAugmentation
 from logvggt_jax.data.feeding.broken_clips import describe
 from logvggt_jax.data.feeding.clips import ClipReader, ReplaceBroken, Size
-from logvggt_jax.data.feeding.frame_range import FrameRange
+from logvggt_jax.data.feeding.frame_range import longest
 from logvggt_jax.data.feeding.sampling import Sampler
 from logvggt_jax.data.feeding.transforms import nearest_size
 from logvggt_jax.errors import InputError
@@ -150,12 +150,9 @@ def _long_enough(name: str, dataset: Dataset, sampler: Sampler, *, skip_broken: 
 
     names = [sequence for sequence in dataset.sequences if fits(sequence)]
     if not names:
-        longest = max((dataset.num_frames(sequence) for sequence in dataset.sequences), default=0)
-        asked = isinstance(dataset, FrameRange)
         raise InputError(
-            f"{name}: none of {len(dataset.sequences)} sequences has {sampler.requirement}; the longest has {longest}"
-            f"{' of the frames that are asked for' if asked else ''}: shorten the clips"
-            f"{', or ask for other frames' if asked else ''}"
+            f"{name}: none of {len(dataset.sequences)} sequences has {sampler.requirement}; {longest(dataset)}: "
+            "shorten the clips, or take more frames"
         )
     if len(names) < len(dataset.sequences):
         short = len(dataset.sequences) - len(names)

@@ -57,7 +57,10 @@ class RunCheckpoints:
         failure: InputError | None = None
         if jax.process_index() == 0:
             try:
-                self._lock = FolderLock(self.folder.parent, "start in another --workdir")
+                self._lock = FolderLock(
+                    self.folder.parent,
+                    "start in another --workdir; processes of one run are started with --distributed",
+                )
                 remove_scratch(self.folder.parent)
             except InputError as error:
                 failure = error

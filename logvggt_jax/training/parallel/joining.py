@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import re
 import secrets
 import threading
 
@@ -36,11 +37,13 @@ def join_processes(
     Returns what watches the others, and ends this process with one line when one of them is lost; None where there are
     no others, or (with a warning) where process 0 cannot be reached by a port of its choice.
 
-    Raises InputError where some of the three are missing, or the cluster does not know them.
+    Raises InputError where some of the three are missing or have another form, or the cluster does not know them.
     """
     given = [value is not None for value in (coordinator, num_processes, process_id)]
     if any(given) and not all(given):
         raise InputError("give all of --coordinator, --num_processes and --process_id, or none of them")
+    if coordinator is not None and not re.fullmatch(r".+:\d+", coordinator):
+        raise InputError(f"--coordinator={coordinator}: expected HOST:PORT, a free port of the machine of process 0")
     waited = (
         f"not all {f'of the {num_processes} ' if num_processes else ''}processes joined within {join_seconds:g} s "
         f"(process 0 is to be at {coordinator or 'an address that the cluster gives'}): look at the output of each, "

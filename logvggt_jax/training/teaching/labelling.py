@@ -12,6 +12,7 @@ from rich.progress import Progress
 
 from logvggt_jax.data.dataset import Dataset, DrawnOnDevice
 from logvggt_jax.data.feeding.broken_clips import describe
+from logvggt_jax.data.feeding.frame_range import longest
 from logvggt_jax.data.feeding.transforms import fit_each, nearest_size
 from logvggt_jax.errors import InputError
 from logvggt_jax.training.config import TeacherConfig
@@ -79,7 +80,10 @@ def taught(
             folder = label_folder(cache, bytes(digest))
             clips[f"{sequence}@{frames[0]}"] = TaughtClip(sequence, frames, sizes[number - 1], folder)
     if not clips:
-        raise InputError(f"{name}: no clip of two frames or more that can be read, nothing to be taught on")
+        raise InputError(
+            f"{name}: no clip of two frames or more that can be read in {len(dataset.sequences)} sequences, nothing to "
+            f"be taught on; {longest(dataset)}"
+        )
     return TaughtDataset(dataset, clips, teacher.digest)
 
 

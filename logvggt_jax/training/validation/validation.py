@@ -8,6 +8,7 @@ import numpy as np
 from jax.sharding import PartitionSpec as P
 
 from logvggt_jax.data.dataset import Dataset
+from logvggt_jax.data.feeding.frame_range import longest
 from logvggt_jax.data.feeding.transforms import fit
 from logvggt_jax.errors import InputError
 from logvggt_jax.metrics.depth import depth_metrics
@@ -116,7 +117,8 @@ def _read_clips(name: str, dataset: Dataset, config: ValidationConfig) -> list[F
     if not sequences or any(counts[each] > room[each] for each in sequences):
         raise InputError(
             f"validation: data set {name!r} has {len(sequences)} sequences of at least {span} frames, "
-            f"num_clips={config.num_clips} needs more or longer ones; lower num_clips, clip_length or stride"
+            f"num_clips={config.num_clips} needs more or longer ones, {longest(dataset)}; lower num_clips, clip_length "
+            "or stride"
         )
     clips = []
     for sequence in sequences:

@@ -12,6 +12,7 @@ import jax
 import numpy as np
 import pytest
 
+from logvggt_jax.errors import InputError
 from logvggt_jax.training.parallel import agreement
 from logvggt_jax.training.parallel.agreement import any_process, check_agreement
 from logvggt_jax.training.parallel.joining import check_processes, join_processes
@@ -87,6 +88,8 @@ def test_several_gpus_of_one_process_draw_a_warning(
 def test_half_an_address_is_refused() -> None:
     with pytest.raises(ValueError, match="all of --coordinator, --num_processes and --process_id"):
         join_processes(coordinator="localhost:1234")
+    with pytest.raises(InputError, match="--coordinator=localhost: expected HOST:PORT"):
+        join_processes(coordinator="localhost", num_processes=2, process_id=1)
 
 
 class PixelRuns:
