@@ -71,8 +71,8 @@ def check_truth(config: TrainConfig) -> None:
         for source in sources:
             if not teacher and source.name in READERS and not READERS[source.name].truth:
                 raise InputError(
-                    f"{source.name} ({source.root}): {READERS[source.name].title} have no poses and no depth, which only "
-                    "a teacher gives them: --config=configs/distill.py:TEACHER, or a data set that has both"
+                    f"{source.name} ({source.root}): {READERS[source.name].title} have no poses and no depth, which "
+                    "only a teacher gives them: --config=configs/distill.py:TEACHER, or a data set that has both"
                 )
 
 
