@@ -1,5 +1,6 @@
 """Accuracy on a few fixed clips that training never sees."""
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -27,7 +28,8 @@ class Judgement(NamedTuple):
     Attributes:
       values: means over the clips of all sources, `validation/abs_rel`, and where there are several over those of each,
         `validation/SOURCE/abs_rel`. Depth is judged after median alignment, poses by errors over all pairs, in degrees.
-        `constant_abs_rel` and `identity_rotation` are what a constant depth and a motionless camera get.
+        `constant_abs_rel` and `identity_rotation` are what a constant depth and a motionless camera get. Clips without
+        depth count for nothing in errors of depth, which are NaN where no clip has any.
       pictures: of the first clip of each source, [h, w, 3] uint8 RGB.
     """
 
@@ -102,8 +104,9 @@ def validation_line(values: Mapping[str, float]) -> str:
     )
 
 
-def _means(results: list[dict[str, float]], prefix: str) -> dict[str, float]:
-    means = {name: float(np.mean([result[name] for result in results])) for name in results[0]}
+def _means(results: list[dict[str, float | None]], prefix: str) -> dict[str, float]:
+    known = {name: [value for result in results if (value := result[name]) is not None] for name in results[0]}
+    means = {name: float(np.mean(values)) if values else math.nan for name, values in known.items()}
     means["rotation_over_identity"] = means["rotation"] / max(means["identity_rotation"], 1e-6)
     return {f"{prefix}/{name}": value for name, value in means.items()}
 
@@ -128,9 +131,9 @@ def _read_clips(name: str, dataset: Dataset, config: ValidationConfig) -> list[F
     return clips
 
 
-def _clip_metrics(depth: np.ndarray, extrinsics: np.ndarray, clip: Frames) -> dict[str, float]:
+def _clip_metrics(depth: np.ndarray, extrinsics: np.ndarray, clip: Frames) -> dict[str, float | None]:
     """Errors of one clip: depth [T, H, W], world-to-camera extrinsics [T, 3, 4]; angles in degrees."""
-    found = depth_metrics(depth, clip.depth, alignment="median")
+    found = _depth_errors(depth, clip)
     rotation, direction = relative_pose_errors(extrinsics, clip.extrinsics)
     return {
         "abs_rel": found["abs_rel"],
@@ -141,9 +144,15 @@ def _clip_metrics(depth: np.ndarray, extrinsics: np.ndarray, clip: Frames) -> di
     }
 
 
-def _baselines(clip: Frames) -> dict[str, float]:
+def _depth_errors(depth: np.ndarray, clip: Frames) -> dict[str, float | None]:
+    found = depth_metrics(depth, clip.depth, alignment="median")
+    # Without a valid pixel all of them are 0, which would be the best there is.
+    return {name: found[name] if found["valid_pixels"] else None for name in ("abs_rel", "delta_1.25")}
+
+
+def _baselines(clip: Frames) -> dict[str, float | None]:
     """What a constant depth and a motionless camera get on a clip, whatever the model has learned."""
-    constant = depth_metrics(np.ones_like(clip.depth), clip.depth, alignment="median")
+    constant = _depth_errors(np.ones_like(clip.depth), clip)
     still = np.broadcast_to(np.eye(4), clip.extrinsics.shape)
     identity, _ = relative_pose_errors(still, clip.extrinsics)
     return {"constant_abs_rel": constant["abs_rel"], "identity_rotation": float(identity.mean())}

@@ -1,6 +1,7 @@
 """Validation fetches what it judges, and judges once what knows nothing."""
 
 import dataclasses
+import itertools
 from typing import Any
 
 import jax
@@ -13,6 +14,7 @@ from logvggt_jax.training.feeding.sources import open_source
 from logvggt_jax.training.parallel.sharding import data_mesh, parameter_layout
 from logvggt_jax.training.validation import validation as module
 from logvggt_jax.training.validation.validation import Validation
+from logvggt_jax.types import Frames
 
 ROOMS = (("height", 28), ("num_frames", 8), ("num_rooms", 2), ("width", 42))
 
@@ -39,6 +41,35 @@ def test_baselines_are_judged_once_and_depth_and_cameras_alone_are_fetched(
     depth, extrinsics, confidence = jax.eval_shape(validation._predict, pixel_params, validation._images)
     assert depth.shape == (2, 3, 28, 42) and extrinsics.shape == (2, 3, 3, 4)
     assert confidence.shape == (1, 3, 28, 42), "of the clip that is shown"
+
+
+def test_a_clip_without_depth_counts_for_nothing_in_errors_of_depth(
+    pixel_model: Any, pixel_params: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = ValidationConfig(
+        (SourceConfig("rooms", None, "val", options=ROOMS),),
+        every=1,
+        num_clips=2,
+        clip_length=3,
+        stride=2,
+        size=(28, 42),
+    )
+    layout, fit = parameter_layout(pixel_params, data_mesh(1), shard=False), module.fit
+
+    def judged(*without: int) -> np.ndarray:
+        """By the model, with these of the two clips stripped of their depth."""
+        numbers = itertools.count()
+
+        def stripped(frames: Frames, size: tuple[int, int]) -> Frames:
+            clip = fit(frames, size)
+            return clip._replace(depth=0 * clip.depth) if next(numbers) in without else clip
+
+        monkeypatch.setattr(module, "fit", stripped)
+        values = Validation(pixel_model, config, layout)(pixel_params).values
+        return np.array([values[f"validation/{name}"] for name in ("abs_rel", "delta_1.25", "constant_abs_rel")])
+
+    np.testing.assert_allclose((judged(0) + judged(1)) / 2, judged(), rtol=1e-5)
+    assert np.isnan(judged(0, 1)).all()
 
 
 def test_any_number_of_clips_is_judged_on_any_number_of_devices(pixel_model: Any, pixel_params: dict[str, Any]) -> None:
