@@ -20,8 +20,7 @@ from logvggt_jax.model.refinement import Refinement
 from logvggt_jax.model.windows import Windows, WindowState
 from logvggt_jax.types import Predictions, WindowOutput
 
-__all__ = ["LogVGGT", "Variables", "shallow", "variable_shapes"]
-
+__all__ = ["LogVGGT", "Variables", "predictions_of", "shallow", "variable_shapes"]
 
 # Names of layers after the first.
 _LATER = r"block_[1-9]\d*$"
@@ -118,20 +117,7 @@ class LogVGGT:
             out = self.windows.scan(variables, images, frame_mask, masks)
         frame_mask = checked_mask(images, frame_mask)
         pose_encodings = self.refinement.refine_sequence(variables, out.camera_tokens, out.register_tokens, frame_mask)
-        pose_encoding = pose_encodings[:, :, -1]
-        extrinsics, intrinsics = decode_poses(pose_encoding, (images.shape[2], images.shape[3]))
-        return Predictions(
-            pose_encoding=pose_encoding,
-            pose_encodings=pose_encodings,
-            extrinsics=extrinsics,
-            intrinsics=intrinsics,
-            depth=out.depth,
-            depth_confidence=out.depth_confidence,
-            camera_tokens=out.camera_tokens,
-            register_tokens=out.register_tokens,
-            points=out.points,
-            points_confidence=out.points_confidence,
-        )
+        return predictions_of(out, pose_encodings, (images.shape[2], images.shape[3]))
 
     @splits_as_its_batch
     def start(
@@ -189,6 +175,24 @@ class LogVGGT:
           Pose encodings [B, N, R, 9] of all rounds, world-to-camera in the first camera's frame.
         """
         return self.refinement.refine(variables, camera_tokens, register_tokens, camera_mask, register_mask)
+
+
+def predictions_of(out: WindowOutput, pose_encodings: jax.Array, image_size: tuple[int, int]) -> Predictions:
+    """All that is predicted, of the outputs of all frames and their poses [B, T, rounds, 9], for images (H, W)."""
+    pose_encoding = pose_encodings[:, :, -1]
+    extrinsics, intrinsics = decode_poses(pose_encoding, image_size)
+    return Predictions(
+        pose_encoding=pose_encoding,
+        pose_encodings=pose_encodings,
+        extrinsics=extrinsics,
+        intrinsics=intrinsics,
+        depth=out.depth,
+        depth_confidence=out.depth_confidence,
+        camera_tokens=out.camera_tokens,
+        register_tokens=out.register_tokens,
+        points=out.points,
+        points_confidence=out.points_confidence,
+    )
 
 
 def shallow(config: ModelConfig) -> ModelConfig:

@@ -127,7 +127,7 @@ def _before_parts(name: str) -> str | None:
 
 
 def _common_prefix(names: Sequence[str]) -> str | None:
-    own = {before for name in names if (before := _before_parts(name))}
+    own = dict.fromkeys(before for name in names if (before := _before_parts(name)))
     for prefix in (*_PREFIXES, *own):
         if names and sum(name.startswith(prefix) for name in names) >= _NEARLY_ALL * len(names):
             return prefix

@@ -27,7 +27,7 @@ from logvggt_jax.model.camera_head import CameraHead
 from logvggt_jax.model.cross_window import CrossWindowMemory
 from logvggt_jax.model.dinov2 import DinoV2
 from logvggt_jax.model.dpt_head import DPTHead
-from logvggt_jax.model.logvggt import LogVGGT
+from logvggt_jax.model.logvggt import LogVGGT, predictions_of
 from logvggt_jax.model.rope import apply_rope, rope_table
 from logvggt_jax.types import Predictions
 from logvggt_jax.weights import config_from_vggt, params_from_vggt
@@ -70,19 +70,7 @@ def one_window(model, variables, images):
 def predictions(golden, converted):
     config, params = converted
     _, out, poses = one_window(LogVGGT(config), {"params": params}, golden["images_u8"][None])
-    extrinsics, intrinsics = decode_poses(poses[:, :, -1], SIZE)
-    return Predictions(
-        pose_encoding=poses[:, :, -1],
-        pose_encodings=poses,
-        extrinsics=extrinsics,
-        intrinsics=intrinsics,
-        depth=out.depth,
-        depth_confidence=out.depth_confidence,
-        camera_tokens=out.camera_tokens,
-        register_tokens=out.register_tokens,
-        points=out.points,
-        points_confidence=out.points_confidence,
-    )
+    return predictions_of(out, poses, SIZE)
 
 
 @pytest.fixture(scope="module")

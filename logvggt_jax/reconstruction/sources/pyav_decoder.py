@@ -5,7 +5,6 @@ from __future__ import annotations
 import heapq
 import itertools
 import math
-import re
 from collections import deque
 from collections.abc import Iterator
 from fractions import Fraction
@@ -21,14 +20,19 @@ from logvggt_jax.errors import InputError
 from logvggt_jax.reconstruction.sources.decoding import Damage, Picture, VideoHeader
 from logvggt_jax.reconstruction.sources.deinterlacing import Deinterlacer, is_interlaced
 from logvggt_jax.reconstruction.sources.orientation import display_matrix, shown_size, turn
+from logvggt_jax.reconstruction.sources.pyav_header import (
+    average_rate,
+    duration,
+    likely_frames,
+    moving_streams,
+    notes_on,
+    unknown_codec,
+)
 
 # Text and single images, which FFmpeg would show as videos of one frame.
 _NO_VIDEOS = ("image2", "tty", "bin", "xbin", "adf", "idf")
 # Formats that state their duration; FFmpeg guesses that of others.
 _STATE_DURATION = ("mov", "matroska", "avi", "flv", "asf")
-# FFmpeg's numbers of what a lens or its stitching program projects onto.
-_PROJECTIONS = {0: "equirectangular", 1: "a cube map", 2: "equirectangular", 3: "half equirectangular", 5: "fisheye"}
-_HDR_TRANSFERS = {16: "PQ", 18: "HLG"}
 # Errors in a row after which a file that cannot be read on counts as ended.
 _MOST_READ_ERRORS = 16
 # Some formats mark no key frames: after so many packets the first that decodes begins the video.
@@ -70,11 +74,11 @@ class PyAVDecoder:
             if frame is None:
                 codec = stream.codec_context.codec.long_name
                 raise InputError(f"{self._name} holds no frame that can be decoded ({codec}); re-encode the video")
-            rate, seconds, stated = _rate(container, stream), _duration(container, stream), stream.frames or None
+            rate, seconds, stated = average_rate(container, stream), duration(container, stream), stream.frames or None
             if stated is not None and stated > container.size:
                 # A recorder that was cut off, or wrote to a pipe, never came to fill in its header.
                 seconds = stated = None
-            frames = _likely_frames(stated, seconds, rate)
+            frames = likely_frames(stated, seconds, rate)
             return VideoHeader(
                 size=shown_size(frame, display_matrix(frame, stream)),
                 rate=float(rate) if rate else None,
@@ -82,7 +86,7 @@ class PyAVDecoder:
                 # The first part of a file in fragments states its own frames only.
                 announced=stated if stated is None or frames is None or frames <= stated else None,
                 seconds=seconds if container.format.name.startswith(_STATE_DURATION) else None,
-                notes=tuple(self._notes(container, stream, frame)),
+                notes=(*notes_on(self._name, container, stream, frame), *self._begins_late()),
             )
 
     def pictures(self) -> Iterator[Picture | Damage]:
@@ -152,7 +156,7 @@ class PyAVDecoder:
         if container.format.name in _NO_VIDEOS or container.format.name.endswith("_pipe"):
             kind = "text" if container.format.name in _NO_VIDEOS[1:] else "a single image"
             raise InputError(f"{self._name} is {kind}, not a video: give a video or the folder that holds the images")
-        streams = _moving(container)
+        streams = moving_streams(container)
         if not streams:
             kinds = sorted({stream.type for stream in container.streams} - {"video"})
             raise InputError(
@@ -162,9 +166,10 @@ class PyAVDecoder:
         best = container.streams.best("video")
         stream = best if best in streams else streams[0]
         if stream.codec_context is None:
+            codec = unknown_codec(container, stream.index)
             raise InputError(
-                f"{self._name}: its codec {_codec(container, stream.index)} cannot be decoded by the FFmpeg that PyAV "
-                "brings; re-encode it, for example to H.264 mp4"
+                f"{self._name}: its codec {codec} cannot be decoded by the FFmpeg that PyAV brings; re-encode it, for "
+                "example to H.264 mp4"
             )
         # Threads within a frame lose nothing when a packet is damaged. With threads over frames, which large pictures
         # need, the library drops what follows a damaged packet among the last few of the file.
@@ -225,6 +230,10 @@ class PyAVDecoder:
         for reason in failures:
             yield Damage(_seconds(waiting, stream.time_base), reason), None
 
+    def _begins_late(self) -> Iterator[str]:
+        if self._lead:
+            yield f"{self._name} begins in the middle: {self._lead} frames before its first key frame are left out"
+
     def _is_numbered_as_stored(self) -> bool:
         """Whether the packets' time stamps only grow, and the frames' do not."""
         with self._open() as container:
@@ -268,46 +277,6 @@ class PyAVDecoder:
         empty.stream = stream
         yield empty
 
-    def _notes(
-        self, container: av.container.InputContainer, stream: av.video.stream.VideoStream, frame: av.VideoFrame
-    ) -> Iterator[str]:
-        """What the user should know, as far as it shows in the header and the first frame."""
-        streams = _moving(container)
-        if len(streams) > 1:
-            sizes = ", ".join(f"{each.width} x {each.height} (0:{each.index})" for each in streams)
-            other = next(each.index for each in streams if each.index != stream.index)
-            yield (
-                f"{self._name} holds {len(streams)} videos, {sizes}, of which 0:{stream.index} is read; for another, "
-                f"ffmpeg -i INPUT -map 0:{other} -c copy OUTPUT.mkv"
-            )
-        if _has_no_times(container):
-            rate = float(_rate(container, stream) or 1)
-            yield (
-                f"{self._name} states no times: {rate:.4g} frames a second are assumed; if that is wrong, make a video "
-                "that states them with ffmpeg -r RATE -i INPUT OUTPUT.mp4"
-            )
-        if self._lead:
-            yield f"{self._name} begins in the middle: {self._lead} frames before its first key frame are left out"
-        if is_interlaced(frame, stream):
-            yield f"{self._name} is interlaced: its frames are deinterlaced (bwdif), and finest lines lose some detail"
-        projections = (int.from_bytes(bytes(d)[:4], "little") for d in frame.side_data if d.type.name == "SPHERICAL")
-        if projection := _PROJECTIONS.get(next(projections, -1)):
-            yield (
-                f"{self._name} looks all around ({projection}), where a pinhole camera is assumed: cut views out of it "
-                "beforehand, with ffmpeg -i INPUT -vf v360=e:flat:h_fov=90:v_fov=60 OUTPUT.mp4 from equirectangular"
-            )
-        if transfer := _HDR_TRANSFERS.get(frame.color_trc):
-            yield (
-                f"{self._name} is HDR ({transfer}): its frames are reduced to 8 bits without tone mapping, which makes "
-                "them look pale; tone-map it beforehand if the result suffers"
-            )
-        ratio = stream.sample_aspect_ratio
-        if ratio and ratio != 1:
-            yield (
-                f"{self._name}: its pixels are not square ({ratio.numerator}:{ratio.denominator}) and are used as they "
-                "are stored; stretch it beforehand with ffmpeg -i INPUT -vf scale=iw*sar:ih,setsar=1 OUTPUT"
-            )
-
 
 def _missing(
     waiting: list[int], failures: deque[str], shown: int, time_base: Fraction, since: int | None
@@ -323,60 +292,3 @@ def _missing(
 def _seconds(waiting: list[int], time_base: Fraction) -> float | None:
     """When the first of the frames that wait is shown; takes it from `waiting`."""
     return float(heapq.heappop(waiting) * time_base) if waiting else None
-
-
-def _moving(container: av.container.InputContainer) -> list[av.video.stream.VideoStream]:
-    """The video streams but for cover pictures, which are streams too."""
-    pictures = av.stream.Disposition.attached_pic | av.stream.Disposition.timed_thumbnails
-    return [stream for stream in container.streams.video if not stream.disposition & pictures]
-
-
-def _has_no_times(container: av.container.InputContainer) -> bool:
-    """Whether the format states none, as a bare H.264 stream."""
-    return bool(container.format.flags & av.format.Flags.no_timestamps.value)
-
-
-def _rate(container: av.container.InputContainer, stream: av.video.stream.VideoStream) -> Fraction | None:
-    """Frames a second on average."""
-    if _has_no_times(container):
-        # What the codec states; the average is a default.
-        return stream.guessed_rate or stream.average_rate
-    # Of some formats the library takes the unit of time for the distance of two frames.
-    return min((rate for rate in (stream.average_rate, stream.guessed_rate) if rate), default=None)
-
-
-def _likely_frames(stated: int | None, seconds: float | None, rate: Fraction | None) -> int | None:
-    """Number of frames that are shown; an edited file states those as well that it does not show, a file in fragments
-    those of the first alone."""
-    by_time = max(1, round(seconds * rate)) if seconds and rate else None
-    if stated is None or by_time is None:
-        return stated or by_time
-    return stated if abs(by_time - stated) <= 0.01 * max(by_time, stated) + 2 else by_time
-
-
-def _duration(container: av.container.InputContainer, stream: av.video.stream.VideoStream) -> float | None:
-    """Seconds from the first frame to the end of the last."""
-    if stream.duration:
-        return float(stream.duration * stream.time_base)
-    start = float((stream.start_time or 0) * stream.time_base)
-    if tag := re.fullmatch(r"(\d+):(\d+):(\d+\.?\d*)", stream.metadata.get("DURATION", "")):
-        # Matroska's, counted from the beginning of the file.
-        hours, minutes, seconds = map(float, tag.groups())
-        return max(0.0, 3600 * hours + 60 * minutes + seconds - start) or None
-    if not container.duration or len(container.streams) > 1:
-        return None
-    total = container.duration / av.time_base
-    return total - start if "matroska" in container.format.name else total
-
-
-def _codec(container: av.container.InputContainer, index: int) -> str:
-    """The codec of a stream for which there is no decoder, as FFmpeg names it."""
-    level = av.logging.get_level()
-    # The library tells it in its log only.
-    av.logging.set_level(av.logging.INFO)
-    try:
-        log = container.dumps_format()
-    finally:
-        av.logging.set_level(level)
-    found = re.search(rf"Stream #0:{index}\b[^\n]*Video: ([^,\n]+)", log)
-    return found[1] if found else "(unknown)"
