@@ -390,8 +390,8 @@ def test_another_release_of_pyav_leaves_videos_to_opencv_and_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = write(tmp_path / "walk.mp4", [grey(i) for i in range(3)])
-    monkeypatch.setattr(av, "__version__", "19.0.2")
-    with pytest.warns(UserWarning, match=r"PyAV 19\.0\.2 .* OpenCV reads .*walk\.mp4 .*logvggt-jax\[video\]"):
+    monkeypatch.setattr(av, "__version__", "20.1.0")
+    with pytest.warns(UserWarning, match=r"PyAV 20\.1\.0 .* OpenCV reads .*walk\.mp4 .*logvggt-jax\[video\]"):
         source = open_source(path)
     assert len(list(source)) == 3
 
@@ -399,6 +399,13 @@ def test_another_release_of_pyav_leaves_videos_to_opencv_and_says_so(
 def test_frames_that_stay_the_same_are_taken_by_opencv(tmp_path: Path, opencv_only: None) -> None:
     path = write(tmp_path / "still.avi", [grey(0)] * 5, codec="huffyuv", pixels="yuv422p")
     assert len(list(open_source(path))) == 5
+
+
+def test_tags_that_are_no_unicode(tmp_path: Path) -> None:
+    """As cameras and old programs write them in the encoding of their country."""
+    path = write(tmp_path / "clip.mkv", [grey(i) for i in range(3)])
+    path.write_bytes(path.read_bytes().replace(b"Lavf", b"L\xe4v\xff"))
+    assert len(list(open_source(path))) == 3
 
 
 def test_a_damaged_duration_is_no_duration(tmp_path: Path) -> None:

@@ -8,9 +8,8 @@ import numpy as np
 
 def display_matrix(frame: av.VideoFrame, stream: av.video.stream.VideoStream) -> np.ndarray | None:
     """[2, 2] matrix D with (x, y) D the place, but for a shift, where the pixel (x, y) is shown; None for none."""
-    for data in frame.side_data:
-        if data.type.name == "DISPLAYMATRIX":
-            return np.frombuffer(bytes(data), np.int32)[:9].reshape(3, 3)[:2, :2].astype(np.float64)
+    if data := frame.side_data.get("DISPLAYMATRIX"):
+        return np.frombuffer(bytes(data), np.int32)[:9].reshape(3, 3)[:2, :2].astype(np.float64)
     tags = {name.lower(): value for name, value in stream.metadata.items()}
     if tags.get("rotate", "").lstrip("-").isdecimal():
         # Clockwise, as older programs wrote it into any file.

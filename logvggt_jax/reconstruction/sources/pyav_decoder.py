@@ -29,6 +29,8 @@ from logvggt_jax.reconstruction.sources.pyav_header import (
     unknown_codec,
 )
 
+# From release 19 on, tags that are not UTF-8 are always read so.
+_TAGS = {"metadata_errors": "replace"} if av.__version__.startswith("18.") else {}
 # Text and single images, which FFmpeg would show as videos of one frame.
 _NO_VIDEOS = ("image2", "tty", "bin", "xbin", "adf", "idf")
 # Formats that state their duration; FFmpeg guesses that of others.
@@ -138,7 +140,7 @@ class PyAVDecoder:
     def _open(self) -> av.container.InputContainer:
         options = {"rtsp_transport": "tcp"} if self._url.startswith("rtsp") else {}
         try:
-            return av.open(self._url, options=options, metadata_errors="replace", timeout=self._timeout)
+            return av.open(self._url, options=options, timeout=self._timeout, **_TAGS)
         except av.FFmpegError as error:
             if self._timeout is not None:
                 late = isinstance(error, av.error.ExitError | av.error.TimeoutError)

@@ -37,8 +37,8 @@ def notes_on(
         )
     if is_interlaced(frame, stream):
         yield f"{name} is interlaced: its frames are deinterlaced (bwdif), and finest lines lose some detail"
-    projections = (int.from_bytes(bytes(d)[:4], "little") for d in frame.side_data if d.type.name == "SPHERICAL")
-    if projection := _PROJECTIONS.get(next(projections, -1)):
+    spherical = frame.side_data.get("SPHERICAL")
+    if spherical and (projection := _PROJECTIONS.get(int.from_bytes(bytes(spherical)[:4], "little"))):
         yield (
             f"{name} looks all around ({projection}), where a pinhole camera is assumed: cut views out of it "
             "beforehand, with ffmpeg -i INPUT -vf v360=e:flat:h_fov=90:v_fov=60 OUTPUT.mp4 from equirectangular"

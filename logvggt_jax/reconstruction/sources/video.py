@@ -27,8 +27,8 @@ from logvggt_jax.reconstruction.sources.source import (
 )
 
 _STREAM = re.compile(r"(rtsps?|rtmps?|https?|udp|tcp|rtp|srt|mms):/{1,2}(?=[^/])", re.IGNORECASE)
-# The release of PyAV whose interface is used; the extra `video` asks for it.
-_PYAV_MAJOR = "18"
+# The releases of PyAV whose interface is known; the extra `video` asks for one of them.
+_PYAV_MAJORS = ("18", "19")
 # Seconds until a network stream that says nothing is given up.
 _TIMEOUT = 10.0
 # Frames a second, for those at the beginning of a stream that come before its clock is known; they are few.
@@ -226,10 +226,10 @@ def _decoder(source: str | Path, name: str, timeout: float | None = None) -> Vid
         import av
     except ImportError:
         return OpenCVDecoder(url, name, timeout)
-    if av.__version__.split(".")[0] != _PYAV_MAJOR:
+    if av.__version__.split(".")[0] not in _PYAV_MAJORS:
         warnings.warn(
-            f"PyAV {av.__version__} has another interface than the {_PYAV_MAJOR} that is known here; OpenCV reads "
-            f'{name} with fewer checks: pip install "logvggt-jax[video]" brings the right one',
+            f"PyAV {av.__version__} may have another interface than {' and '.join(_PYAV_MAJORS)}, which are known "
+            f'here; OpenCV reads {name} with fewer checks: pip install "logvggt-jax[video]" brings the right one',
             stacklevel=2,
         )
         return OpenCVDecoder(url, name, timeout)
