@@ -79,12 +79,12 @@ def atomic_folder(path: str | Path, *, replace: bool = False) -> Iterator[Path]:
     """A folder to fill, `<path>.<unique>.partial`, that becomes `path` when the block ends, and vanishes if it fails.
 
     Its parents are made too. With `replace` what is at `path` goes once the new folder stands in its place; callers
-    make sure that it is worth no more than the new one (`check_output`). Raises OutputExists where something is at
-    `path` and `replace` is not set, or came to be there in the meantime; DiskError where the folder cannot be made or
-    renamed.
+    make sure that it is worth no more than the new one (`check_output`). Raises OutputExists where something else than
+    an empty folder is at `path` and `replace` is not set, or came to be there in the meantime; DiskError where the
+    folder cannot be made or renamed.
     """
     path = Path(path)
-    if not replace and path.exists():
+    if not replace and not _is_free(path):
         raise _exists(path)
     partial = path.with_name(f"{path.name}.{_unique()}.partial")
     with disk_errors(partial):
@@ -97,22 +97,26 @@ def atomic_folder(path: str | Path, *, replace: bool = False) -> Iterator[Path]:
         shutil.rmtree(partial, ignore_errors=True)
 
 
-def check_output(output: str | Path, *, overwrite: bool, marker: str) -> Path:
+def check_output(output: str | Path, *, overwrite: bool, marker: str, in_place: bool = False) -> Path:
     """The absolute path of `output`, provided that a result may be written there; OutputExists otherwise.
 
-    With `overwrite` an existing folder may be replaced, provided it is empty or holds `marker`, a file that every
-    finished folder of this kind has, so that a slip of the keyboard deletes no other folder.
+    An empty folder that was made beforehand is as good as none. With `overwrite` an existing folder may be replaced
+    that holds `marker`, a file that every finished folder of this kind has, so that a slip of the keyboard deletes no
+    other folder. Unless what is written goes `in_place`, into the folder itself, a new folder takes its place at the
+    end, which the top of a volume gives up for nobody.
     """
     try:
         output = Path(output).expanduser().resolve()
     except RuntimeError as error:  # a link that leads to itself, the home of nobody
         raise InputError(f"{output}: {error}") from error
     with disk_errors(output):
-        if not output.exists():
+        if output.is_mount() and not in_place:
+            raise OutputExists(f"{output} is the top of a volume, which nothing can replace: choose a folder in it")
+        if _is_free(output):
             return output
         if not overwrite:
             raise _exists(output)
-        replaceable = output.is_dir() and (not any(output.iterdir()) or (output / marker).is_file())
+        replaceable = (output / marker).is_file()
     if not replaceable:
         raise OutputExists(
             f"{output} is not overwritten: it holds no {marker}, so it is no earlier result; choose another "
@@ -201,6 +205,10 @@ def _unique() -> str:
     return f"{os.getpid()}-{secrets.token_hex(4)}"
 
 
+def _is_free(path: Path) -> bool:
+    return not path.exists() or (path.is_dir() and not any(path.iterdir()))
+
+
 def _exists(path: Path) -> OutputExists:
     return OutputExists(f"{path} exists: choose another output or pass --overwrite to replace it")
 
@@ -208,9 +216,9 @@ def _exists(path: Path) -> OutputExists:
 def move_folder(source: Path, target: Path, *, replace: bool) -> None:
     """Renames a folder; with `replace` what is at `target` goes once the other stands in its place."""
     if not replace:
-        if target.exists():
+        if not _is_free(target):
             raise _exists(target)
-        source.rename(target)
+        source.rename(target)  # an empty folder gives way
         return
     # A folder cannot replace a full one in one call: the old one steps aside and goes last.
     aside = target.with_name(f".{target.name}.{_unique()}.old")

@@ -119,6 +119,27 @@ def test_only_results_are_overwritten_and_only_when_asked(tmp_path: Path) -> Non
     assert names(target) == ["new"] and names(tmp_path) == ["out"]
 
 
+def test_an_empty_folder_is_as_good_as_none(tmp_path: Path) -> None:
+    target = tmp_path / "out"
+    target.mkdir()
+    assert check_output(target, overwrite=False, marker="done") == target
+    with atomic_folder(target) as folder:
+        (folder / "done").touch()
+    assert names(target) == ["done"] and names(tmp_path) == ["out"]
+    with pytest.raises(OutputExists, match="--overwrite"):
+        check_output(target, overwrite=False, marker="done")
+
+
+def test_the_top_of_a_volume_is_told_before_the_work_is_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a folder that a container gets from outside: nothing can be renamed to it."""
+    monkeypatch.setattr(Path, "is_mount", lambda self: self == tmp_path)
+    for overwrite in (False, True):
+        with pytest.raises(OutputExists, match="top of a volume"):
+            check_output(tmp_path, overwrite=overwrite, marker="done")
+    assert check_output(tmp_path, overwrite=True, marker="done", in_place=True) == tmp_path
+    assert check_output(tmp_path / "new", overwrite=False, marker="done") == tmp_path / "new"
+
+
 def test_a_folder_that_cannot_be_replaced_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     target = tmp_path / "out"
     target.mkdir()

@@ -52,7 +52,7 @@ def run_evaluation(
       InputError: a setting, the data or the checkpoint cannot be used.
     """
     run = read_run(configuration)
-    output = check_output(output, overwrite=True, marker=RECORDS_FILE)
+    output = check_output(output, overwrite=True, marker=RECORDS_FILE, in_place=True)
     asks = isinstance(run, ClipRun) and run.evaluation.image_size is None
     longer_edge = read_provenance(checkpoint).longer_edge if asks else None
     benchmarks, baselines = open_run(run, data_root, longer_edge)
