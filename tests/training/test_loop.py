@@ -18,6 +18,7 @@ import pytest
 from jax.sharding import Mesh
 
 from logvggt_jax.data.feeding.clips import ClipReader
+from logvggt_jax.data.registry import open_dataset
 from logvggt_jax.errors import InputError
 from logvggt_jax.interruption import StopRequest
 from logvggt_jax.model.parameters import stack_layers
@@ -225,6 +226,16 @@ def test_checkpoint_of_another_configuration_is_refused(run_config: TrainConfig,
     other = dataclasses.replace(run_config, loss=dataclasses.replace(run_config.loss, alpha=0.5), seed=1)
     with pytest.raises(ValueError, match=r"other settings: loss\.alpha=0\.2, now 0\.5; seed=0, now 1\. Set them back"):
         train(other, finished, mesh=data_mesh(1))
+
+
+def test_a_run_does_not_go_on_with_sequences_that_grew(
+    run_config: TrainConfig, finished: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = {**dict(run_config.data.sources[0].options), "num_frames": 10}
+    monkeypatch.setattr(loop, "open_data", lambda _: ({"rooms": open_dataset("rooms", None, "train", **options)}, ()))
+    # Where the next stage, which begins anew, has no position of its own to compare.
+    with pytest.raises(InputError, match=r"rooms, room-00000 had frames 0:8 and has 0:10 now; .* and 3 more"):
+        train(run_config, finished, mesh=data_mesh(2), resume_step=4)
 
 
 def test_resume_step_that_does_not_exist_is_refused(run_config: TrainConfig, tmp_path: Path) -> None:
