@@ -306,6 +306,15 @@ def test_endless_non_finite_updates_stop_the_run(
         train(run_config, tmp_path, mesh=data_mesh(1))
 
 
+def test_a_work_folder_that_is_a_file_is_refused_before_data_are_read(
+    run_config: TrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(loop, "open_data", lambda _: pytest.fail("not yet"))
+    (tmp_path / "run").write_text("notes")
+    with pytest.raises(InputError, match=r"run is no folder; choose another output"):
+        train(run_config, tmp_path / "run", mesh=data_mesh(1))
+
+
 def test_data_that_fail_leave_a_checkpoint(
     run_config: TrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
