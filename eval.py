@@ -14,14 +14,17 @@ import shlex
 import sys
 from collections.abc import Sequence
 
-from absl import app, flags, logging
-from ml_collections import config_flags
+from logvggt_jax.interruption import one_line_at_ctrl_c
 
-from logvggt_jax.compile import check_devices, enable_compilation_cache
-from logvggt_jax.errors import InputError, one_line, printable
-from logvggt_jax.evaluation.report.report import print_report
-from logvggt_jax.evaluation.run import run_evaluation
-from logvggt_jax.terminal import forgiving_streams, one_log_handler
+with one_line_at_ctrl_c("eval.py"):
+    from absl import app, flags, logging
+    from ml_collections import config_flags
+
+    from logvggt_jax.compile import check_devices, enable_compilation_cache
+    from logvggt_jax.errors import InputError, one_line, printable
+    from logvggt_jax.evaluation.report.report import print_report
+    from logvggt_jax.evaluation.run import run_evaluation
+    from logvggt_jax.terminal import forgiving_streams, one_log_handler
 
 _CONFIG = config_flags.DEFINE_config_file("config", None, "what to evaluate: a file of configs/eval", lock_config=True)
 _CHECKPOINT = flags.DEFINE_string(
@@ -85,5 +88,5 @@ def parse_flags(arguments: list[str]) -> list[str]:
 if __name__ == "__main__":
     flags.mark_flags_as_required(["config", "checkpoint", "output"])
     one_log_handler()
-    with forgiving_streams():
+    with forgiving_streams(), one_line_at_ctrl_c("eval.py"):
         app.run(main, flags_parser=parse_flags)

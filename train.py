@@ -20,22 +20,25 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-import jax
-from absl import app, flags, logging
-from ml_collections import config_flags
+from logvggt_jax.interruption import INTERRUPTED, one_line_at_ctrl_c
 
-from logvggt_jax.compile import check_devices, check_nccl, enable_compilation_cache
-from logvggt_jax.errors import InputError, one_line
-from logvggt_jax.terminal import forgiving_streams, one_log_handler
-from logvggt_jax.training.config import TrainConfig
-from logvggt_jax.training.dry_run import described_mesh, dry_run
-from logvggt_jax.training.loop import NonFiniteTraining, train
-from logvggt_jax.training.parallel.joining import JOIN_SECONDS, LOSS_SECONDS, check_processes, join_processes
-from logvggt_jax.training.parallel.lifeline import Lifeline
-from logvggt_jax.training.parallel.sharding import data_mesh, use_cpu_cores
-from logvggt_jax.training.preflight import preflight
-from logvggt_jax.training.reporting.profile import ProfiledSteps
-from logvggt_jax.training.source_text import with_sources
+with one_line_at_ctrl_c("train.py"):
+    import jax
+    from absl import app, flags, logging
+    from ml_collections import config_flags
+
+    from logvggt_jax.compile import check_devices, check_nccl, enable_compilation_cache
+    from logvggt_jax.errors import InputError, one_line
+    from logvggt_jax.terminal import forgiving_streams, one_log_handler
+    from logvggt_jax.training.config import TrainConfig
+    from logvggt_jax.training.dry_run import described_mesh, dry_run
+    from logvggt_jax.training.loop import NonFiniteTraining, train
+    from logvggt_jax.training.parallel.joining import JOIN_SECONDS, LOSS_SECONDS, check_processes, join_processes
+    from logvggt_jax.training.parallel.lifeline import Lifeline
+    from logvggt_jax.training.parallel.sharding import data_mesh, use_cpu_cores
+    from logvggt_jax.training.preflight import preflight
+    from logvggt_jax.training.reporting.profile import ProfiledSteps
+    from logvggt_jax.training.source_text import with_sources
 
 _CONFIG = config_flags.DEFINE_config_file("config", None, "File with the run's settings.", lock_config=True)
 _SOURCES = flags.DEFINE_multi_string(
@@ -70,9 +73,6 @@ _DESCRIBED = flags.DEFINE_string(
 _CACHE = flags.DEFINE_string(
     "compilation_cache", None, "Folder that keeps compiled programs, `none` for none; by default the user's cache."
 )
-
-# As shells count what Ctrl-C ended.
-_INTERRUPTED = 130
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -123,7 +123,7 @@ def _fail(error: BaseException, watched: Lifeline | None) -> NoReturn:
         message = f"train.py: {one_line(error)}"
     elif isinstance(error, KeyboardInterrupt) and flags.FLAGS.verbosity <= 0:
         message = "train.py: interrupted; the same command goes on from the last checkpoint, if there is one"
-    elif several:
+    elif several or isinstance(error, KeyboardInterrupt):
         message = "".join(traceback.format_exception(error))
     else:
         raise error
@@ -138,7 +138,7 @@ def _fail(error: BaseException, watched: Lifeline | None) -> NoReturn:
         os._exit(1)
     if isinstance(error, KeyboardInterrupt):
         print(message, file=sys.stderr)
-        sys.exit(_INTERRUPTED)
+        sys.exit(INTERRUPTED)
     sys.exit(message)
 
 
@@ -176,5 +176,5 @@ if __name__ == "__main__":
         "a run needs --workdir; --described goes with --dry_run",
     )
     one_log_handler()
-    with forgiving_streams():
+    with forgiving_streams(), one_line_at_ctrl_c("train.py"):
         app.run(main, flags_parser=parse_flags)

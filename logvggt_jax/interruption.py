@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import signal
+import sys
 import threading
+from collections.abc import Iterator
 from types import FrameType
 from typing import Any
+
+INTERRUPTED = 130
+"""Exit code of what Ctrl-C ended, as shells count it."""
 
 
 class Interrupted(Exception):
@@ -49,3 +56,46 @@ class StopRequest:
         for number, handler in self._previous.items():
             signal.signal(number, handler)
         self._previous.clear()
+
+
+@contextlib.contextmanager
+def one_line_at_ctrl_c(program: str) -> Iterator[None]:
+    """While entered, Ctrl-C ends `program` with one line and the code `INTERRUPTED`, where what runs lets it pass.
+
+    It does so at once while modules are imported: libraries take a KeyboardInterrupt in the middle of their extensions
+    for an error of their own, crash, or forget it. Outside of the main thread that does not work, nor where something
+    else handles the signal, or it is ignored.
+    """
+    line = f"{program}: interrupted"
+
+    def end(number: int, frame: FrameType | None) -> None:
+        if _importing(frame):
+            with contextlib.suppress(OSError, ValueError):  # nobody may be reading
+                sys.stdout.flush()
+                print(line, file=sys.stderr, flush=True)
+            os._exit(INTERRUPTED)
+        signal.default_int_handler(number, frame)
+
+    ours = threading.current_thread() is threading.main_thread()
+    ours = ours and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if ours:
+        signal.signal(signal.SIGINT, end)
+    try:
+        yield
+    except KeyboardInterrupt:
+        print(line, file=sys.stderr)
+        sys.exit(INTERRUPTED)
+    finally:
+        if ours:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _importing(frame: FrameType | None) -> bool:
+    """Whether a module is being imported: the import system is at work, or a module's own lines between imports."""
+    if frame is not None and frame.f_code.co_name == "<module>":
+        return True
+    while frame is not None:
+        if frame.f_globals.get("__name__", "").startswith("importlib._bootstrap"):
+            return True
+        frame = frame.f_back
+    return False

@@ -8,9 +8,9 @@ import warnings
 from collections.abc import Sequence
 
 from logvggt_jax.cli import data, doctor, live, models, reconstruct, results
-from logvggt_jax.cli.exit_codes import BAD_INPUT, INTERRUPTED, OUTPUT_LOST
+from logvggt_jax.cli.exit_codes import BAD_INPUT, OUTPUT_LOST
 from logvggt_jax.errors import InputError, one_line, printable
-from logvggt_jax.interruption import Interrupted
+from logvggt_jax.interruption import INTERRUPTED, Interrupted, one_line_at_ctrl_c
 from logvggt_jax.terminal import forgiving_streams
 
 
@@ -24,7 +24,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Args:
       arguments: without the program's name; default `sys.argv[1:]`.
     """
-    with forgiving_streams() as output:
+    with forgiving_streams() as output, one_line_at_ctrl_c("logvggt"):
         code = _run(sys.argv[1:] if arguments is None else arguments)
     if output.failure is not None and not isinstance(output.failure, BrokenPipeError):
         print(f"logvggt: error: standard output cannot be written: {one_line(output.failure)}", file=sys.stderr)

@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 from logvggt_jax.cli.choices import FORMATS, METHOD_NAMES
 from logvggt_jax.cli.command import add_command, execution_options, longer_edge_option, output_option
-from logvggt_jax.cli.exit_codes import BAD_INPUT, INTERRUPTED
+from logvggt_jax.cli.exit_codes import BAD_INPUT
 from logvggt_jax.cli.viewing import stay_open, watch_options, watched
 from logvggt_jax.errors import InputError, one_line, printable
+from logvggt_jax.interruption import INTERRUPTED
 
 if TYPE_CHECKING:
     from logvggt_jax.reconstruction.result import Reconstruction

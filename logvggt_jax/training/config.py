@@ -284,6 +284,7 @@ class TrainConfig:
                     "every clip at one size: give all stages the same sizes"
                 )
         require_counts(self, "log_every", "save_every", "keep_checkpoints", "max_skipped_in_a_row", "accumulate")
+        require_within(self, "[0, inf)", "seed")
         require_within(self, "[0, 1)", "average")
         require_within(self, "(0, inf)", "max_minutes")
 

@@ -13,6 +13,7 @@ from rich.console import Console
 from logvggt_jax.compile import most_device_bytes
 from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.data.feeding.batches import BatchIterator
+from logvggt_jax.files import check_writable
 from logvggt_jax.interruption import StopRequest
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.operations import matmul_flops_per_second
@@ -74,6 +75,8 @@ def train(
         check_batch_size(stage, mesh, accumulate=config.accumulate)
     if wandb is not None:
         load_wandb()
+    if jax.process_index() == 0:  # which alone writes there
+        check_writable(workdir.expanduser().absolute() / "checkpoints")
     check_shared(workdir)
     with contextlib.ExitStack() as stack:
         # Before gigabytes of weights are read, and unwatched: to label all clips, or to list a disk, takes hours.
@@ -154,6 +157,8 @@ class _Run:
             source = stage_batches(datasets, self.config.data, stage, seed=seed)
             if position is not None and position.stage == index:
                 source.set_state(position.data)
+            elif position is not None:  # of a stage that is done, on the same sequences
+                source.check_frames(position.data)
             # Otherwise they would wait for one another in different programs.
             check_agreement(f"stage {stage.name!r}: the data", {**source.get_state(), "broken": None})
             left.append((index, stage, end, source))

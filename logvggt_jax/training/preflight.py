@@ -25,7 +25,8 @@ from logvggt_jax.training.checkpoints.checkpoint_files import Position
 from logvggt_jax.training.checkpoints.run_checkpoints import RunCheckpoints
 from logvggt_jax.training.config import SourceConfig, StageConfig, TeacherConfig, TrainConfig
 from logvggt_jax.training.feeding.batches import stage_batches
-from logvggt_jax.training.feeding.sources import check_truth, open_sources
+from logvggt_jax.training.feeding.sources import open_sources
+from logvggt_jax.training.feeding.truth import check_depth, check_truth
 from logvggt_jax.training.parallel.agreement import any_process, check_shared
 from logvggt_jax.training.parallel.sharding import DATA_AXIS, check_batch_size, split
 from logvggt_jax.training.step.costs import step_costs
@@ -70,6 +71,7 @@ def preflight(config: TrainConfig, workdir: Path, mesh: Mesh, say: Callable[[str
     def find_data() -> str:
         check_truth(config)
         datasets.update(open_sources(config.data, () if config.validation is None else config.validation.sources))
+        check_depth(config, datasets)
         return f"{', '.join(datasets)} found" if config.teacher is not None else with_clips()
 
     def with_clips() -> str:

@@ -65,6 +65,13 @@ def test_what_cannot_be_used_is_one_line(
     assert result.stderr.count("\n") == 1 and message in result.stderr and not output.exists()
 
 
+def test_ctrl_c_is_one_line(run_eval: Callable, tmp_path: Path) -> None:
+    config = tmp_path / "config.py"
+    config.write_text("def get_config():\n    raise KeyboardInterrupt\n")
+    result = run_eval(f"--config={config}", "--checkpoint=c", f"--output={tmp_path / 'out'}")
+    assert (result.returncode, result.stderr) == (130, "eval.py: interrupted\n")
+
+
 def test_a_bug_keeps_its_traceback(tmp_path: Path) -> None:
     program = """
 import eval as script

@@ -16,6 +16,8 @@ from logvggt_jax import ModelConfig
 from logvggt_jax.data import open_dataset
 from logvggt_jax.data.errors import BrokenPicture
 from logvggt_jax.data.feeding.batches import training_batches
+from logvggt_jax.data.feeding.frame_range import FrameRange
+from logvggt_jax.data.feeding.listed_frames import listed_frames
 from logvggt_jax.errors import InputError
 from logvggt_jax.metrics.depth import depth_metrics
 from logvggt_jax.training import loop
@@ -72,6 +74,13 @@ def test_clips_have_the_teachers_labels_and_never_the_truth(rooms: Any, tmp_path
         batch = next(batches)
     assert batch["confidence"].shape == batch["depth"].shape == (2, 3, *SIZE)
     np.testing.assert_allclose(np.log(batch["depth"]) + 1, batch["confidence"], rtol=1e-5)
+
+
+def test_a_clip_knows_its_frames_in_the_whole_sequence(rooms: Any, tmp_path: Path) -> None:
+    last = labelled(FrameRange(rooms, (-7, None), "rooms"), tmp_path, stride=2, clip_length=3)
+    found = {name.partition("@")[2]: frames for name, frames in listed_frames({"rooms": last})["rooms"].items()}
+    # One that grew has clips of the same names, and others in them.
+    assert found == {"0": "3:8", "2": "5:10"}
 
 
 def test_what_was_labelled_once_is_not_labelled_again_unless_teacher_or_pictures_differ(

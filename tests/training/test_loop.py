@@ -18,6 +18,7 @@ import pytest
 from jax.sharding import Mesh
 
 from logvggt_jax.data.feeding.clips import ClipReader
+from logvggt_jax.data.registry import open_dataset
 from logvggt_jax.errors import InputError
 from logvggt_jax.interruption import StopRequest
 from logvggt_jax.model.parameters import stack_layers
@@ -25,7 +26,7 @@ from logvggt_jax.training import loop
 from logvggt_jax.training.checkpoints import run_checkpoints
 from logvggt_jax.training.checkpoints.checkpoint_files import Position
 from logvggt_jax.training.checkpoints.run_checkpoints import RunCheckpoints
-from logvggt_jax.training.config import VALIDATION_METRICS, SourceConfig, TrainConfig, ValidationConfig
+from logvggt_jax.training.config import VALIDATION_METRICS, SourceConfig, StageConfig, TrainConfig, ValidationConfig
 from logvggt_jax.training.feeding.device_batches import DeviceBatches
 from logvggt_jax.training.loop import NonFiniteTraining, train
 from logvggt_jax.training.parallel.sharding import data_mesh
@@ -194,6 +195,60 @@ def test_finished_run_is_left_alone(run_config: TrainConfig, straight: tuple[Tra
     assert _numbers(finished) == _numbers(straight[1])
 
 
+def _at_constant_rate(config: TrainConfig, *stages: StageConfig) -> TrainConfig:
+    """The run with these stages; what its first steps learn does not depend on how many follow."""
+    rate = config.optimizer.learning_rate
+    optimizer = dataclasses.replace(config.optimizer, final_learning_rate=rate, warmup_fraction=0.0)
+    return dataclasses.replace(config, optimizer=optimizer, stages=stages)
+
+
+@pytest.fixture(scope="module")
+def at_constant_rate(run_config: TrainConfig, pixel_model: Any, pixel_params: Any, tmp_path_factory: Any) -> Path:
+    """The folder of a finished run of two stages."""
+    workdir = Path(tmp_path_factory.mktemp("constant"))
+    with pytest.MonkeyPatch.context() as patch:
+        _use(patch, pixel_model, pixel_params)
+        patch.setattr(loop, "make_program", _program)
+        train(_at_constant_rate(run_config, *run_config.stages), workdir, mesh=data_mesh(1))
+    return workdir
+
+
+@pytest.mark.parametrize("added", [True, False])
+def test_a_finished_run_that_is_to_go_further_trains_the_new_steps_and_no_others(
+    run_config: TrainConfig, at_constant_rate: Path, tmp_path: Path, added: bool
+) -> None:
+    workdir = Path(shutil.copytree(at_constant_rate, tmp_path / "finished"))
+    first, last = run_config.stages
+    more = (last, dataclasses.replace(last, name="third")) if added else (dataclasses.replace(last, steps=4),)
+    config = _at_constant_rate(run_config, first, *more)
+    state = train(config, workdir, mesh=data_mesh(1))
+    # Times and all.
+    assert read_metrics(workdir / "metrics.jsonl")[:6] == read_metrics(at_constant_rate / "metrics.jsonl")
+    _same(state, train(config, tmp_path / "whole", mesh=data_mesh(1)))
+    assert _numbers(workdir) == _numbers(tmp_path / "whole")
+    training = read_provenance(workdir / "model").training
+    assert training is not None and training.steps == 8
+    # And is finished again.
+    _same(train(config, workdir, mesh=data_mesh(1)), state)
+
+
+def test_other_changes_of_stages_are_refused(run_config: TrainConfig, finished: Path) -> None:
+    first, last = run_config.stages
+    third = dataclasses.replace(last, name="third")
+    longer = [dataclasses.replace(stage, steps=8) for stage in run_config.stages]
+    for stages, step, named in (
+        # Where it is not finished.
+        ((first, last, third), 4, r"stages=\['first', 'second'\], now \['first', 'second', 'third'\]"),
+        ((longer[0], last), None, r"stages\[0\]\.steps=4, now 8"),
+        ((first, longer[1], third), None, "stages"),
+        ((first, dataclasses.replace(last, steps=1)), None, r"stages\[1\]\.steps=2, now 1"),
+        ((first, dataclasses.replace(longer[1], clip_length=2)), None, r"stages\[1\]\.clip_length=3, now 2"),
+    ):
+        config = dataclasses.replace(run_config, stages=stages)
+        with pytest.raises(InputError, match=rf"other settings: {named}.*\(a finished run may get stages after"):
+            train(config, finished, mesh=data_mesh(1), resume_step=step)
+
+
 @pytest.mark.usefixtures("abandoned_reads")
 def test_run_whose_newest_checkpoint_is_damaged_ends_the_same(
     run_config: TrainConfig, straight: tuple[TrainState, Path], finished: Path
@@ -227,6 +282,16 @@ def test_checkpoint_of_another_configuration_is_refused(run_config: TrainConfig,
         train(other, finished, mesh=data_mesh(1))
 
 
+def test_a_run_does_not_go_on_with_sequences_that_grew(
+    run_config: TrainConfig, finished: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = {**dict(run_config.data.sources[0].options), "num_frames": 10}
+    monkeypatch.setattr(loop, "open_data", lambda _: ({"rooms": open_dataset("rooms", None, "train", **options)}, ()))
+    # Where the next stage, which begins anew, has no position of its own to compare.
+    with pytest.raises(InputError, match=r"rooms, room-00000 had frames 0:8 and has 0:10 now; .* and 3 more"):
+        train(run_config, finished, mesh=data_mesh(2), resume_step=4)
+
+
 def test_resume_step_that_does_not_exist_is_refused(run_config: TrainConfig, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="no checkpoint of step 5; there are none"):
         train(run_config, tmp_path, mesh=data_mesh(1), resume_step=5)
@@ -239,6 +304,15 @@ def test_endless_non_finite_updates_stop_the_run(
     monkeypatch.setattr(loop, "initial_parameters", lambda *_, **__: jax.tree.map(jnp.array, broken))
     with pytest.raises(NonFiniteTraining, match="step 2: 2 updates in a row had a non-finite loss or gradient"):
         train(run_config, tmp_path, mesh=data_mesh(1))
+
+
+def test_a_work_folder_that_is_a_file_is_refused_before_data_are_read(
+    run_config: TrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(loop, "open_data", lambda _: pytest.fail("not yet"))
+    (tmp_path / "run").write_text("notes")
+    with pytest.raises(InputError, match=r"run is no folder; choose another output"):
+        train(run_config, tmp_path / "run", mesh=data_mesh(1))
 
 
 def test_data_that_fail_leave_a_checkpoint(

@@ -104,6 +104,7 @@ def test_missing_fields_are_named(run_config: TrainConfig) -> None:
         ("optimizer.clip_norm", 0.0, r"must lie in \(0, inf\), got 0\.0"),
         ("optimizer.b1", 1.5, r"must lie in \[0, 1\), got 1\.5"),
         ("optimizer.learning_rate", "1e-3", "must be a number, got '1e-3'"),
+        ("seed", -1, r"must lie in \[0, inf\), got -1"),
         ("data.max_broken", 1.0, r"must lie in \[0, 1\), got 1\.0"),
         ("stages.first.min_stride", 3, "=3 exceeds max_stride=2"),
         ("stages.first.steps", 0, "must be a positive integer, got 0"),

@@ -20,7 +20,8 @@ from logvggt_jax.data.dataset import Dataset, DrawnOnDevice
 from logvggt_jax.data.feeding.augmentation import ColourAugmentation
 from logvggt_jax.data.feeding.broken_clips import BrokenClips
 from logvggt_jax.data.feeding.clips import BROKEN, NAME, Size
-from logvggt_jax.data.feeding.mixture import mixture
+from logvggt_jax.data.feeding.listed_frames import check_listed_frames
+from logvggt_jax.data.feeding.mixture import FRAMES, mixture
 from logvggt_jax.data.feeding.sampling import sampler_for
 from logvggt_jax.errors import InputError, one_line
 
@@ -136,16 +137,19 @@ class BatchIterator(Iterator[Batch]):
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Continues after the examples that `state` counts.
 
-        Raises InputError if the state is of another seed, clip or mixture, whose examples would differ.
+        Raises InputError if the state is of another seed, clip or mixture, or of sequences with other frames, whose
+        examples would differ.
         """
         expected = {"examples", "broken", *self._identity}
-        if set(state) != expected:
+        # States of before frames were listed pass without them.
+        if set(state) | {FRAMES} != expected:
             raise InputError(
                 f"data state has fields {sorted(state)}, expected {sorted(expected)}: "
                 "it was written by another version or is damaged"
             )
+        self.check_frames(state)
         for name, value in self._identity.items():
-            if state[name] != value:
+            if name != FRAMES and state[name] != value:
                 raise InputError(
                     f"data state was written with {name}={state[name]}, this run has {value}: "
                     "resume with the same data settings, or start a new run"
@@ -153,6 +157,10 @@ class BatchIterator(Iterator[Batch]):
         self.close()
         self._consumed = int(state["examples"])
         self.broken.set_state(state["broken"])
+
+    def check_frames(self, state: Mapping[str, Any]) -> None:
+        """Raises InputError naming sequences that have other frames than where `state`, of any clips, was written."""
+        check_listed_frames(state.get(FRAMES, {}), self._identity[FRAMES])
 
     def _open(self) -> Iterator[dict[str, Any]]:
         start = self._consumed + self._process_index

@@ -1,7 +1,7 @@
 """A part of every sequence of a data set, as a data set: the first frames to train on, the last ones to validate on."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -12,6 +12,15 @@ from logvggt_jax.frames import Frames
 
 Range = tuple[int | None, int | None]
 """First frame and the one after the last, as in a slice of Python: None is an end, negative ones count from the end."""
+
+
+@runtime_checkable
+class PartOfFrames(Protocol):
+    """A data set that gives a part of the frames of another one."""
+
+    def range(self, sequence: str) -> range:
+        """The frames of `sequence`, as the whole set counts them."""
+        ...
 
 
 class FrameRange(Dataset):
@@ -39,7 +48,7 @@ class FrameRange(Dataset):
         return {**self._dataset.identity, "frames": list(self._frames)}
 
     def range(self, sequence: str) -> range:
-        """The frames of `sequence`, as the whole set counts them."""
+        """As of `PartOfFrames`."""
         return range(self._dataset.num_frames(sequence))[slice(*self._frames)]
 
     def num_frames(self, sequence: str) -> int:
@@ -73,10 +82,12 @@ def longest(dataset: Dataset) -> str:
     return f"the longest has {count}{' of the frames that are asked for' if isinstance(dataset, FrameRange) else ''}"
 
 
+def frames_of(dataset: Dataset, sequence: str) -> range:
+    """The frames of `sequence` in a view of a data set, the whole or a part of it, as the whole counts them."""
+    return dataset.range(sequence) if isinstance(dataset, PartOfFrames) else range(dataset.num_frames(sequence))
+
+
 def shared_frames(trained: Dataset, evaluated: Dataset, sequence: str) -> bool:
     """Whether two views of one data set, each the whole or a range of it, share frames of `sequence`."""
-    ranges = [
-        each.range(sequence) if isinstance(each, FrameRange) else range(each.num_frames(sequence))
-        for each in (trained, evaluated)
-    ]
+    ranges = [frames_of(each, sequence) for each in (trained, evaluated)]
     return bool(range(max(r.start for r in ranges), min(r.stop for r in ranges)))

@@ -15,10 +15,12 @@ from logvggt_jax.data.feeding.augmentation import ColourAugmentation
 from logvggt_jax.data.feeding.broken_clips import describe
 from logvggt_jax.data.feeding.clips import ClipReader, ReplaceBroken, Size
 from logvggt_jax.data.feeding.frame_range import longest
+from logvggt_jax.data.feeding.listed_frames import listed_frames
 from logvggt_jax.data.feeding.sampling import Sampler
 from logvggt_jax.data.feeding.transforms import nearest_size
 from logvggt_jax.errors import InputError
 
+FRAMES = "frames"  # in what examples are drawn from: `ListedFrames`
 _SIZE_READERS = 16
 
 
@@ -94,6 +96,7 @@ def mixture(
         "seed": seed,
         "samplers": {name: repr(sampler) for name, sampler in samplers.items()},
         "sizes": [list(size) for size in sizes],
+        FRAMES: listed_frames(datasets),
         "sequences": {name: [_fingerprint(part) for part in parts] for name, parts in sequences.items()},
         "weights": dict(shares),
         "augmentation": repr(augmentation),

@@ -71,6 +71,7 @@ class StoredCheckpoint:
     """A checkpoint's description, read and compared with its digest; arrays are read later.
 
     Attributes:
+      step: steps that were done.
       position: where the run stood.
       config: the run's settings, as mappings.
     """
@@ -93,7 +94,7 @@ class StoredCheckpoint:
         self._digests: Mapping[str, Any] = meta["digests"]
         # Earlier versions kept every layer's parameters and moments by themselves.
         self._stacked = meta.get("layers") == "stacked"
-        self.position, self.config = Position(meta["stage"], data), meta["config"]
+        self.step, self.position, self.config = meta["step"], Position(meta["stage"], data), meta["config"]
 
     def read(self, like: TrainState, config: TrainConfig) -> TrainState:
         """The state with the shapes and placement of `like`; its content is not compared yet.

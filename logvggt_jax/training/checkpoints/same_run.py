@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from logvggt_jax.errors import InputError
@@ -16,7 +16,10 @@ _FREE_DATA_SETTINGS = ("worker_count", "num_threads", "cache_dir", "max_broken")
 
 
 def check_configuration(stored: StoredCheckpoint, config: TrainConfig) -> None:
-    """Raises InputError naming the settings, of those that decide what is learned, in which they differ."""
+    """Raises InputError naming the settings, of those that decide what is learned, in which they differ.
+
+    A finished run may be given further stages, or more steps of its last one.
+    """
     ours, written = config.to_dict(), stored.config
     with contextlib.suppress(InputError):  # with what an earlier version had no field for
         # Validation may change, and is not to keep the rest from being read where its fields did.
@@ -24,15 +27,33 @@ def check_configuration(stored: StoredCheckpoint, config: TrainConfig) -> None:
     found: list[str] = []
     for part in ("model", "stages", "data", "loss", "optimizer", "seed", "average"):
         then, now = written.get(part), ours[part]
+        if part == "stages" and then is not None and _goes_further(stored.step, then, now):
+            continue
         if part == "data" and then is not None:
             then, now = _what_decides_clips(then), _what_decides_clips(now)
         found += [f"{name}={theirs!r}, now {mine!r}" for name, theirs, mine in _differences(then, now, part)]
     if found:
         more = f"; and {len(found) - _NAMED} more" if len(found) > _NAMED else ""
+        mend = "Set them back"
+        if any(each.startswith("stages") for each in found):
+            mend += " (a finished run may get stages after its last one, or else more steps of that one)"
         raise InputError(
-            f"{stored.where} was written with other settings: {'; '.join(found[:_NAMED])}{more}. Set them back, or "
-            "start a new --workdir, which --config.initial_weights lets begin with the model of this one"
+            f"{stored.where} was written with other settings: {'; '.join(found[:_NAMED])}{more}. {mend}, or start a "
+            "new --workdir, which --config.initial_weights lets begin with the model of this one"
         )
+
+
+def _goes_further(done: int, then: Sequence[Mapping[str, Any]], now: Sequence[Mapping[str, Any]]) -> bool:
+    """Whether the stages `now` are those of `then`, all finished after `done` steps, and more of them.
+
+    Either stages that follow, or steps of the last one: with another number of stages that one draws other clips.
+    """
+    if done != sum(stage["steps"] for stage in then):
+        return False
+    if len(now) > len(then):
+        return list(now[: len(then)]) == list(then)
+    *before, last = then
+    return list(now) == [*before, {**last, "steps": now[-1]["steps"]}] and now[-1]["steps"] > last["steps"]
 
 
 def _what_decides_clips(data: Mapping[str, Any]) -> dict[str, Any]:
@@ -51,4 +72,11 @@ def _differences(theirs: Any, ours: Any, name: str) -> Iterator[tuple[str, Any, 
         for i, (a, b) in enumerate(zip(theirs, ours, strict=True)):
             yield from _differences(a, b, f"{name}[{i}]")
     elif theirs != ours:
-        yield name, theirs, ours
+        yield name, _named(theirs), _named(ours)
+
+
+def _named(value: Any) -> Any:
+    """The names of stages or sources, of which there are others or not as many; other values as they are."""
+    if isinstance(value, list) and value and all(isinstance(each, dict) and "name" in each for each in value):
+        return [each["name"] for each in value]
+    return value

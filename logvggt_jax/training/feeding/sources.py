@@ -15,7 +15,7 @@ from logvggt_jax.data.feeding.holdouts import check_disjoint, check_held_out
 from logvggt_jax.data.packed.index import is_packed
 from logvggt_jax.data.registry import DATASETS, READERS, open_dataset
 from logvggt_jax.errors import InputError
-from logvggt_jax.training.config import DataConfig, SourceConfig, TrainConfig
+from logvggt_jax.training.config import DataConfig, SourceConfig
 
 
 def open_source(source: SourceConfig) -> Dataset:
@@ -61,19 +61,6 @@ def open_sources(config: DataConfig, validation: Sequence[SourceConfig] = ()) ->
         made = reader.for_training(cache_dir=config.cache_dir, progress=progress)
         datasets[source.name] = _frames_of(source, made)
     return datasets
-
-
-def check_truth(config: TrainConfig) -> None:
-    """Raises InputError where there is no teacher for sources without poses and depth."""
-    validated = () if config.validation is None else config.validation.sources
-    taught = (config.teacher is not None, config.teacher is not None and config.teacher.validation)
-    for sources, teacher in zip((config.data.sources, validated), taught, strict=True):
-        for source in sources:
-            if not teacher and source.name in READERS and not READERS[source.name].truth:
-                raise InputError(
-                    f"{source.name} ({source.root}): {READERS[source.name].title} have no poses and no depth, which "
-                    "only a teacher gives them: --config=configs/distill.py:TEACHER, or a data set that has both"
-                )
 
 
 def _hold_others(one: SourceConfig, other: SourceConfig) -> bool:

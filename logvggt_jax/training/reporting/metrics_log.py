@@ -61,7 +61,7 @@ class MetricsLog:
             # Without a buffer, which would fail once more when it is closed.
             self._file, self._times = self.path.open("ab", buffering=0), times.open("ab", buffering=0)
         self._events = EventFile(workdir / "tensorboard", purge_step=first_step + 1)
-        known = read_metrics(times)
+        known = [entry for entry in read_metrics(times) if {"time", "productive_seconds"} <= entry.keys()]
         if known:
             self.started = known[0]["time"]
             self.productive_seconds = known[-1]["productive_seconds"]
@@ -119,13 +119,15 @@ class MetricsLog:
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
-    """The lines of a metrics file; an unfinished last line (a killed run) is left out."""
+    """The lines of a metrics file; what is none is left out: the unfinished last one of a killed run, damaged ones."""
     entries = []
-    for line in path.read_text().splitlines():
+    for line in path.read_bytes().splitlines():
         try:
-            entries.append(json.loads(line))
-        except json.JSONDecodeError:
-            break
+            entry = json.loads(line)
+        except (ValueError, RecursionError):
+            continue
+        if isinstance(entry, dict) and isinstance(entry.get("step"), int):
+            entries.append(entry)
     return entries
 
 

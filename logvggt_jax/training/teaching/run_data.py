@@ -8,7 +8,8 @@ import jax
 
 from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.training.config import TeacherConfig, TrainConfig
-from logvggt_jax.training.feeding.sources import check_truth, open_source, open_sources
+from logvggt_jax.training.feeding.sources import open_source, open_sources
+from logvggt_jax.training.feeding.truth import check_depth, check_truth
 from logvggt_jax.training.teaching.labelling import taught
 from logvggt_jax.training.teaching.teacher import PlainVGGT, Teacher
 
@@ -17,10 +18,11 @@ def open_data(config: TrainConfig) -> tuple[Mapping[str, Dataset], Sequence[Data
     """The mixture's data sets by name, and the validation sets where they are not simply their sources.
 
     With a teacher every clip is labelled here, or found in the cache; the teacher is gone when this returns. Raises
-    InputError as `check_truth`, `open_sources`, `PlainVGGT` and `taught`.
+    InputError as `check_truth`, `open_sources`, `check_depth`, `PlainVGGT` and `taught`.
     """
     check_truth(config)
     datasets = open_sources(config.data, () if config.validation is None else config.validation.sources)
+    check_depth(config, datasets)
     if config.teacher is None:
         return datasets, ()
     labelled = label(config, config.teacher, PlainVGGT(config.teacher), datasets)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from logvggt_jax.data.dataset import Dataset, check_indices, check_sequence
+from logvggt_jax.data.feeding.frame_range import frames_of
 from logvggt_jax.data.feeding.transforms import fit
 from logvggt_jax.frames import Frames
 from logvggt_jax.training.teaching.labels import stored_labels
@@ -43,6 +44,12 @@ class TaughtDataset(Dataset):
     def identity(self) -> Mapping[str, Any]:
         """As of `Dataset`."""
         return {**self._dataset.identity, "teacher": self._teacher}
+
+    def range(self, sequence: str) -> range:
+        """As of `PartOfFrames`."""
+        clip = self._clip(sequence)
+        step = clip.frames[1] - clip.frames[0]
+        return frames_of(self._dataset, clip.sequence)[clip.frames[0] : clip.frames[-1] + 1 : step]
 
     def num_frames(self, sequence: str) -> int:
         """As of `Dataset`."""

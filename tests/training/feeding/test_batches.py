@@ -15,7 +15,6 @@ from logvggt_jax.errors import InputError
 from logvggt_jax.training.config import DataConfig, SourceConfig, TrainConfig
 from logvggt_jax.training.feeding.batches import stage_batches
 from logvggt_jax.training.feeding.sources import open_source, open_sources
-from logvggt_jax.training.teaching.run_data import open_data
 
 OPTIONS = {"height": 28, "width": 42, "num_frames": 8, "num_rooms": 8}
 
@@ -106,12 +105,6 @@ def test_a_data_set_to_validate_on_without_its_folder_is_named_with_the_flag(tmp
     absent = SourceConfig(name="tum_recording", root=str(tmp_path / "none"), split="all")
     with pytest.raises(InputError, match=r"without their folder: tum_recording \(.*none\); give --validation_source="):
         open_sources(data(), (rooms("val"), absent))
-
-
-def test_pictures_alone_are_refused_where_nobody_labels_them(tmp_path: Path, run_config: TrainConfig) -> None:
-    config = dataclasses.replace(run_config, data=data(sources=(SourceConfig("images", str(tmp_path), "all"),)))
-    with pytest.raises(InputError, match=r"images \(.*\): .* no poses and no depth, .*configs/distill\.py"):
-        open_data(config)
 
 
 def test_a_damaged_data_set_is_not_a_missing_one(tmp_path: Path) -> None:

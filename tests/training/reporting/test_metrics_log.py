@@ -12,7 +12,7 @@ from rich.console import Console
 from tensorboardX.proto.event_pb2 import Event
 
 from logvggt_jax.errors import DiskError
-from logvggt_jax.training.reporting.metrics_log import FILE_NAME, MetricsLog, read_metrics
+from logvggt_jax.training.reporting.metrics_log import FILE_NAME, TIMES_NAME, MetricsLog, read_metrics
 
 
 def _log(workdir: Path, first_step: int) -> MetricsLog:
@@ -75,3 +75,18 @@ def test_resumed_run_replaces_later_lines_and_an_unfinished_one(tmp_path: Path) 
     entries = read_metrics(tmp_path / FILE_NAME)
     assert [(entry["step"], entry["loss"]) for entry in entries] == [(1, 1.0), (2, 2.0), (3, 3.0), (4, 40.0)]
     assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
+
+
+def test_damaged_lines_cost_a_resumed_run_no_others(tmp_path: Path) -> None:
+    with _log(tmp_path, 0) as log:
+        for step in range(1, 4):
+            log.write(step, {"loss": float(step)})
+    lines = (tmp_path / FILE_NAME).read_bytes().splitlines()
+    damaged = [lines[0], b"\xff\x00", b"7", b'{"loss": 1.0}', *lines[1:]]
+    (tmp_path / FILE_NAME).write_bytes(b"\n".join([*damaged, b""]))
+    (tmp_path / TIMES_NAME).write_text('{"step": 0}\n')
+    with _log(tmp_path, 3) as log:
+        assert log.productive_seconds == 0.0
+        log.write(4, {"loss": 4.0})
+    assert [entry["step"] for entry in read_metrics(tmp_path / FILE_NAME)] == [1, 2, 3, 4]
+    assert (tmp_path / FILE_NAME).read_bytes().splitlines()[:3] == lines
