@@ -24,7 +24,7 @@ $(VENV)/.installed: pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed, for example: make PYTHON=python3.12")'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet --editable ".[colmap,data,docs,eval,export,formats,heic,hub,video,viewer,dev]"
+	$(BIN)/python -m pip install --quiet --editable ".[colmap,data,docs,eval,export,formats,heic,hub,lowprecision,video,viewer,dev]"
 	@touch $@
 
 demo: install

@@ -199,6 +199,21 @@ def test_a_dry_run_says_what_a_run_needs_and_leaves_nothing(
     assert shown.err == "" and list(tmp_path.iterdir()) == []
 
 
+def test_eight_bits_are_announced_before_the_weights_are_read(
+    checkpoint: Path, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("qwix", reason="qwix is not installed (extra `lowprecision`)")
+    monkeypatch.setattr("logvggt_jax.weights.checkpoints.load_model", lambda _: pytest.fail("reads the weights"))
+    monkeypatch.setattr("logvggt_jax.reconstruction.request.describe", lambda *_: [])
+    arguments = ["reconstruct", str(room), "--checkpoint", str(checkpoint), "--output", str(tmp_path / "out")]
+    arguments += ["--dry-run", "--compilation-cache", "none", "--precision", "int8"]
+    assert main(arguments) == 0
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 2 and "int8" in said[0] and "(cpu)" in said[0] and "without --precision" in said[1]
+    monkeypatch.setitem(sys.modules, "qwix", None)
+    assert_fails(capsys, arguments, "qwix", 'pip install "logvggt-jax[lowprecision]"')
+
+
 def test_info_counts_parameters(
     checkpoint: Path, small_config: ModelConfig, capsys: pytest.CaptureFixture[str]
 ) -> None:

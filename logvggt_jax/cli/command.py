@@ -68,6 +68,13 @@ def execution_options(parser: argparse.ArgumentParser) -> None:
         "--dtype", choices=("float32", "bfloat16"), default=None, help="compute type instead of the checkpoint's own"
     )
     parser.add_argument(
+        "--precision",
+        choices=("int8", "fp8"),
+        default=None,
+        help="large products of encoder and aggregator in eight bits, at some loss of accuracy (needs the extra "
+        "`lowprecision`; `logvggt doctor --part precision` prints what is lost and gained)",
+    )
+    parser.add_argument(
         "--compilation-cache",
         default=None,
         metavar="DIR",

@@ -14,11 +14,12 @@ from logvggt_jax.errors import InputError, disk_errors
 
 
 def _doctor(options: argparse.Namespace) -> int:
-    from logvggt_jax.doctor.examination import QUICK, SHARES, examine, part_findings
+    from logvggt_jax.doctor.examination import ON_REQUEST, QUICK, SHARES, examine, part_findings
     from logvggt_jax.doctor.finding import Finding
 
-    if unknown := sorted(set(options.part or ()) - {*SHARES, *METHOD_NAMES}):
-        raise InputError(f"doctor has no part {unknown[0]!r}; it has {', '.join((*SHARES, *METHOD_NAMES))}")
+    known = (*SHARES, *ON_REQUEST, *METHOD_NAMES)
+    if unknown := sorted(set(options.part or ()) - set(known)):
+        raise InputError(f"doctor has no part {unknown[0]!r}; it has {', '.join(known)}")
     parts = options.part or (METHOD_NAMES if options.methods else QUICK if options.quick else tuple(SHARES))
     marks = {True: "ok", False: "WRONG", None: ""}
 
@@ -58,6 +59,7 @@ def add_to(commands: Any) -> None:
         "against recorded values), inference (kernels, memory, time and utilisation of a step), training (the same "
         "for the training step), whole (from files to files). With --methods each method of `reconstruct --method` is "
         "such a part: its frames a second at VGGT-1B's size, beside what the originals in PyTorch reach on one H100. "
+        "`--part precision` compares products in eight bits (`reconstruct --precision`) with those in bfloat16. "
         "On a CPU the model is a tiny one, and nothing is compared. Exit code 0: nothing wrong, 1: something is, "
         "or a part did not come to its end in its time.",
     )

@@ -17,6 +17,7 @@ from logvggt_jax.errors import InputError, one_line
 
 def _live(options: argparse.Namespace) -> int:
     from logvggt_jax.compile import check_devices, enable_compilation_cache
+    from logvggt_jax.model.low_precision import check_precision, in_low_precision
     from logvggt_jax.model.parameters import in_compute_type
     from logvggt_jax.reconstruction.live import LiveSession, OnlineSettings, Recording, online_stream
     from logvggt_jax.reconstruction.live.follow import check_answers, follow
@@ -41,11 +42,15 @@ def _live(options: argparse.Namespace) -> int:
     if doubt := expectation(provenance.trained_for, "windows"):
         warnings.warn(doubt, stacklevel=1)
     check_devices()
+    if options.precision and (note := check_precision(options.precision)):
+        warnings.warn(note, stacklevel=1)
     if options.reconnect is None:
         check_answers(source)
     enable_compilation_cache(options.compilation_cache)
     with watched(options) as window:
         model, variables = from_pretrained(checkpoint, dtype=options.dtype)
+        if options.precision:
+            variables = in_low_precision(variables, options.precision)
         variables = in_compute_type(variables, model.config)
         session = LiveSession(
             lambda: online_stream(model, variables, online, provisional=window is not None),

@@ -24,6 +24,7 @@ SOURCE_OPTIONS = ("stride", "max_frames", "fps", "start", "end", "pattern", "siz
 
 def _reconstruct(options: argparse.Namespace) -> int:
     from logvggt_jax.compile import check_devices, enable_compilation_cache
+    from logvggt_jax.model.low_precision import check_precision, in_low_precision
     from logvggt_jax.model.parameters import in_compute_type
     from logvggt_jax.reconstruction.calibration import Calibration
     from logvggt_jax.reconstruction.exporters import check_formats
@@ -58,6 +59,8 @@ def _reconstruct(options: argparse.Namespace) -> int:
     longer_edge = options.longer_edge or provenance.longer_edge or LONGER_EDGE
     config = read_config(checkpoint, dtype=options.dtype)
     check_devices()
+    if options.precision and (note := check_precision(options.precision)):
+        source.notes.append(note)
     enable_compilation_cache(options.compilation_cache)
     method = choose_method(provenance, None if options.method == "auto" else options.method)
     check_masks(source, method)
@@ -65,6 +68,8 @@ def _reconstruct(options: argparse.Namespace) -> int:
     needs = describe(source, target, config if options.dry_run else None, method, settings, longer_edge, point_filter)
     if provenance.longer_edge not in (None, longer_edge):
         source.notes.append(f"these weights were trained at {provenance.longer_edge} pixels, not {longer_edge}")
+    if options.precision and options.dry_run:
+        source.notes.append("memory and time are those without --precision")
     said = len(source.notes)
     for note in source.notes:
         print(f"logvggt: note: {printable(note)}", file=sys.stderr)
@@ -74,6 +79,8 @@ def _reconstruct(options: argparse.Namespace) -> int:
         return 0
     with watched(options) as window:
         model, variables = from_pretrained(checkpoint, dtype=options.dtype)
+        if options.precision:
+            variables = in_low_precision(variables, options.precision)
         # Here rather than in the stream alone, so that nothing keeps the float32 parameters on the device.
         variables = in_compute_type(variables, model.config)
         result = reconstruct(

@@ -24,7 +24,10 @@ SHARES: Mapping[str, tuple[int, int]] = {
 }
 TOTAL = (60, 300)
 QUICK = ("environment", "parity", "inference")
-# A method of `logvggt_jax.streaming` is a part of its own name. Each is sure of so many seconds, quick and in full.
+# Parts that run where they are asked for.
+ON_REQUEST = ("precision",)
+# A method of `logvggt_jax.streaming` is a part of its own name. Each is sure of so many seconds, quick and in full, as
+# are parts on request.
 METHOD_SHARE = (60, 150)
 
 
@@ -40,14 +43,14 @@ def part_findings(part: str, *, tiny: bool, quick: bool) -> Iterator[Finding]:
 
         yield from parity.examine()
         return
-    from logvggt_jax.doctor import inference, methods, training, whole
+    from logvggt_jax.doctor import inference, methods, precision, training, whole
     from logvggt_jax.doctor.subject import subject
 
-    if part not in SHARES:
+    modules = {"inference": inference, "training": training, "whole": whole, "precision": precision}
+    if part not in modules:
         yield from methods.examine(part, subject(tiny=tiny, quick=quick))
         return
-    module = {"inference": inference, "training": training, "whole": whole}[part]
-    yield from module.examine(subject(tiny=tiny, quick=quick))
+    yield from modules[part].examine(subject(tiny=tiny, quick=quick))
 
 
 def examine(parts: Sequence[str], *, tiny: bool, quick: bool, show: Callable[[Finding], None]) -> bool:

@@ -24,13 +24,10 @@ def examine(subject: Subject) -> Iterator[Finding]:
     """One step of s new frames, as a stream runs it when no frame is padding."""
     model = subject.model
     stride = model.config.windows.stride
-    frames = jnp.asarray(np.random.default_rng(1).integers(0, 256, (1, stride, *subject.image_size, 3), np.uint8))
-    held = jax.ShapeDtypeStruct((1, model.windows.overlap, *subject.image_size, 3), jnp.uint8)
     variables = in_compute_type(random_variables(model), model.config)
     # One loop over layers compiles in a fraction of the time; streams run them one by one, which is faster.
     variables = jax.device_put(stack_layers(variables) if subject.quick else variables)
-    # Values do not matter: nothing has to be compiled for them.
-    state = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(model.start, variables, held))
+    state, frames = step_inputs(subject, variables)
     started = time.perf_counter()
     step = jax.jit(model.step, donate_argnums=1).lower(variables, state, frames).compile()
     yield Finding("inference", "compilation", time.perf_counter() - started, "s")
@@ -49,13 +46,8 @@ def examine(subject: Subject) -> Iterator[Finding]:
         yield Finding("inference", what, size / 2**30, "GiB")
 
     count = 4 if subject.tiny else 20 if subject.quick else 60
-    state, out = step(variables, state, frames)
-    jax.block_until_ready(out)
-    started = time.perf_counter()
-    for _ in range(count):
-        state, out = step(variables, state, frames)
-    jax.block_until_ready(out)
-    seconds = (time.perf_counter() - started) / count
+    inputs = jax.eval_shape(lambda s, f: (s, f), state, frames)
+    seconds = step_seconds(step, variables, state, frames, count)
     yield Finding(
         "inference",
         "step, back to back",
@@ -65,7 +57,6 @@ def examine(subject: Subject) -> Iterator[Finding]:
     )
     yield Finding("inference", "rate", stride / seconds, "frames/s")
     plain = LogVGGT(dataclasses.replace(model.config, attention="xla"))
-    inputs = jax.eval_shape(lambda s, f: (s, f), state, frames)
     operations = count_flops(plain.step, variable_shapes(plain.config), *inputs)
     peak = matmul_flops_per_second("bfloat16", size=256 if subject.tiny else None)
     yield Finding("inference", "operations of a step", operations / 1e12, "TFLOP")
@@ -73,6 +64,27 @@ def examine(subject: Subject) -> Iterator[Finding]:
     yield Finding(
         "inference", "utilisation", operations / seconds / peak, note="operations a second over that product's"
     )
+
+
+def step_inputs(subject: Subject, variables: Any) -> tuple[Any, jax.Array]:
+    """A stream's state and the new frames of its next step."""
+    model = subject.model
+    held = jax.ShapeDtypeStruct((1, model.windows.overlap, *subject.image_size, 3), jnp.uint8)
+    # Values do not matter: nothing has to be compiled for them.
+    state = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(model.start, variables, held))
+    shape = (1, model.config.windows.stride, *subject.image_size, 3)
+    return state, jnp.asarray(np.random.default_rng(1).integers(0, 256, shape, np.uint8))
+
+
+def step_seconds(step: Any, variables: Any, state: Any, frames: jax.Array, count: int) -> float:
+    """Of one of `count` steps back to back; `state` is donated."""
+    state, out = step(variables, state, frames)
+    jax.block_until_ready(out)
+    started = time.perf_counter()
+    for _ in range(count):
+        state, out = step(variables, state, frames)
+    jax.block_until_ready(out)
+    return (time.perf_counter() - started) / count
 
 
 def attention_calls(program: jax.stages.Compiled) -> int | None:

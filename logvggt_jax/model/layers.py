@@ -12,10 +12,23 @@ import jax.numpy as jnp
 
 from logvggt_jax.model.attention import attention
 from logvggt_jax.model.initializers import constant, fan_in_normal
+from logvggt_jax.model.low_precision import product
 from logvggt_jax.model.memory import Keys, LayerMemory, OwnTokens
 from logvggt_jax.model.precision import product_precision
 from logvggt_jax.model.rope import RopeTable, apply_rope
 from logvggt_jax.model.shape_check import Dense, LayerNorm, ShapeCheck
+
+
+class _Dense(Dense):
+    """A linear layer whose kernel may come in eight bits, see `low_precision.py`; its result is of type `out`."""
+
+    out: str = "float32"
+
+    def __call__(self, inputs: jax.Array) -> jax.Array:
+        if not self.has_variable("params", "codes"):
+            return super().__call__(inputs)
+        given: Any = self.variables["params"]
+        return (product(inputs, given["codes"], given["scale"]) + given["bias"]).astype(self.out)
 
 
 def dense(
@@ -23,8 +36,9 @@ def dense(
 ) -> nn.Dense:
     """Linear layer: products of `dtype`, summed in float32 and handed out in `out`, float32 unless what follows would
     round it anyway. Wide sums that leave the matrix unit in 16 bits are half of the memory traffic."""
-    return Dense(
+    return _Dense(
         features,
+        out=out,
         dtype=dtype,
         precision=product_precision(dtype),
         dot_general=functools.partial(jax.lax.dot_general, preferred_element_type=jnp.dtype(out)),

@@ -28,6 +28,7 @@ from logvggt_jax.data.feeding.transforms import LONGER_EDGE
 from logvggt_jax.errors import InputError
 from logvggt_jax.interruption import StopRequest
 from logvggt_jax.model.logvggt import LogVGGT, Variables
+from logvggt_jax.model.low_precision import precision_of
 from logvggt_jax.reconstruction.calibration import Calibration
 from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE
 from logvggt_jax.reconstruction.finishing import finish
@@ -77,7 +78,7 @@ def reconstruct(
       source: folder of images or video; what `open_source` gives chooses among the frames, and has their masks.
       output: folder to make; it appears when all is done.
       model: the model.
-      variables: {"params": …}.
+      variables: {"params": …}, perhaps in eight bits (`in_low_precision`).
       method: name of `logvggt_jax.streaming.METHODS`; `chunks` for public VGGT weights, see `choose_method`.
       settings: of the method's own settings class; None for its defaults.
       longer_edge: size in pixels, a multiple of 14, to which the longer edge of the frames is resized; take
@@ -115,6 +116,7 @@ def reconstruct(
         "calibration": str(calibration),
         # Left out where there are none, as by earlier versions, whose runs can be taken up.
         **({} if source.masks is None else {"masks": str(source.masks.path.resolve())}),
+        **({} if (precision := precision_of(variables)) is None else {"precision": precision}),
     }
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Rate(), TimeRemainingColumn())
     console = Console(stderr=True)

@@ -22,7 +22,7 @@ import pytest
 from logvggt_jax import LogVGGT, ModelConfig, Predictions
 from logvggt_jax.cli import main
 from logvggt_jax.cli.choices import METHOD_NAMES
-from logvggt_jax.doctor import environment, examination, methods, parity, training
+from logvggt_jax.doctor import environment, examination, methods, parity, precision, training
 from logvggt_jax.doctor.finding import UNFINISHED, Finding
 from logvggt_jax.doctor.subject import Subject, tiny_config
 from logvggt_jax.geometry import decode_poses
@@ -82,6 +82,33 @@ def test_a_method_is_timed_and_on_a_cpu_compared_with_nothing(method: str, rates
     found = [finding for finding in findings if finding.unit == "frames/s"]
     assert len(found) == rates and all(isinstance(each.value, float) and each.value > 0 for each in found)
     assert all(finding.ok is None and not finding.note for finding in findings)
+
+
+@pytest.mark.slow
+def test_eight_bits_are_compared_with_bfloat16() -> None:
+    pytest.importorskip("qwix", reason="qwix is not installed (extra `lowprecision`)")
+    findings = {finding.what: finding for finding in examination.part_findings("precision", tiny=True, quick=True)}
+    assert not [finding for finding in findings.values() if finding.ok is False]
+    depth = [findings[f"{name}: depth"].value for name in ("int8", "fp8")]
+    assert all(findings[f"{name}: depth"].ok for name in ("int8", "fp8"))
+    # Seven bits of a token's largest value against three bits of every value.
+    assert isinstance(depth[0], float) and isinstance(depth[1], float) and 0.0 < depth[0] < depth[1]
+
+
+def test_a_step_in_eight_bits_is_timed_beside_bfloat16(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("qwix", reason="qwix is not installed (extra `lowprecision`)")
+    monkeypatch.delitem(precision.PRECISIONS, "fp8")  # which would be one more program
+    subject = Subject(LogVGGT(tiny_config("bfloat16")), (28, 42), tiny=True, quick=True)
+    found = list(precision.step_times(subject, {"int8": "a note"}))
+    assert [finding.what.split(":")[0] for finding in found] == ["bfloat16", "int8"]
+    assert [finding.note for finding in found] == ["", "a note"]
+    assert all(isinstance(finding.value, float) and finding.value > 0 and finding.unit == "ms" for finding in found)
+
+
+def test_without_qwix_the_part_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "qwix", None)
+    (finding,) = examination.part_findings("precision", tiny=True, quick=True)
+    assert (finding.value, finding.ok) == (None, None) and "lowprecision" in finding.note
 
 
 def test_rates_are_judged_where_the_originals_were_measured(monkeypatch: pytest.MonkeyPatch) -> None:

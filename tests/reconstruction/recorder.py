@@ -75,7 +75,6 @@ def reconstruct_recorded(
             source,
             output,
             model=LogVGGT(),
-            variables={},
             method="recorder",
-            **{"longer_edge": LONGER_EDGE, **options},
+            **{"longer_edge": LONGER_EDGE, "variables": {}, **options},
         )

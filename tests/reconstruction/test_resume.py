@@ -198,6 +198,8 @@ def test_another_request_is_refused_and_overwrite_starts_anew(
     before = contents(tmp_path / "out.partial")
     with pytest.raises(OutputExists, match=r"unfinished.*differs in point_filter.*--overwrite"):
         run(Recorder(), walk, output, point_filter=PointFilter(max_points=10))
+    with pytest.raises(OutputExists, match=r"unfinished.*differs in precision"):
+        run(Recorder(), walk, output, variables={"params": {"codes": np.zeros((1, 1), np.int8)}})
     assert contents(tmp_path / "out.partial").keys() == before.keys()
     anew = Recorder()
     run(anew, walk, output, overwrite=True)
