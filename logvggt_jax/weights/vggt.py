@@ -32,13 +32,14 @@ _TRANSPOSED_CONV = functools.partial(np.transpose, axes=(2, 3, 0, 1))
 
 _OUTPUT_HIDDEN = 32  # width between the two convolutions of the DPT head's output, in every VGGT
 _DTYPES = ("float32", "float16", "bfloat16", "float64")
-# Blocks of the encoder by its width, as DINOv2 was published, and of the camera head beside VGGT-1B's.
+# How many blocks a whole checkpoint has at least, by the encoder's width: in the encoder, as DINOv2 was published, and
+# in the camera head, which is known of VGGT-1B alone.
 _DINOV2_DEPTHS = {384: 12, 768: 12, 1024: 24, 1536: 40}
 _TRUNK_DEPTHS = {1024: 4}
 # Constants that some checkpoints hold, and the one parameter that only training used.
 _BUFFERS = ("aggregator._resnet_mean", "aggregator._resnet_std")
 _MASK_TOKEN = "aggregator.patch_embed.mask_token"
-# The fields that shapes tell.
+# The fields of the configuration that the shapes of tensors tell.
 _SIZES = {
     "encoder": ("embed_dim", "depth", "mlp_ratio", "num_registers", "position_grid", "patch_size"),
     "aggregator": ("depth", "num_heads", "mlp_ratio", "num_registers"),

@@ -31,8 +31,8 @@ def make_optimizer(
 
     `params` is a dict of modules (encoder, aggregator, heads). The gradient of each module is clipped to
     `config.clip_norm` by itself, so that one head with an exploding gradient does not slow down the others. Parameters
-    matched by the patterns `frozen` (see `freezing`) do not move, and no moments are kept for them. `norm` is that of a
-    tree of gradients, of which a device may hold a part.
+    matched by the patterns `frozen` (see `freezing`) do not move, and no moments are kept for them. `norm` is the
+    l2 norm of a tree of gradients; where a device holds a part of each alone, it sums over the devices.
 
     Weight decay applies to the kernels of linear layers and convolutions: not to biases, norms, gains of residual
     branches, special tokens and the position embedding, unless `config.decay_all`.
