@@ -130,6 +130,7 @@ def _block(name: str, path: ParamPath, width: int, mlp_ratio: int, head_norm: in
 
 
 def _encoder(config: EncoderConfig) -> Iterator[Rule]:
+    """DINOv2: special tokens, position embedding, patch embedding, blocks, last norm."""
     name, path, width = "aggregator.patch_embed", ("encoder",), config.embed_dim
     yield from _raw(f"{name}.cls_token", (*path, "cls_token"), 1, 1, width)
     yield from _raw(f"{name}.pos_embed", (*path, "pos_embed"), 1, 1 + config.position_grid**2, width)
@@ -142,6 +143,7 @@ def _encoder(config: EncoderConfig) -> Iterator[Rule]:
 
 
 def _aggregator(config: AggregatorConfig, width: int) -> Iterator[Rule]:
+    """The trunk: special tokens, and the blocks over frames and over windows."""
     name, path = "aggregator", ("aggregator",)
     yield from _raw(f"{name}.camera_token", (*path, "camera_token"), 1, 2, 1, width)
     yield from _raw(f"{name}.register_token", (*path, "register_token"), 1, 2, config.num_registers, width)
@@ -153,6 +155,7 @@ def _aggregator(config: AggregatorConfig, width: int) -> Iterator[Rule]:
 
 
 def _camera_head(config: CameraHeadConfig, width: int) -> Iterator[Rule]:
+    """The camera head: trunk, adaptive norm, and what embeds and corrects a pose."""
     name, path = "camera_head", ("camera_head",)
     yield from _raw(f"{name}.empty_pose_tokens", (*path, "empty_pose_tokens"), 1, 1, 9)
     for i in range(config.depth):
