@@ -17,7 +17,7 @@ from configs import finetune
 
 def get_config(teacher: str = "facebook/VGGT-1B") -> ConfigDict:
     """The run; fields as in `configs/finetune.py`, whose sizes, schedule and data settings it has."""
-    config = finetune.get_config(teacher)
+    config = finetune.tuning(teacher)
     config.teacher = {"weights": teacher, "clip_length": 48, "stride": 2, "validation": True}
     config.loss.name = "distillation"
     config.stages = ConfigDict(

@@ -13,6 +13,7 @@ from ml_collections import ConfigDict
 
 from configs import h20
 from logvggt_jax.config import PATCH, ModelConfig
+from logvggt_jax.errors import MissingInput
 from logvggt_jax.weights.address import hub_address, resolve
 from logvggt_jax.weights.checkpoints import read_config, read_provenance
 
@@ -23,6 +24,15 @@ LAST = 200  # frames of a recording that are kept to validate on
 
 def get_config(model: str = "facebook/VGGT-1B") -> ConfigDict:
     """The run; fields as in `configs/h20.py`, whose data settings and objective it has."""
+    try:
+        return tuning(model)
+    except MissingInput as error:
+        goes_on = "a run that has begun goes on without it: give its --workdir after the colon instead"
+        raise MissingInput(f"{error}; {goes_on}") from error
+
+
+def tuning(model: str) -> ConfigDict:
+    """The same, which other configurations build on."""
     sizes, longer_edge = ModelConfig(dtype="bfloat16"), LONGER_EDGE
     if hub_address(model) is None:  # what the hub has is not fetched to be looked at
         path = resolve(model)

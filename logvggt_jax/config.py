@@ -61,7 +61,7 @@ def from_mapping(cls: type[Config], values: Any, path: str) -> Config:
     arguments = {name: _read(hints[name], value, _joined(path, name)) for name, value in values.items()}
     try:
         return cls(**arguments)
-    except ValueError as error:
+    except InputError as error:
         # A validator names class and field; whoever wrote the mapping knows the field by its path.
         prefix = f"{cls.__name__}."
         message = str(error)
@@ -272,6 +272,8 @@ class AggregatorConfig:
     def __post_init__(self) -> None:
         freeze_lists(self)
         require_counts(self, "depth", "num_heads", "mlp_ratio", "num_registers")
+        require_within(self, "(0, inf)", "rope_base")
+        require_within(self, "[0, inf)", "layer_scale", "token_scale")
         layers = self.key_layers
         if len(layers) != 4 or list(layers) != sorted(set(layers)) or layers[0] < 0 or layers[-1] >= self.depth:
             raise InputError(
@@ -297,6 +299,7 @@ class CameraHeadConfig:
     def __post_init__(self) -> None:
         freeze_lists(self)
         require_counts(self, "depth", "num_heads", "iterations")
+        require_within(self, "[0, inf)", "layer_scale")
         if len(self.initial_pose) != 9:
             raise InputError(f"CameraHeadConfig.initial_pose needs 9 numbers, got {len(self.initial_pose)}")
 

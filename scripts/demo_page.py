@@ -23,7 +23,7 @@ from logvggt_jax.evaluation.report.page import table as table_part
 from logvggt_jax.evaluation.report.tables import MARK, Table, benchmark_tables
 from logvggt_jax.files import write_text
 from logvggt_jax.frames import Frames
-from logvggt_jax.geometry import camera_centres, invert, umeyama, unproject_pixels
+from logvggt_jax.geometry import NoSimilarity, camera_centres, invert, umeyama, unproject_pixels
 from logvggt_jax.metrics import NotMeasurable, depth_metrics, pose_accuracy, relative_pose_errors, trajectory_errors
 from logvggt_jax.metrics.trajectory import rms_radius
 from logvggt_jax.reconstruction.reconstruct import Reconstruction
@@ -110,7 +110,7 @@ def _point_pictures(
     true = unproject_pixels(room.depth, room.intrinsics, room.extrinsics, chosen)
     try:
         found = umeyama(found, true).apply(found)
-    except ValueError:
+    except NoSimilarity:
         return []
     frames, pixels = np.divmod(chosen, room.depth[0].size)
     colours = room.images.reshape(len(room.images), -1, 3)[frames, pixels]

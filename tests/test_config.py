@@ -111,6 +111,17 @@ def test_a_value_that_does_not_fit_is_named_by_its_path(changes: dict[str, Any],
     assert "\n" not in str(error.value)
 
 
+def test_a_bug_in_a_validator_is_not_the_users() -> None:
+    @dataclasses.dataclass(frozen=True)
+    class Faulty:
+        def __post_init__(self) -> None:
+            int("a bug")
+
+    with pytest.raises(ValueError, match="invalid literal") as error:
+        from_mapping(Faulty, {}, "config")
+    assert not isinstance(error.value, InputError)
+
+
 def test_missing_fields_are_named_with_what_they_should_be() -> None:
     with pytest.raises(InputError, match=r"missing field config\.count, a whole number; Settings knows count, parts"):
         from_mapping(Settings, {"parts": ()}, "config")
@@ -159,6 +170,9 @@ def test_any_stride_below_the_window_is_accepted(size: int) -> None:
         (lambda: AggregatorConfig(key_layers=(4, 11, 17)), r"AggregatorConfig\.key_layers must be four"),
         (lambda: AggregatorConfig(key_layers=(4, 11, 17, 24)), r"AggregatorConfig\.key_layers must be four"),
         (lambda: AggregatorConfig(key_layers=(11, 4, 17, 23)), r"AggregatorConfig\.key_layers must be four"),
+        (lambda: AggregatorConfig(rope_base=0.0), r"AggregatorConfig\.rope_base must lie in \(0, inf\), got 0\.0"),
+        (lambda: AggregatorConfig(token_scale=-1.0), r"AggregatorConfig\.token_scale must lie in \[0, inf\), got -1"),
+        (lambda: CameraHeadConfig(layer_scale=math.inf), r"CameraHeadConfig\.layer_scale must lie in \[0, inf\)"),
         (lambda: CameraHeadConfig(initial_pose=(0.0,)), r"CameraHeadConfig\.initial_pose needs 9 numbers, got 1"),
         (lambda: DPTConfig(features=12), r"DPTConfig\.features must be a multiple of 8"),
         (lambda: DPTConfig(out_channels=(256, 512, 1024)), r"DPTConfig\.out_channels must be four"),

@@ -15,6 +15,7 @@ from root_programs import RootPrograms, loaded
 from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.data.feeding.holdouts import PUBLISHED
 from logvggt_jax.data.rooms.rooms import Rooms
+from logvggt_jax.errors import MissingInput
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.parallel.sharding import check_batch_size, data_mesh
 from logvggt_jax.training.step.costs import abstract_clips
@@ -120,6 +121,23 @@ def test_finetuning_takes_sizes_and_pictures_from_the_model_it_starts_from(
     assert own.optimizer.learning_rate > vggt.optimizer.learning_rate
     trained, validated = own.data.sources[0], own.validation.sources[0]
     assert (trained.frames, validated.frames) == ((None, -200), (-200, None)), "what is validated is not trained on"
+
+
+def test_finetuning_goes_on_from_its_own_folder_where_its_first_weights_are_gone(
+    tmp_path: Path, small_config: ModelConfig
+) -> None:
+    def config(start: Path) -> TrainConfig:
+        return TrainConfig.from_dict(importlib.import_module("configs.finetune").get_config(str(start)).to_dict())
+
+    start, workdir = tmp_path / "start", tmp_path / "run"
+    for folder in (start, workdir / "model"):
+        folder.mkdir(parents=True)
+        known = {"config": small_config.to_dict(), "digests": {}, "provenance": Provenance("windows", 70).to_dict()}
+        write_description(folder, known)
+    begun, goes_on = config(start), config(workdir)
+    assert dataclasses.replace(goes_on, initial_weights=begun.initial_weights) == begun
+    with pytest.raises(MissingInput, match=r"gone: no such file .* give its --workdir after the colon"):
+        config(tmp_path / "gone")
 
 
 def test_h20_is_the_papers_training(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,6 +26,7 @@ _DECIDING = (
     "streaming",
     "data/dataset.py",
     "data/formats",
+    "data/packed",
     "data/readers",
     "data/rooms",
     "data/feeding/transforms.py",

@@ -11,7 +11,7 @@ from logvggt_jax.evaluation.methods.method import ClipPrediction, Method
 from logvggt_jax.evaluation.progress import track
 from logvggt_jax.evaluation.protocols.protocol import DepthMeasure, PointsMeasure, Protocol
 from logvggt_jax.evaluation.scratch import scratch_array
-from logvggt_jax.geometry import camera_centres, invert, umeyama, unproject_pixels
+from logvggt_jax.geometry import NoSimilarity, camera_centres, invert, umeyama, unproject_pixels
 from logvggt_jax.metrics.depth import DEPTH_KEYS, mean_depth_metrics, pixel_errors, resize_depth, valid_depth
 from logvggt_jax.metrics.errors import NotMeasurable
 from logvggt_jax.metrics.points import estimate_normals, point_cloud_metrics, sample_indices
@@ -203,7 +203,7 @@ def aligned_points(prediction: ClipPrediction, truth: ClipTruth) -> np.ndarray:
     cloud = unproject_pixels(depth, prediction.intrinsics, prediction.extrinsics, truth.indices)
     try:
         return umeyama(cloud, truth.points).apply(cloud)
-    except ValueError as error:
+    except NoSimilarity as error:
         raise NotMeasurable(f"predicted points cannot be aligned: {error}") from error
 
 

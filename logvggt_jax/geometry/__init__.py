@@ -24,7 +24,7 @@ from logvggt_jax.geometry.rotations import (
     quaternion_to_matrix,
     rotation_angle,
 )
-from logvggt_jax.geometry.similarity import Similarity, pose_similarity, robust_similarity, umeyama
+from logvggt_jax.geometry.similarity import NoSimilarity, Similarity, pose_similarity, robust_similarity, umeyama
 from logvggt_jax.geometry.similarity_group import (
     log_derivative,
     scale_of,
@@ -34,6 +34,7 @@ from logvggt_jax.geometry.similarity_group import (
 )
 
 __all__ = [
+    "NoSimilarity",
     "Similarity",
     "as_matrix",
     "camera_centres",

@@ -12,6 +12,13 @@ from logvggt_jax.geometry.rotations import nearest_rotation, rotation_angle
 _ROUNDS = 20
 
 
+class NoSimilarity(ValueError):
+    """What is to be aligned has no similarity, or more than one: too few points, points on a line, nothing that moves.
+
+    Arrays of wrong shapes are plain ValueErrors: those are faults of the caller.
+    """
+
+
 class Similarity(NamedTuple):
     """y = scale * rotation @ x + translation; rotation [3, 3], translation [3], float64."""
 
@@ -44,14 +51,14 @@ class Similarity(NamedTuple):
 def umeyama(source: np.ndarray, target: np.ndarray, weights: np.ndarray | None = None) -> Similarity:
     """Least-squares similarity that maps `source` [N, 3] onto `target` [N, 3] (Umeyama 1991).
 
-    Optional `weights` [N]. Raises ValueError for fewer than three points or points on a line, where no unique
-    similarity exists. The degeneracy test is relative, so tiny trajectories are not refused.
+    Optional `weights` [N]. Raises NoSimilarity for fewer than three points or points on a line, where no unique one
+    exists. The degeneracy test is relative, so tiny trajectories are not refused.
     """
     source, target = np.asarray(source, np.float64), np.asarray(target, np.float64)
     if source.shape != target.shape or source.ndim != 2 or source.shape[1] != 3:
         raise ValueError(f"need two [N, 3] arrays of corresponding points, got {source.shape} and {target.shape}")
     if len(source) < 3:
-        raise ValueError(f"a similarity needs at least 3 corresponding points, got {len(source)}")
+        raise NoSimilarity(f"a similarity needs at least 3 corresponding points, got {len(source)}")
     w = np.full(len(source), 1.0 / len(source)) if weights is None else np.asarray(weights, np.float64)
     w = w / w.sum()
     mean_source, mean_target = w @ source, w @ target
@@ -59,11 +66,11 @@ def umeyama(source: np.ndarray, target: np.ndarray, weights: np.ndarray | None =
     variance = float(w @ (centred_source**2).sum(1))
     spread = np.sqrt(variance * float(w @ (centred_target**2).sum(1)))
     if not np.isfinite(spread):
-        raise ValueError("no similarity: a point or weight is not finite")
+        raise NoSimilarity("no similarity: a point or weight is not finite")
     covariance = (centred_target * w[:, None]).T @ centred_source
     u, singular, vt = np.linalg.svd(covariance)
     if singular[1] <= 1e-12 * max(spread, np.finfo(np.float64).tiny):
-        raise ValueError("no unique similarity: the points coincide or lie on one line")
+        raise NoSimilarity("no unique similarity: the points coincide or lie on one line")
     sign = np.ones(3)
     sign[2] = np.sign(np.linalg.det(u) * np.linalg.det(vt))
     rotation = (u * sign) @ vt
@@ -102,11 +109,11 @@ def pose_similarity(source: np.ndarray, target: np.ndarray) -> Similarity:
       target: [N, 3|4, 4] of the same cameras in another world.
 
     Raises:
-      ValueError: fewer than two cameras, or centres that coincide, which have no scale.
+      NoSimilarity: fewer than two cameras, or centres that coincide, which have no scale.
     """
     source, target = np.asarray(source, np.float64), np.asarray(target, np.float64)
     if len(source) < 2:
-        raise ValueError(f"a similarity of cameras needs at least 2, got {len(source)}")
+        raise NoSimilarity(f"a similarity of cameras needs at least 2, got {len(source)}")
     rotation = _central_rotation(np.swapaxes(target[:, :3, :3], -1, -2) @ source[:, :3, :3])
     turned, centres = camera_centres(source) @ rotation.T, camera_centres(target)
     # Of camera i and the one half the sequence on: long ways, of which most are right.
@@ -114,7 +121,7 @@ def pose_similarity(source: np.ndarray, target: np.ndarray) -> Similarity:
     lengths = np.linalg.norm(turned - turned[partner], axis=1)
     moved = lengths > 1e-9 * max(float(np.abs(turned).max()), np.finfo(np.float64).tiny)
     if not moved.any():
-        raise ValueError("no similarity: the cameras are all at one place, which leaves the scale open")
+        raise NoSimilarity("no similarity: the cameras are all at one place, which leaves the scale open")
     scale = float(np.median(np.linalg.norm(centres - centres[partner], axis=1)[moved] / lengths[moved]))
     translation = np.median(centres - scale * turned, axis=0)
     for _ in range(_ROUNDS):
@@ -128,7 +135,7 @@ def pose_similarity(source: np.ndarray, target: np.ndarray) -> Similarity:
         alike = float(weights @ ((turned - mean_source) * (centres - mean_target)).sum(1))
         spread = float(weights @ ((centres - mean_target) ** 2).sum(1))
         if not (alike > 0 and spread > 0):
-            raise ValueError("no similarity: the cameras of the two worlds do not move alike")
+            raise NoSimilarity("no similarity: the cameras of the two worlds do not move alike")
         scale = spread / alike
         translation = mean_target - scale * mean_source
     return Similarity(scale, rotation, translation)

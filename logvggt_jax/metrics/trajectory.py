@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from logvggt_jax.errors import MissingPackage, install_line
-from logvggt_jax.geometry import nearest_rotation, umeyama
+from logvggt_jax.geometry import NoSimilarity, nearest_rotation, umeyama
 from logvggt_jax.metrics.errors import NotMeasurable
 from logvggt_jax.metrics.pose import checked_poses
 
@@ -57,7 +57,7 @@ def align_trajectory(predicted_poses: np.ndarray, true_poses: np.ndarray) -> np.
         raise ValueError(f"{len(predicted)} predicted and {len(true)} true poses: give one of each a frame")
     try:
         similarity = umeyama(predicted[:, :3, 3], true[:, :3, 3])
-    except ValueError as error:
+    except NoSimilarity as error:
         raise NotMeasurable(
             f"trajectory of {len(true)} poses cannot be aligned ({error}); it must neither stand still nor be straight"
         ) from error

@@ -81,7 +81,7 @@ class Aggregator(ShapeCheck, nn.Module):
         config, sizes = self.config, self.config.aggregator
         batch, frames, _, width = patch_tokens.shape
         num_special = 1 + sizes.num_registers
-        special = self._special_tokens(starts_sequence, batch, frames, width)
+        special = self._special_tokens(starts_sequence, frames, width)
         x = jnp.concatenate([special, patch_tokens.astype(jnp.float32)], axis=2)
         shape, tokens = x.shape, x.shape[2]
         rope = rope_table(grid, num_special, width // sizes.num_heads, sizes.rope_base)
@@ -162,7 +162,7 @@ class Aggregator(ShapeCheck, nn.Module):
                 key_tokens.append(both.astype(config.dtype))
         return WindowTokens(jnp.stack(key_tokens, axis=1), both[:, :, :num_special]), memory
 
-    def _special_tokens(self, starts_sequence: jax.Array, batch: int, frames: int, width: int) -> jax.Array:
+    def _special_tokens(self, starts_sequence: jax.Array, frames: int, width: int) -> jax.Array:
         """Camera and register tokens [B, K, 5, C]: copy 0 for the sequence's first frame, copy 1 for others."""
         initial = normal(self.config.aggregator.token_scale)
         camera = self.param("camera_token", initial, (1, 2, 1, width))

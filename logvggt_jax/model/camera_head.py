@@ -14,8 +14,10 @@ from logvggt_jax.model.shape_check import ShapeCheck
 
 
 class CameraHead(ShapeCheck, nn.Module):
-    """The camera tokens of a sequence to its poses, in rounds: each embeds the pose of the round before, lets it shift,
-    scale and gate the tokens (adaptive LayerNorm), runs the trunk, and adds a correction to the pose.
+    """Poses of a sequence from its camera tokens, in rounds that correct one another.
+
+    A round embeds the pose of the round before, which shifts, scales and gates the tokens (adaptive LayerNorm), runs
+    the trunk over them, and adds what comes out to the pose.
 
     Float32 throughout, since rotations lose orthogonality in bfloat16.
     """
@@ -27,11 +29,11 @@ class CameraHead(ShapeCheck, nn.Module):
     def __call__(
         self, camera_tokens: jax.Array, camera_mask: jax.Array | None, memory: RoundMemory | None = None
     ) -> tuple[jax.Array, RoundMemory]:
-        """Pose encodings [B, N, R, 9] after each of the R rounds, the last one the best; and the memory it leaves.
+        """Pose encodings [B, N, R, 9] after each of the R rounds, of which the last counts; and the memory it leaves.
 
         In the trunk every frame sees all frames that count, and what the memory adds. No gradient flows from a round
-        into the pose of the round before. Negative fields of view become 0 in the result, and stay negative in what the
-        next round is given.
+        into the pose of the round before. In the result a negative field of view is 0; the next round is given it as it
+        is.
 
         Args:
           camera_tokens: [B, N, 2C].

@@ -13,6 +13,7 @@ from flax import struct
 
 from logvggt_jax.model.gccr import RegisterKeys
 from logvggt_jax.model.memory import Attend, Keys, LayerMemory, OwnTokens, Project, RoundMemory
+from logvggt_jax.model.padding import with_places
 
 
 @struct.dataclass
@@ -36,7 +37,7 @@ class KeyValueCache:
 
     def grown(self, room: int) -> KeyValueCache:
         """The same with so many more places, which are empty."""
-        key, value = (with_places(x, x.ndim - 3, room) for x in (self.key, self.value))
+        key, value = (with_places(x, room, axis=x.ndim - 3) for x in (self.key, self.value))
         return self.replace(key=key, value=value)  # type: ignore[attr-defined]
 
     def extended(self, new: Keys) -> tuple[Keys, KeyValueCache]:
@@ -131,11 +132,6 @@ def empty(
     # Two buffers: a donated state holds none twice.
     key, value = (jnp.zeros((*leading, *shape), dtype) for _ in range(2))
     return kind(key, value, jnp.zeros(leading, jnp.int32))
-
-
-def with_places(x: jax.Array, axis: int, room: int) -> jax.Array:
-    """`x` followed by `room` zeros along an axis."""
-    return jnp.pad(x, [(0, room if i == axis else 0) for i in range(x.ndim)])
 
 
 def _keys_of(cache: KeyValueCache) -> Keys:

@@ -108,9 +108,11 @@ class MLP(nn.Module):
 
 
 class Attention(nn.Module):
-    """Multi-head attention of a block's own tokens to themselves and to what a memory adds.
+    """Multi-head attention in four parts, between which a memory can come in; the block puts them together.
 
-    With `qk_norm` queries and keys are normalised per head, before the rotary embedding.
+    `queries` and `keys` project the block's tokens, `attend` lets queries see keys and has no parameters, and calling
+    the module projects the result back to the residual stream. With `qk_norm` queries and keys are normalised per head,
+    before the rotary embedding.
     """
 
     num_heads: int
@@ -130,14 +132,14 @@ class Attention(nn.Module):
             self.key_norm = layer_norm(1e-5, "key_norm", self.dtype)
 
     def queries(self, normed: jax.Array, rope: RopeTable | None) -> jax.Array:
-        """[B, N, C] after the block's LayerNorm to queries [B, N, heads, head_dim] in the compute type."""
+        """Queries [B, N, heads, head_dim] in the compute type of tokens [B, N, C] after the block's LayerNorm."""
         query = self._heads(self.query(normed))
         if self.qk_norm:
             query = self.query_norm(query)
         return (query if rope is None else apply_rope(query, rope)).astype(self.dtype)
 
     def keys(self, normed: jax.Array, rope: RopeTable | None, valid: jax.Array | None = None) -> Keys:
-        """[B, N, C] after the block's LayerNorm to keys and values in the compute type; see `Keys`."""
+        """Keys and values in the compute type of tokens [B, N, C] after the block's LayerNorm; see `Keys`."""
         key, value = (self._heads(x) for x in jnp.split(self.key_value(normed), 2, axis=-1))
         if self.qk_norm:
             key = self.key_norm(key)
@@ -145,11 +147,11 @@ class Attention(nn.Module):
         return Keys(key.astype(self.dtype), value.astype(self.dtype), valid)
 
     def attend(self, query: jax.Array, keys: Keys) -> jax.Array:
-        """Queries [B, Q, heads, head_dim] to what they take in of the keys, of the same shape."""
+        """The softmax-weighted mean of the values for each query [B, Q, heads, head_dim], in the same shape."""
         return attention(query, keys.key, keys.value, keys.valid, implementation=self.implementation)
 
     def __call__(self, taken: jax.Array) -> jax.Array:
-        """What the tokens take in, [B, N, heads, head_dim], to the branch [B, N, C], before its LayerScale."""
+        """The residual branch [B, N, C], before its LayerScale, of what `attend` gave, [B, N, heads, head_dim]."""
         return self.output(taken.reshape(*taken.shape[:2], self.width))
 
     def _heads(self, x: jax.Array) -> jax.Array:
@@ -190,8 +192,8 @@ class Block(nn.Module):
         Args:
           x: [B, n · P, C] float32, the tokens of n frames, frame after frame.
           rope: rotary table of one frame's P tokens; None for tokens without a position.
-          valid: which tokens of `x` count, see `Keys.valid`; what forms the memory takes is its own. No token attends
-            to the others.
+          valid: which tokens of `x` count, in one of the forms of `Keys.valid`; a memory may ask for a certain one. No
+            token attends to the others.
           memory: what the block has seen before; None for its own tokens alone.
         """
         width = x.shape[-1]

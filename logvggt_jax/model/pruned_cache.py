@@ -23,8 +23,9 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from logvggt_jax.model.key_value_cache import KeyValueCache, with_places
+from logvggt_jax.model.key_value_cache import KeyValueCache
 from logvggt_jax.model.memory import Attend, Keys, LayerMemory, OwnTokens, Project
+from logvggt_jax.model.padding import with_places
 from logvggt_jax.model.quantisation import (
     GROUP,
     decoded,
@@ -103,9 +104,9 @@ class PackedPrunedCache(PrunedCache):
     def grown(self, room: int) -> PackedPrunedCache:
         """See `KeyValueCache.grown`."""
         per_token = ("key", "value", "group", "value_scale", "value_zero")
-        arrays = {name: with_places(getattr(self, name), 1, room) for name in per_token}
+        arrays = {name: with_places(getattr(self, name), room, axis=1) for name in per_token}
         more = num_groups(self.capacity + room + self.tokens) - self.key_scale.shape[1]
-        arrays |= {name: with_places(getattr(self, name), 1, more) for name in ("key_scale", "key_zero")}
+        arrays |= {name: with_places(getattr(self, name), more, axis=1) for name in ("key_scale", "key_zero")}
         return self.replace(**arrays)  # type: ignore[attr-defined]
 
     def opened(self, dtype: Any) -> tuple[jax.Array, jax.Array]:

@@ -17,6 +17,7 @@ from logvggt_jax.model.camera_head import CameraHead
 from logvggt_jax.model.checks import check_array
 from logvggt_jax.model.gccr import GCCR, RegisterKeys
 from logvggt_jax.model.kept_registers import is_kept
+from logvggt_jax.model.padding import with_places
 from logvggt_jax.model.parameters import Variables, run
 
 
@@ -157,10 +158,7 @@ class Refinement:
         triggers = num_triggers(num_frames, size)
         # Room for the last trigger's full size: spans keep one shape.
         padding = triggers * size - num_frames
-        camera_tokens, registers = jax.tree.map(
-            lambda x: jnp.pad(x, [(0, padding if axis == 1 else 0) for axis in range(x.ndim)]),
-            (camera_tokens, registers),
-        )
+        camera_tokens, registers = jax.tree.map(lambda x: with_places(x, padding, axis=1), (camera_tokens, registers))
 
         def one_trigger(refined: jax.Array, start: jax.Array) -> tuple[jax.Array, jax.Array]:
             stop = jnp.minimum(start + size, num_frames)

@@ -19,6 +19,7 @@ from logvggt_jax.model.dinov2 import DinoV2
 from logvggt_jax.model.dpt_head import DPTHead, depth_activation, point_activation
 from logvggt_jax.model.layers import with_special
 from logvggt_jax.model.masks import seen_patches, without_masked, zero_where_masked
+from logvggt_jax.model.padding import with_places
 from logvggt_jax.model.parameters import Variables, run
 from logvggt_jax.types import WindowOutput
 
@@ -145,11 +146,11 @@ class Windows:
         if padded:
             # An item that has ended shifts its held frames out instead.
             active = (state.step == 0) | frame_mask.any(1)
-            key_tokens = _select(active, key_tokens, _shift_in(state.key_tokens, stride, axis=2))
-            special_tokens = _select(active, special_tokens, _shift_in(state.special_tokens, stride, axis=1))
-            window_mask = _select(active, window_mask, _shift_in(state.frame_mask, stride, axis=1))
+            key_tokens = _select(active, key_tokens, with_places(state.key_tokens, stride, axis=2))
+            special_tokens = _select(active, special_tokens, with_places(state.special_tokens, stride, axis=1))
+            window_mask = _select(active, window_mask, with_places(state.frame_mask, stride, axis=1))
             if masks is not None and state.masks is not None:
-                masks = _select(active, masks, _shift_in(state.masks, stride, axis=1))
+                masks = _select(active, masks, with_places(state.masks, stride, axis=1))
         out = self.decode_dense(
             variables,
             WindowTokens(key_tokens[:, :, :stride], special_tokens[:, :stride]),
@@ -391,11 +392,6 @@ def _in_groups(function: Callable[[Any], jax.Array], inputs: Any, at_most: int) 
 
 def _image_size(images: jax.Array) -> tuple[int, int]:
     return images.shape[2], images.shape[3]
-
-
-def _shift_in(held: jax.Array, padding: int, *, axis: int) -> jax.Array:
-    """`held` followed by `padding` empty frames."""
-    return jnp.pad(held, [(0, padding if i == axis else 0) for i in range(held.ndim)])
 
 
 def _select(active: jax.Array, when_active: jax.Array, otherwise: jax.Array) -> jax.Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
 from typing import Any
 
@@ -137,7 +138,9 @@ def device_needs(
     memory: Any = program.lowered.compile().memory_analysis()
     working = None
     if memory is not None:
-        whole = memory.argument_size_in_bytes + memory.output_size_in_bytes + memory.temp_size_in_bytes
-        working = whole - memory.alias_size_in_bytes - parameters
+        # Parameters that the program does not read are no arguments of what is compiled, and are on the device as well.
+        given = sum(math.prod(x.shape) * x.dtype.itemsize for x in jax.tree.leaves(program.lowered.args_info))
+        working = given + memory.output_size_in_bytes + memory.temp_size_in_bytes
+        working -= memory.alias_size_in_bytes + parameters
     rate = _REACHED * matmul_flops_per_second(model.config.dtype)
     return DeviceNeeds(parameters, working, program.flops / program.frames / rate)

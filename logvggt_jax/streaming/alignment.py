@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from logvggt_jax.geometry import Similarity, robust_similarity, unproject_pixels
+from logvggt_jax.geometry import NoSimilarity, Similarity, robust_similarity, unproject_pixels
 from logvggt_jax.streaming.offline import PlainPrediction
 
 # Shared pixels that fit a similarity: seven numbers need no more, and every chunk solves for them six times.
@@ -22,12 +22,12 @@ def align(source: PlainPrediction, target: PlainPrediction) -> Similarity:
     confidences, with Huber weights against what the predictions disagree about.
 
     Raises:
-      ValueError: fewer than three pixels are valid in both, or their points lie on a line.
+      NoSimilarity: fewer than three pixels are valid in both, or their points lie on a line.
     """
     valid = confident(source, target)
     chosen = _some(valid)
     if len(chosen) < 3:
-        raise ValueError(f"{len(chosen)} of {valid.size} pixels have a valid depth and confidence in both")
+        raise NoSimilarity(f"{len(chosen)} of {valid.size} pixels have a valid depth and confidence in both")
     weights = np.sqrt(source.depth_confidence.reshape(-1)[chosen].astype(np.float64))
     weights *= np.sqrt(target.depth_confidence.reshape(-1)[chosen].astype(np.float64))
     threshold = _HUBER_THRESHOLD * float(np.median(target.depth.reshape(-1)[chosen]))

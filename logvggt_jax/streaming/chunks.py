@@ -18,6 +18,7 @@ import numpy as np
 
 from logvggt_jax.config import require_counts
 from logvggt_jax.errors import InputError
+from logvggt_jax.geometry import NoSimilarity
 from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.model.parameters import in_compute_type
 from logvggt_jax.streaming.alignment import align, move, residual
@@ -145,7 +146,7 @@ class ChunkChain:
         shared = self._plan.overlap
         try:
             similarity = align(jax.tree.map(lambda x: x[:shared], chunk), self._shared)
-        except ValueError as error:
+        except NoSimilarity as error:
             raise PredictionError(
                 f"the chunk from frame {self._first} to {self._first + len(self._images) - 1} cannot be aligned with "
                 f"the one before on the {shared} frames they share ({error}); take larger chunks with more overlap"

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from logvggt_jax.geometry import Similarity, project, unproject
+from logvggt_jax.geometry import NoSimilarity, Similarity, project, unproject
 from logvggt_jax.streaming.alignment import align, confident
 from logvggt_jax.streaming.offline import PlainPrediction
 
@@ -60,12 +60,12 @@ def check_loop(joint: PlainPrediction, first: PlainPrediction, second: PlainPred
     try:
         with np.errstate(all="ignore"):  # of untrained models, whose lenses may have no field of view
             return _compared(parts, (first, second))
-    except ValueError:
+    except NoSimilarity:
         return LoopCheck(0.0, 0.0, 0.0, None)
 
 
 def _compared(parts: Sequence[PlainPrediction], own: Sequence[PlainPrediction]) -> LoopCheck:
-    """As `check_loop`; ValueError where a place's predictions cannot be aligned."""
+    """As `check_loop`; NoSimilarity where a place's predictions cannot be aligned."""
     carried = [align(*each) for each in zip(parts, own, strict=True)]
     shape = min(_same_shape(*each) for each in zip(parts, own, carried, strict=True))
     one_way, other_way = _seen_alike(parts[0], parts[1]), _seen_alike(parts[1], parts[0])

@@ -1,7 +1,9 @@
 """Methods that turn frames into predictions: one protocol, one registry.
 
-Reconstruction, evaluation, timing and the command line open a method by its name and know no other way: a published
-number is a number of the code that users run. A new method is a file of this folder and a line of `METHODS`.
+Reconstruction, evaluation, timing and the command line open a method by its name: a published number is a number of the
+code that users run. What needs more of windows than the protocol has (ablations, which try several modes of refinement
+on one run of them, and live sequences) opens the class behind their name itself. A new method is a file of this folder
+and a line of `METHODS`.
 """
 
 from __future__ import annotations

@@ -13,6 +13,7 @@ import numpy as np
 
 from logvggt_jax.model.gccr import RegisterKeys
 from logvggt_jax.model.kept_registers import is_kept
+from logvggt_jax.model.padding import with_places
 
 Tokens = TypeVar("Tokens")
 
@@ -38,7 +39,7 @@ def _slide(buffers: Tokens, frames: jax.Array) -> Tokens:
 
     def slid(buffer: jax.Array) -> jax.Array:
         room = buffer.shape[1]
-        padded = jnp.pad(buffer, [(0, room if axis == 1 else 0) for axis in range(buffer.ndim)])
+        padded = with_places(buffer, room, axis=1)
         rest = jax.lax.dynamic_slice_in_dim(padded, 1 + frames, room - 1, axis=1)
         return jnp.concatenate([buffer[:, :1], rest], axis=1)
 
@@ -47,7 +48,7 @@ def _slide(buffers: Tokens, frames: jax.Array) -> Tokens:
 
 @functools.partial(jax.jit, static_argnames="room")
 def _grown(buffers: Tokens, *, room: int) -> Tokens:
-    return jax.tree.map(lambda x: jnp.pad(x, [(0, room if axis == 1 else 0) for axis in range(x.ndim)]), buffers)
+    return jax.tree.map(lambda x: with_places(x, room, axis=1), buffers)
 
 
 class _Waiting(NamedTuple):

@@ -32,13 +32,14 @@ _TRANSPOSED_CONV = functools.partial(np.transpose, axes=(2, 3, 0, 1))
 
 _OUTPUT_HIDDEN = 32  # width between the two convolutions of the DPT head's output, in every VGGT
 _DTYPES = ("float32", "float16", "bfloat16", "float64")
-# Blocks of the encoder by its width, as DINOv2 was published, and of the camera head beside VGGT-1B's.
+# How many blocks a whole checkpoint has at least, by the encoder's width: in the encoder, as DINOv2 was published, and
+# in the camera head, which is known of VGGT-1B alone.
 _DINOV2_DEPTHS = {384: 12, 768: 12, 1024: 24, 1536: 40}
 _TRUNK_DEPTHS = {1024: 4}
 # Constants that some checkpoints hold, and the one parameter that only training used.
 _BUFFERS = ("aggregator._resnet_mean", "aggregator._resnet_std")
 _MASK_TOKEN = "aggregator.patch_embed.mask_token"
-# The fields that shapes tell.
+# The fields of the configuration that the shapes of tensors tell.
 _SIZES = {
     "encoder": ("embed_dim", "depth", "mlp_ratio", "num_registers", "position_grid", "patch_size"),
     "aggregator": ("depth", "num_heads", "mlp_ratio", "num_registers"),
@@ -129,6 +130,7 @@ def _block(name: str, path: ParamPath, width: int, mlp_ratio: int, head_norm: in
 
 
 def _encoder(config: EncoderConfig) -> Iterator[Rule]:
+    """DINOv2: special tokens, position embedding, patch embedding, blocks, last norm."""
     name, path, width = "aggregator.patch_embed", ("encoder",), config.embed_dim
     yield from _raw(f"{name}.cls_token", (*path, "cls_token"), 1, 1, width)
     yield from _raw(f"{name}.pos_embed", (*path, "pos_embed"), 1, 1 + config.position_grid**2, width)
@@ -141,6 +143,7 @@ def _encoder(config: EncoderConfig) -> Iterator[Rule]:
 
 
 def _aggregator(config: AggregatorConfig, width: int) -> Iterator[Rule]:
+    """The trunk: special tokens, and the blocks over frames and over windows."""
     name, path = "aggregator", ("aggregator",)
     yield from _raw(f"{name}.camera_token", (*path, "camera_token"), 1, 2, 1, width)
     yield from _raw(f"{name}.register_token", (*path, "register_token"), 1, 2, config.num_registers, width)
@@ -152,6 +155,7 @@ def _aggregator(config: AggregatorConfig, width: int) -> Iterator[Rule]:
 
 
 def _camera_head(config: CameraHeadConfig, width: int) -> Iterator[Rule]:
+    """The camera head: trunk, adaptive norm, and what embeds and corrects a pose."""
     name, path = "camera_head", ("camera_head",)
     yield from _raw(f"{name}.empty_pose_tokens", (*path, "empty_pose_tokens"), 1, 1, 9)
     for i in range(config.depth):

@@ -172,6 +172,8 @@ def test_the_version_of_the_code_is_that_of_its_statements(tmp_path: Path) -> No
     assert first == version("model/layers.py", 'def f(x):\n    """Twice x."""\n    # so\n    return 2 * x\n')
     assert first == version("evaluation/report/tables.py", "x = 1\n")
     assert first != version("model/layers.py", 'def f(x):\n    """Doubles."""\n    return 3 * x\n')
+    before = version("data/packed/records.py", "def read(x):\n    return x\n")
+    assert before != version("data/packed/records.py", "def read(x):\n    return -x\n"), "data may be packed"
     code_version.cache_clear()
 
 

@@ -156,5 +156,9 @@ def test_pixels_of_a_long_clip_lie_on_disk(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_a_bug_in_a_metric_is_not_called_unmeasurable(rooms: Rooms) -> None:
     frames = rooms.read(rooms.sequences[0], [0, 2, 4])
+    truth = prepare_truth(clip_of(frames), PROTOCOL.points)
+    assert truth.points is not None
+    with pytest.raises(ValueError, match=r"two .* arrays of corresponding points"):
+        score_of(frames, dataclasses.replace(truth, points=truth.points[1:]))
     with pytest.raises(ValueError, match="2 predicted poses, 3 true ones"):
         score_of(frames, prepare_truth(clip_of(frames), None), extrinsics=frames.extrinsics[:2])

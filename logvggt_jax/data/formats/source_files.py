@@ -2,6 +2,7 @@
 
 import re
 import stat
+from collections.abc import Sequence
 from pathlib import Path
 
 from logvggt_jax.data.errors import MissingFiles, missing_file
@@ -38,6 +39,11 @@ class SourceFiles:
             return {name: parent / name for name in chosen if (parent / name).is_dir()}
         except OSError as error:
             raise refused(parent, error) from error
+
+    def folders_with(self, signs: Sequence[str], parent: Path, expected: str) -> dict[str, Path]:
+        """Folders in `parent` by name, sorted, in which one of these names is there; MissingFiles as `names`."""
+        folders = {name: parent / name for name in self.names(parent, expected)}
+        return {name: each for name, each in folders.items() if any(self.exists(each / sign) for sign in signs)}
 
     def text(self, path: Path, expected: str) -> str:
         """A text file's content; MissingFiles saying what was `expected`, InputError for other bytes."""

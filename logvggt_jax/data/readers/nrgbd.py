@@ -45,9 +45,7 @@ class NRGBD(FolderDataset):
     )
 
     def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
-        folders = {name: self.root / name for name in files.names(self.root, "scenes")}
-        signs = ("images", "poses.txt")
-        return {name: each for name, each in folders.items() if any(files.exists(each / sign) for sign in signs)}
+        return files.folders_with(("images", "poses.txt"), self.root, "scenes")
 
     def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
         kinds = ((folder / "images", "img{}.png"), (folder / "depth", "depth{}.png"))

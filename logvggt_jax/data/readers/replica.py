@@ -48,9 +48,7 @@ class Replica(FolderDataset):
     )
 
     def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
-        folders = {name: self.root / name for name in files.names(self.root, "scenes")}
-        signs = ("results", "traj.txt")
-        return {name: each for name, each in folders.items() if any(files.exists(each / sign) for sign in signs)}
+        return files.folders_with(("results", "traj.txt"), self.root, "scenes")
 
     def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
         calibration = self.root / "cam_params.json"

@@ -9,7 +9,7 @@ import numpy as np
 
 from logvggt_jax.data.feeding.transforms import ResizeTransform
 from logvggt_jax.errors import InputError
-from logvggt_jax.geometry import Similarity, camera_centres, pose_similarity, rotation_angle
+from logvggt_jax.geometry import NoSimilarity, Similarity, camera_centres, pose_similarity, rotation_angle
 from logvggt_jax.reconstruction.exporters.libraries import check_library
 from logvggt_jax.reconstruction.fusion.bundle_adjustment import bundle_adjust
 from logvggt_jax.reconstruction.fusion.depth_scales import depth_scales
@@ -120,7 +120,7 @@ def align(result: Reconstruction, matched: dict[int, ExternalPose], path: str | 
     frames, extrinsics = list(matched), np.stack([pose.extrinsics for pose in matched.values()])
     try:
         similarity = pose_similarity(result.extrinsics[frames], extrinsics)
-    except ValueError as error:
+    except NoSimilarity as error:
         raise InputError(f"{path}: {error}") from error
     moved = similarity.apply_to_extrinsics(result.extrinsics[frames])
     distances = np.linalg.norm(camera_centres(moved) - camera_centres(extrinsics), axis=1)

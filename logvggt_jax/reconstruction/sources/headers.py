@@ -17,6 +17,7 @@ from logvggt_jax.data.errors import BrokenPicture
 from logvggt_jax.data.formats.image import decoding_errors
 from logvggt_jax.data.formats.jpeg import decode_jpeg, first_scan
 from logvggt_jax.errors import InputError, disk_errors
+from logvggt_jax.reconstruction.sources.media_boxes import boxes
 from logvggt_jax.reconstruction.sources.pictures import MOST_PIXELS, not_colours, open_picture
 
 _FILM_DIAGONAL = math.hypot(36, 24)  # mm; what "equivalent to 35 mm film" refers to (CIPA DCG-001)
@@ -156,7 +157,7 @@ def _reaches_end(kind: str, picture: ImageFile.ImageFile, stream: IO[bytes]) -> 
         return all(_raw_end(tile, picture) <= length for tile in picture.tile if tile.codec_name == "raw")
     if kind == "TIFF":
         return _tiff_end(picture) <= length
-    return _last_box_ends(stream) <= length
+    return all(box.end <= length for box in boxes(stream, length))
 
 
 def _raw_end(tile: ImageFile._Tile, picture: ImageFile.ImageFile) -> int:
@@ -195,22 +196,6 @@ def _note_exif_of_png(picture: ImageFile.ImageFile, stream: IO[bytes]) -> None:
         if chunk == b"eXIf":
             stream.seek(position)
             picture.info["exif"] = b"Exif\0\0" + stream.read(size)
-
-
-def _last_box_ends(stream: IO[bytes]) -> int:
-    """Where the last box of the ISO base media file format (AVIF, HEIC) ends by its own length."""
-    length, position = _bytes(stream), 0
-    while position + 8 <= length:
-        stream.seek(position)
-        head = stream.read(16)
-        size = int.from_bytes(head[:4], "big")
-        if size == 1:
-            size = int.from_bytes(head[8:], "big")
-        if size < 8:
-            # 0: to the end of the file. Smaller ones do not exist.
-            return length if size == 0 else length + 1
-        position += size
-    return position
 
 
 def _bytes(stream: IO[bytes]) -> int:

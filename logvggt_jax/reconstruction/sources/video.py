@@ -16,6 +16,7 @@ import numpy as np
 from logvggt_jax.errors import InputError, disk_errors
 from logvggt_jax.reconstruction.sources.decoding import Damage, Picture, VideoDecoder, VideoHeader
 from logvggt_jax.reconstruction.sources.masks import Masked, Masks
+from logvggt_jax.reconstruction.sources.media_boxes import boxes
 from logvggt_jax.reconstruction.sources.opencv_decoder import OpenCVDecoder
 from logvggt_jax.reconstruction.sources.sampling import FrameClock, FrameSelection, expected_frames
 from logvggt_jax.reconstruction.sources.source import (
@@ -258,20 +259,8 @@ def _check_index(path: Path, file: BinaryIO, size: int) -> None:
     head = file.read(12)
     if head[4:8] != b"ftyp" or head[8:] in _PICTURES:
         return
-    offset = 0
-    while offset + 8 <= size:
-        file.seek(offset)
-        head = file.read(16)
-        length = int.from_bytes(head[:4], "big")
-        if length == 1:
-            length = int.from_bytes(head[8:], "big")
-        if length == 0:
-            length = size - offset
-        if length < 8:
-            break
-        offset += length
-        if head[4:8] == b"moov" and offset <= size:
-            return
+    if any(box.kind == b"moov" and box.end <= size for box in boxes(file, size)):
+        return
     raise InputError(
         f"{path} lacks its index (moov), or part of it: the recording or the copy was broken off; copy it anew, or "
         "restore it with untrunc and a whole video of the same camera"

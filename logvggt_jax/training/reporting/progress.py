@@ -9,7 +9,7 @@ _LAST_OF_INTERVAL = ("learning_rate", "skipped", "longest_skip")
 
 
 class IntervalMeans:
-    """Means of what the steps between two log lines say; finite values alone count."""
+    """The mean of each value that the steps between two log lines report; values that are not finite do not count."""
 
     def __init__(self) -> None:
         self._values: dict[str, list[float]] = {}
@@ -20,7 +20,7 @@ class IntervalMeans:
             self._values.setdefault(name, []).append(value)
 
     def read(self) -> dict[str, float]:
-        """The means, of counters and the learning rate the last value; then begins anew."""
+        """The mean of each value since the last call; of counters and the learning rate the last value instead."""
         values, self._values = self._values, {}
         return {name: found[-1] if name in _LAST_OF_INTERVAL else _mean(found) for name, found in values.items()}
 
@@ -61,8 +61,12 @@ def progress_line(
 
 
 def goodput(productive: float, wall: float) -> str:
-    """Productive seconds as a part of those since the first start, in words; the latter are of a clock that people and
-    machines set."""
+    """The share of the time since the first start that went into training, in words.
+
+    Args:
+      productive: seconds of the steps that made the present state.
+      wall: seconds since the first start, by a clock that may have been set in between.
+    """
     done = f"{duration(productive)} of training"
     if wall < productive or wall <= 0:
         return f"goodput not known, {done} in less time: the clock was set back since the first start"

@@ -31,8 +31,8 @@ def make_optimizer(
 
     `params` is a dict of modules (encoder, aggregator, heads). The gradient of each module is clipped to
     `config.clip_norm` by itself, so that one head with an exploding gradient does not slow down the others. Parameters
-    matched by the patterns `frozen` (see `freezing`) do not move, and no moments are kept for them. `norm` is that of a
-    tree of gradients, of which a device may hold a part.
+    matched by the patterns `frozen` (see `freezing`) do not move, and no moments are kept for them. `norm` is the
+    l2 norm of a tree of gradients; where a device holds a part of each alone, it sums over the devices.
 
     Weight decay applies to the kernels of linear layers and convolutions: not to biases, norms, gains of residual
     branches, special tokens and the position embedding, unless `config.decay_all`.
@@ -74,6 +74,8 @@ def module_norms(gradients: Any, norm: Norm = optax.tree.norm) -> dict[str, jax.
 
 
 def _schedule(config: OptimizerConfig, steps: int) -> optax.Schedule:
+    """The learning rate at each of so many steps: warm-up, then a cosine, or a level line that falls in the last
+    quarter."""
     warmup = round(config.warmup_fraction * steps)
     if config.schedule == "cosine":
         return optax.warmup_cosine_decay_schedule(
@@ -102,6 +104,8 @@ def _clip(limit: float, norm: Norm) -> optax.GradientTransformation:
 
 
 def _module_optimizer(config: OptimizerConfig, norm: Norm) -> optax.GradientTransformation:
+    """Clipping, Adam and weight decay, which the leaves named `kernel` have, of one module."""
+
     def decayed(tree: Any) -> Any:
         return jax.tree_util.tree_map_with_path(lambda path, _: config.decay_all or path[-1].key == "kernel", tree)
 
