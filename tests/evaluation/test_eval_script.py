@@ -3,7 +3,6 @@
 import functools
 import json
 import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -72,19 +71,17 @@ def test_ctrl_c_is_one_line(run_eval: Callable, tmp_path: Path) -> None:
     assert (result.returncode, result.stderr) == (130, "eval.py: interrupted\n")
 
 
-def test_a_bug_keeps_its_traceback(tmp_path: Path) -> None:
-    program = """
-import eval as script
+def test_a_bug_keeps_its_traceback(run_eval: Callable, tmp_path: Path) -> None:
+    fault = """
+import logvggt_jax.evaluation.run as run
 
 def broken(*_, **__):
     raise ValueError("a bug")
 
-script.run_evaluation = broken
-script.app.run(script.main, flags_parser=script.parse_flags)
+run.run_evaluation = broken
 """
     flags = ["--config=configs/eval/rooms.py", "--checkpoint=c", f"--output={tmp_path}"]
-    command = [sys.executable, "-c", program, *flags]
-    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=500, check=False)
+    result = run_eval(*flags, first=fault)
     assert result.returncode != 0
     assert "Traceback" in result.stderr and "ValueError: a bug" in result.stderr
 

@@ -1,9 +1,7 @@
 """`train.py` itself: one step of a real model, its validation and its files; and what it says when it ends badly."""
 
-import os
 import shutil
 import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -14,7 +12,6 @@ import root_programs
 from logvggt_jax.training.reporting.metrics_log import read_metrics
 from logvggt_jax.weights.checkpoints import load_model, read_provenance
 
-ROOT = Path(__file__).parents[2]
 SETTINGS = (
     "--config=configs/tiny.py",
     "--config.model.encoder.depth=1",
@@ -35,7 +32,9 @@ SETTINGS = (
 def run_train(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., subprocess.CompletedProcess[str]]]:
     """`train.py` with `SETTINGS`, a folder and other arguments."""
     with root_programs.loaded(tmp_path_factory.mktemp("programs"), "logvggt_jax.training.loop") as run:
-        yield lambda workdir, *arguments: run("train.py", *SETTINGS, f"--workdir={workdir}", *arguments)
+        yield lambda workdir, *arguments, **first: run(
+            "train.py", *SETTINGS, f"--workdir={workdir}", *arguments, **first
+        )
 
 
 @pytest.fixture(scope="module")
@@ -78,19 +77,17 @@ def test_the_same_command_goes_on_with_parameters_in_parts(run_train: Callable, 
         ("KeyboardInterrupt", 130, "train.py: interrupted; the same command goes on"),
     ],
 )
-def test_a_fault_of_ours_keeps_its_traceback(tmp_path: Path, error: str, code: int, said: str) -> None:
+def test_a_fault_of_ours_keeps_its_traceback(
+    run_train: Callable, tmp_path: Path, error: str, code: int, said: str
+) -> None:
     """What a user can mend, or wanted, is one line; anything else shows where it arose."""
-    (tmp_path / "sitecustomize.py").write_text(
+    fault = (
         "import logvggt_jax.training.config as config\n"
         "def fail(values):\n"
         f"    raise {error}\n"
         "config.TrainConfig.from_dict = fail\n"
     )
-    command = [sys.executable, "train.py", "--config=configs/tiny.py", f"--workdir={tmp_path / 'run'}"]
-    path = os.pathsep.join((str(tmp_path), str(ROOT)))
-    finished = subprocess.run(
-        command, cwd=ROOT, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": path}, check=False
-    )
+    finished = run_train(tmp_path / "run", first=fault)
     assert finished.returncode == code and finished.stderr.startswith(said)
     assert "ValueError: a bug" in finished.stderr or finished.stderr.count("\n") == 1
 
