@@ -22,6 +22,8 @@ os.environ.setdefault("XLA_FLAGS", QUICK + SIMPLE)
 jax.config.update("jax_platforms", "cpu")
 jax.config.update("jax_num_cpu_devices", 16)
 
+from root_programs import RootPrograms, loaded  # noqa: E402
+
 from logvggt_jax import LogVGGT, ModelConfig  # noqa: E402
 from logvggt_jax.doctor.subject import tiny_config  # noqa: E402
 
@@ -95,6 +97,18 @@ def _programs_are_compiled_once(tmp_path_factory: pytest.TempPathFactory) -> Ite
             jax.config.update(name, value)
             patch.setenv(name.upper(), str(value))
         yield
+
+
+@pytest.fixture(scope="session")
+def programs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RootPrograms]:
+    """`train.py` and `eval.py` on the CPU, their libraries imported once for all tests of this process."""
+    libraries = ("evaluation.run", "training.loop", "training.dry_run", "training.preflight")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("JAX_PLATFORMS", "cpu")
+        folder = tmp_path_factory.mktemp("programs")
+        with loaded(folder, "pytest", *(f"logvggt_jax.{name}" for name in libraries)) as programs:
+            patch.undo()
+            yield programs
 
 
 @pytest.fixture(autouse=True, scope="module")

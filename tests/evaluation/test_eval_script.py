@@ -3,11 +3,11 @@
 import functools
 import json
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-import root_programs
+from root_programs import RootPrograms
 
 from logvggt_jax.config import ModelConfig
 from logvggt_jax.weights import save_model
@@ -16,12 +16,9 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
-def run_eval(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., subprocess.CompletedProcess[str]]]:
-    """`eval.py` with the given arguments, on the CPU."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("JAX_PLATFORMS", "cpu")
-        with root_programs.loaded(tmp_path_factory.mktemp("programs"), "logvggt_jax.evaluation.run") as run:
-            yield functools.partial(run, "eval.py")
+def run_eval(programs: RootPrograms) -> Callable[..., subprocess.CompletedProcess[str]]:
+    """`eval.py` with the given arguments."""
+    return functools.partial(programs, "eval.py")
 
 
 def test_an_evaluation_leaves_tables_json_and_figures(

@@ -2,12 +2,12 @@
 
 import shutil
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-import root_programs
+from root_programs import RootPrograms
 
 from logvggt_jax.training.reporting.metrics_log import read_metrics
 from logvggt_jax.weights.checkpoints import load_model, read_provenance
@@ -32,12 +32,11 @@ def batches_of(clips: int) -> tuple[str, str]:
 
 
 @pytest.fixture(scope="module")
-def run_train(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., subprocess.CompletedProcess[str]]]:
+def run_train(programs: RootPrograms) -> Callable[..., subprocess.CompletedProcess[str]]:
     """`train.py` with `SETTINGS`, a folder and other arguments."""
-    with root_programs.loaded(tmp_path_factory.mktemp("programs"), "logvggt_jax.training.loop") as run:
-        yield lambda workdir, *arguments, **first: run(
-            "train.py", *SETTINGS, f"--workdir={workdir}", *arguments, **first
-        )
+    return lambda workdir, *arguments, **first: programs(
+        "train.py", *SETTINGS, f"--workdir={workdir}", *arguments, **first
+    )
 
 
 @pytest.fixture(scope="module")

@@ -7,13 +7,12 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
-from root_programs import RootPrograms, loaded
+from root_programs import RootPrograms
 
 from logvggt_jax.errors import InputError
 from logvggt_jax.training.parallel import agreement
@@ -93,13 +92,6 @@ def test_half_an_address_is_refused() -> None:
         join_processes(coordinator="localhost:1234")
     with pytest.raises(InputError, match="--coordinator=localhost: expected HOST:PORT"):
         join_processes(coordinator="localhost", num_processes=2, process_id=1)
-
-
-@pytest.fixture(scope="module")
-def programs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RootPrograms]:
-    libraries = ("pytest", *(f"logvggt_jax.training.{name}" for name in ("loop", "dry_run", "preflight")))
-    with loaded(tmp_path_factory.mktemp("programs"), *libraries) as programs:
-        yield programs
 
 
 class PixelRuns:
