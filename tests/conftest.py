@@ -22,6 +22,8 @@ os.environ.setdefault("XLA_FLAGS", QUICK + SIMPLE)
 jax.config.update("jax_platforms", "cpu")
 jax.config.update("jax_num_cpu_devices", 16)
 
+from root_programs import RootPrograms, loaded  # noqa: E402
+
 from logvggt_jax import LogVGGT, ModelConfig  # noqa: E402
 from logvggt_jax.doctor.subject import tiny_config  # noqa: E402
 
@@ -32,23 +34,30 @@ gc.set_threshold(100_000, 50, 100)
 if not flags.FLAGS.is_parsed():
     flags.FLAGS.mark_as_parsed()
 
-# Files of more than twenty seconds of processor time: they come first, so that none is left to one process at the end.
+# Files of more than about fifteen seconds of processor time, the dearest first: none is left to one process at the end.
 DEAREST = (
     "model/test_logvggt.py",
-    "model/test_golden_pruned.py",
-    "model/test_golden_merged.py",
+    "streaming/test_frame_methods.py",
     "training/test_train_script.py",
-    "training/parallel/test_processes.py",
-    "model/test_golden_causal.py",
     "training/test_loop.py",
+    "weights/test_checkpoints.py",
+    "data/feeding/test_pipeline.py",
+    "model/test_windows.py",
     "doctor/test_doctor.py",
-    "training/parallel/test_sharding.py",
+    "model/test_parity.py",
+    "streaming/test_snapshot.py",
+    "test_configs.py",
+    "test_cli.py",
+    "streaming/test_stream_session.py",
+    "model/test_golden_pruned.py",
+    "model/test_refinement.py",
+    "streaming/test_bounded_stream.py",
     "evaluation/costs/test_throughput.py",
-    "model/test_golden_rolling.py",
     "evaluation/test_eval_script.py",
-    "evaluation/costs/test_efficiency.py",
-    "training/step/test_step.py",
-    "evaluation/methods/test_variants.py",
+    "training/parallel/test_processes.py",
+    "training/parallel/test_sharding.py",
+    "weights/test_vggt.py",
+    "evaluation/test_run.py",
 )
 
 SHARED = Path(os.environ.get("LOGVGGT_SHARED", Path(__file__).parents[2] / "shared"))
@@ -57,6 +66,12 @@ SHARED = Path(os.environ.get("LOGVGGT_SHARED", Path(__file__).parents[2] / "shar
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     place = {Path(__file__).parent / name: number for number, name in enumerate(DEAREST)}
     items.sort(key=lambda item: place.get(item.path, len(place)))
+
+
+def pytest_collection_finish() -> None:
+    """The modules imported by now stay: no later collection walks through their third of a million objects again."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -82,6 +97,18 @@ def _programs_are_compiled_once(tmp_path_factory: pytest.TempPathFactory) -> Ite
             jax.config.update(name, value)
             patch.setenv(name.upper(), str(value))
         yield
+
+
+@pytest.fixture(scope="session")
+def programs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RootPrograms]:
+    """`train.py` and `eval.py` on the CPU, their libraries imported once for all tests of this process."""
+    libraries = ("evaluation.run", "training.loop", "training.dry_run", "training.preflight")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("JAX_PLATFORMS", "cpu")
+        folder = tmp_path_factory.mktemp("programs")
+        with loaded(folder, "pytest", *(f"logvggt_jax.{name}" for name in libraries)) as programs:
+            patch.undo()
+            yield programs
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -4,9 +4,10 @@ of it, so that what takes seconds to import is imported once."""
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -14,42 +15,77 @@ ROOT = Path(__file__).parents[1]
 
 # A fork leaves the loop, so that its end is the interpreter's own: exit codes, messages and tracebacks as ever.
 _SERVER = """
+import gc
+gc.set_threshold(100_000, 50, 100)  # as in `conftest.py`
 import importlib, json, os, runpy, signal, sys, warnings
 for library in sys.argv[1:]:
     importlib.import_module(library)
 warnings.filterwarnings("ignore", message=r".*os\\.fork")
-arguments = None
+order = None
 for line in sys.stdin:
-    arguments, output, error = json.loads(line)
+    order = json.loads(line)
+    if isinstance(order, int):
+        print(os.waitstatus_to_exitcode(os.waitpid(order, 0)[1]), flush=True)
+        continue
     child = os.fork()
     if child == 0:
         signal.alarm(600)  # what hangs is killed
-        for number, file in ((1, output), (2, error)):
+        for number, file in ((1, order["output"]), (2, order["error"])):
             os.dup2(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), number)
         break
-    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
-    arguments = None
-if arguments is not None:
-    sys.argv = arguments
+    print(child, flush=True)
+    order = None
+if order is not None:
+    sys.argv = order["arguments"]
     sys.path.insert(0, os.getcwd())
-    runpy.run_path(arguments[0], run_name="__main__")
+    exec(order["first"], {})
+    runpy.run_path(sys.argv[0], run_name="__main__")
 """
 
 
+class Running:
+    """A program that has been started; what it prints goes to the files `output` and `error`."""
+
+    def __init__(self, pid: int, output: Path, error: Path, ended: Callable[[int], int]) -> None:
+        self.output, self.error = output, error
+        self.returncode: int | None = None
+        self._pid, self._ended = pid, ended
+
+    def wait(self) -> int:
+        """Its exit code, once it has ended."""
+        if self.returncode is None:
+            self.returncode = self._ended(self._pid)
+        return self.returncode
+
+    def send_signal(self, number: int) -> None:
+        """Nothing once it was waited for: its number may be another's by then."""
+        if self.returncode is None:
+            os.kill(self._pid, number)
+
+
 class RootPrograms:
-    """Runs one program after the other; see `loaded`."""
+    """Runs programs; see `loaded`."""
 
     def __init__(self, server: subprocess.Popen[str], folder: Path) -> None:
-        self._server, self._folder = server, folder
+        self._server, self._folder, self._count = server, folder, 0
 
-    def __call__(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        """The program `arguments[0]` of the root with its arguments, once it has ended."""
+    def start(self, *arguments: str, first: str = "") -> Running:
+        """The program `arguments[0]` of the root with its arguments; `first` are Python statements to run before."""
+        self._count += 1
+        output, error = (self._folder / f"{self._count}.{name}" for name in ("output", "error"))
+        order = {"arguments": arguments, "first": first, "output": str(output), "error": str(error)}
+        return Running(self._ask(order), output, error, self._ask)
+
+    def __call__(self, *arguments: str, first: str = "") -> subprocess.CompletedProcess[str]:
+        """The same, once it has ended."""
+        run = self.start(*arguments, first=first)
+        return subprocess.CompletedProcess(arguments, run.wait(), run.output.read_text(), run.error.read_text())
+
+    def _ask(self, order: dict | int) -> int:
         assert self._server.stdin is not None and self._server.stdout is not None
-        files = self._folder / "output", self._folder / "error"
-        self._server.stdin.write(json.dumps([arguments, *map(str, files)]) + "\n")
+        self._server.stdin.write(json.dumps(order) + "\n")
         self._server.stdin.flush()
-        code = int(self._server.stdout.readline())
-        return subprocess.CompletedProcess(arguments, code, *(file.read_text() for file in files))
+        return int(self._server.stdout.readline())
 
 
 @contextmanager

@@ -5,12 +5,11 @@ import importlib
 import math
 import os
 import subprocess
-from collections.abc import Iterator
 from pathlib import Path
 
 import jax
 import pytest
-from root_programs import RootPrograms, loaded
+from root_programs import RootPrograms
 
 from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.data.feeding.holdouts import PUBLISHED
@@ -242,12 +241,6 @@ def _check_step(
     # Layers and windows are loops, so that a kernel is in the program a few times and runs many: attention of a frame
     # and of a window with its cache at least.
     assert program.count(backward) >= 2 and program.count(forward) >= 2
-
-
-@pytest.fixture(scope="module")
-def programs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RootPrograms]:
-    with loaded(tmp_path_factory.mktemp("programs"), "logvggt_jax.training.loop") as programs:
-        yield programs
 
 
 @pytest.mark.parametrize(

@@ -3,12 +3,11 @@
 import functools
 import json
 import subprocess
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-import root_programs
+from root_programs import RootPrograms
 
 from logvggt_jax.config import ModelConfig
 from logvggt_jax.weights import save_model
@@ -17,12 +16,9 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
-def run_eval(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., subprocess.CompletedProcess[str]]]:
-    """`eval.py` with the given arguments, on the CPU."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("JAX_PLATFORMS", "cpu")
-        with root_programs.loaded(tmp_path_factory.mktemp("programs"), "logvggt_jax.evaluation.run") as run:
-            yield functools.partial(run, "eval.py")
+def run_eval(programs: RootPrograms) -> Callable[..., subprocess.CompletedProcess[str]]:
+    """`eval.py` with the given arguments."""
+    return functools.partial(programs, "eval.py")
 
 
 def test_an_evaluation_leaves_tables_json_and_figures(
@@ -72,19 +68,17 @@ def test_ctrl_c_is_one_line(run_eval: Callable, tmp_path: Path) -> None:
     assert (result.returncode, result.stderr) == (130, "eval.py: interrupted\n")
 
 
-def test_a_bug_keeps_its_traceback(tmp_path: Path) -> None:
-    program = """
-import eval as script
+def test_a_bug_keeps_its_traceback(run_eval: Callable, tmp_path: Path) -> None:
+    fault = """
+import logvggt_jax.evaluation.run as run
 
 def broken(*_, **__):
     raise ValueError("a bug")
 
-script.run_evaluation = broken
-script.app.run(script.main, flags_parser=script.parse_flags)
+run.run_evaluation = broken
 """
     flags = ["--config=configs/eval/rooms.py", "--checkpoint=c", f"--output={tmp_path}"]
-    command = [sys.executable, "-c", program, *flags]
-    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=500, check=False)
+    result = run_eval(*flags, first=fault)
     assert result.returncode != 0
     assert "Traceback" in result.stderr and "ValueError: a bug" in result.stderr
 

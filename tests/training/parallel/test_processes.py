@@ -2,6 +2,7 @@
 
 import platform
 import re
+import signal
 import socket
 import subprocess
 import sys
@@ -11,6 +12,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from root_programs import RootPrograms
 
 from logvggt_jax.errors import InputError
 from logvggt_jax.training.parallel import agreement
@@ -37,7 +39,7 @@ SETTINGS = (
 )
 
 PIXEL_MODEL = """
-import runpy, sys
+import sys
 sys.path[:0] = ["tests/training", "."]
 import conftest
 from logvggt_jax.training import loop
@@ -98,26 +100,21 @@ class PixelRuns:
     `patches` are Python statements for each process, run before training.
     """
 
-    def __init__(self, *workdirs: Path, patches: tuple[str, str] = ("", ""), flags: tuple[str, ...] = ()) -> None:
+    def __init__(
+        self, programs: RootPrograms, *workdirs: Path, patches: tuple[str, str] = ("", ""), flags: tuple[str, ...] = ()
+    ) -> None:
         address = f"localhost:{_free_port()}"
         self.processes = [
-            subprocess.Popen(
-                [
-                    sys.executable,
-                    "-c",
-                    f"{PIXEL_MODEL}\n{patch}\nrunpy.run_path('train.py', run_name='__main__')",
-                    *PIXEL_SETTINGS,
-                    f"--workdir={workdir}",
-                    "--distributed",
-                    f"--coordinator={address}",
-                    "--num_processes=2",
-                    f"--process_id={number}",
-                    *flags,
-                ],
-                cwd=ROOT,
-                text=True,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
+            programs.start(
+                "train.py",
+                *PIXEL_SETTINGS,
+                f"--workdir={workdir}",
+                "--distributed",
+                f"--coordinator={address}",
+                "--num_processes=2",
+                f"--process_id={number}",
+                *flags,
+                first=f"{PIXEL_MODEL}\n{patch}",
             )
             for number, (workdir, patch) in enumerate(zip(workdirs, patches, strict=True))
         ]
@@ -127,21 +124,20 @@ class PixelRuns:
 
     def __exit__(self, *_: object) -> None:
         for process in self.processes:
-            process.kill()
-            process.communicate()
+            process.send_signal(signal.SIGKILL)
+            process.wait()
 
     def training(self) -> None:
         """Waits for a line of a step after the first."""
-        stdout = self.processes[0].stdout
-        assert stdout is not None
-        for line in stdout:
-            if line.startswith("step 10/"):
-                return
-        raise AssertionError(self.errors(0))
+        output, end = self.processes[0].output, time.monotonic() + 600
+        while not (output.exists() and "\nstep 10/" in output.read_text()):
+            assert time.monotonic() < end, self.processes[0].error.read_text()
+            time.sleep(0.05)
 
     def errors(self, process: int) -> str:
         """What a process said on standard error until its end, without what the libraries say at the start."""
-        lines = self.processes[process].communicate(timeout=60)[1].splitlines(keepends=True)
+        self.processes[process].wait()
+        lines = self.processes[process].error.read_text().splitlines(keepends=True)
         return "".join(line for line in lines if not line.startswith(("[Gloo]", "rendering rooms")))
 
 
@@ -152,11 +148,11 @@ def _free_port() -> int:
 
 
 @pytest.mark.parametrize("lost", [1, pytest.param(0, marks=pytest.mark.slow)])
-def test_the_loss_of_a_process_ends_the_other_with_one_line(lost: int, tmp_path: Path) -> None:
-    with PixelRuns(tmp_path, tmp_path) as runs:
+def test_the_loss_of_a_process_ends_the_other_with_one_line(lost: int, programs: RootPrograms, tmp_path: Path) -> None:
+    with PixelRuns(programs, tmp_path, tmp_path) as runs:
         runs.training()
         started = time.monotonic()
-        runs.processes[lost].kill()
+        runs.processes[lost].send_signal(signal.SIGKILL)
         errors = runs.errors(1 - lost)
         assert time.monotonic() - started < 10
         assert runs.processes[1 - lost].returncode == 1, errors
@@ -166,29 +162,32 @@ def test_the_loss_of_a_process_ends_the_other_with_one_line(lost: int, tmp_path:
         assert (re.fullmatch if lost else re.search)(line, errors), errors
 
 
-def test_any_exception_ends_its_process_with_a_traceback_and_the_other_with_a_line(tmp_path: Path) -> None:
+def test_any_exception_ends_its_process_with_a_traceback_and_the_other_with_a_line(
+    programs: RootPrograms, tmp_path: Path
+) -> None:
     patch = "def fail(run, step, *_):\n    raise KeyError('a bug')\nloop._Run._validate = fail"
-    with PixelRuns(tmp_path, tmp_path, patches=("", patch), flags=("--config.validation.every=10",)) as runs:
+    with PixelRuns(programs, tmp_path, tmp_path, patches=("", patch), flags=("--config.validation.every=10",)) as runs:
         assert "Traceback" in runs.errors(1) and runs.processes[1].returncode == 1
         errors = runs.errors(0)
         assert runs.processes[0].returncode == 1
         assert re.fullmatch(r"train.py: process 1 on \S+ was lost, it ended with: KeyError: 'a bug'\n", errors)
 
 
-def test_a_stop_signal_for_one_process_stops_all_after_the_same_step(tmp_path: Path) -> None:
-    with PixelRuns(tmp_path, tmp_path) as runs:
+def test_a_stop_signal_for_one_process_stops_all_after_the_same_step(programs: RootPrograms, tmp_path: Path) -> None:
+    with PixelRuns(programs, tmp_path, tmp_path) as runs:
         runs.training()
-        runs.processes[1].terminate()
-        output = runs.processes[0].communicate(timeout=60)
-        assert [process.wait(60) for process in runs.processes] == [0, 0], output
-        found = re.search(r"stopping after step (\d+): another process is to stop", output[0])
+        runs.processes[1].send_signal(signal.SIGTERM)
+        codes = [process.wait() for process in runs.processes]
+        output = runs.processes[0].output.read_text()
+        assert codes == [0, 0], output + runs.errors(0)
+        found = re.search(r"stopping after step (\d+): another process is to stop", output)
         assert found is not None, output
         assert (tmp_path / "checkpoints" / found[1]).is_dir()
 
 
-def test_folders_that_are_not_shared_are_an_error_of_the_start(tmp_path: Path) -> None:
+def test_folders_that_are_not_shared_are_an_error_of_the_start(programs: RootPrograms, tmp_path: Path) -> None:
     patch = "from logvggt_jax.training.parallel import agreement; agreement.SHARED_SECONDS = 0.5"
-    with PixelRuns(tmp_path / "a", tmp_path / "b", patches=(patch, patch)) as runs:
+    with PixelRuns(programs, tmp_path / "a", tmp_path / "b", patches=(patch, patch)) as runs:
         for number in range(2):
             errors = runs.errors(number)
             assert runs.processes[number].returncode == 1
@@ -197,7 +196,7 @@ def test_folders_that_are_not_shared_are_an_error_of_the_start(tmp_path: Path) -
     assert not list((tmp_path / "a").iterdir())
 
 
-def test_a_preflight_goes_on_together_when_one_process_fails_a_try(tmp_path: Path) -> None:
+def test_a_preflight_goes_on_together_when_one_process_fails_a_try(programs: RootPrograms, tmp_path: Path) -> None:
     quick = (
         "from logvggt_jax.training import preflight as flight\n"
         "from logvggt_jax.training.step.costs import StepCosts\n"
@@ -209,17 +208,18 @@ def test_a_preflight_goes_on_together_when_one_process_fails_a_try(tmp_path: Pat
         "def fail(*_): raise InputError('scene0001: cannot be opened')\n"
         "flight._read_clips = fail\n"
     )
-    with PixelRuns(tmp_path, tmp_path, patches=(quick, quick + broken), flags=("--preflight",)) as runs:
-        outputs = [process.communicate(timeout=60) for process in runs.processes]
-        assert [process.returncode for process in runs.processes] == [1, 1], outputs
+    with PixelRuns(programs, tmp_path, tmp_path, patches=(quick, quick + broken), flags=("--preflight",)) as runs:
+        codes = [process.wait() for process in runs.processes]
+        outputs = [(process.output.read_text(), process.error.read_text()) for process in runs.processes]
+        assert codes == [1, 1], outputs
     assert "rooms: FAILED on process 1: scene0001: cannot be opened" in outputs[1][0]
     assert "checkpoint: " in outputs[0][0] and "checkpoint: " not in outputs[1][0]
     assert "preflight: 1 of the tries failed: rooms; see the lines above" in outputs[0][1] + outputs[1][1]
     assert not list(tmp_path.iterdir())
 
 
-def test_a_process_that_never_joins_is_waited_for_as_long_as_stated(tmp_path: Path) -> None:
-    with PixelRuns(tmp_path, tmp_path, patches=("", "sys.exit()"), flags=("--join_seconds=2",)) as runs:
+def test_a_process_that_never_joins_is_waited_for_as_long_as_stated(programs: RootPrograms, tmp_path: Path) -> None:
+    with PixelRuns(programs, tmp_path, tmp_path, patches=("", "sys.exit()"), flags=("--join_seconds=2",)) as runs:
         errors = runs.errors(0)
         assert runs.processes[0].returncode == 1
     assert re.fullmatch(r"train.py: not all of the 2 processes joined within 2 s .*\n", errors)

@@ -46,7 +46,16 @@ def alone(layered: Any, loss_config: LossConfig, layered_params: Any, sixteen: C
 
 @pytest.mark.parametrize(
     ("devices", "shard", "accumulate"),
-    [(1, False, 4), (4, False, 1), (4, True, 1), (4, True, 2), (4, False, 4), (16, False, 1), (16, True, 1)],
+    [
+        (4, True, 2),
+        (4, False, 4),
+        (16, True, 1),
+        # Each of these leaves out something of those above.
+        *(
+            pytest.param(*each, marks=pytest.mark.slow)
+            for each in ((1, False, 4), (4, False, 1), (4, True, 1), (16, False, 1))
+        ),
+    ],
 )
 def test_first_gradient_is_that_of_one_device(
     devices: int,
