@@ -163,7 +163,7 @@ def _chosen_of_cells(num_frames: int, grid: tuple[int, int]) -> np.ndarray:
     """Whether a patch is the one of its 2 x 2 cell, bool [frames, patches of whole cells] in their raster order."""
     rows, columns = grid[0] // 2, grid[1] // 2
     # PyTorch's generator on a CPU is this Mersenne twister, and its draws of 0 … 3 are its numbers modulo 4.
-    draws = np.random.RandomState(_SEED).randint(0, 2**32, (num_frames, rows, columns), np.uint32) % 4
+    draws = np.random.RandomState(_SEED).randint(0, 2**32, (num_frames, rows, columns), dtype=np.uint32) % 4
     chosen = np.zeros((num_frames, rows, 2, columns, 2), bool)
     frame, row, column = np.indices(draws.shape)
     chosen[frame, row, draws // 2, column, draws % 2] = True
