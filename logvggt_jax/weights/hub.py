@@ -51,8 +51,8 @@ def download(repository: str, file: str | None = None) -> Path:
         raise _not_found(repository) from error
     except hub.errors.LocalEntryNotFoundError as error:
         raise MissingInput(
-            f"{repository}: the hub cannot be reached and its cache on this machine has no {file or 'copy'}; "
-            "connect, or download the file elsewhere and give its path"
+            f"{repository}: no such path here, the hub cannot be reached, and its cache on this machine has no "
+            f"{file or 'copy'}; check the path, or connect, or download the file elsewhere and give its path"
         ) from error
     except hub.errors.RemoteEntryNotFoundError as error:
         raise MissingInput(f"{repository}: the repository holds no {file}; look for the name on its page") from error

@@ -167,11 +167,12 @@ def test_gif_keeps_its_own_durations(tmp_path: Path, library: str) -> None:
     np.testing.assert_allclose(times(list(open_source(path))), [0, 0.1, 0.5, 0.7], atol=1e-3)
 
 
-def test_a_stream_without_times_is_counted(tmp_path: Path) -> None:
-    source = open_source(write(tmp_path / "raw.h264", [grey(i) for i in range(5)]))
+@pytest.mark.parametrize("rate", [10, 12])
+def test_a_stream_without_times_is_counted(tmp_path: Path, rate: int) -> None:
+    source = open_source(write(tmp_path / "raw.h264", [grey(i) for i in range(5)], rate=rate))
     # The rate is the stream's own, where it states one.
-    np.testing.assert_allclose(times(list(source)), np.arange(5) / 10)
-    assert "states no times: 10 frames a second are assumed" in source.notes[0]
+    np.testing.assert_allclose(times(list(source)), np.arange(5) / rate)
+    assert f"states no times: {rate} frames a second are assumed" in source.notes[0]
 
 
 def test_time_stamps_in_the_order_of_storage_are_sorted(tmp_path: Path) -> None:

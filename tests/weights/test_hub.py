@@ -168,7 +168,7 @@ def test_the_caches_own_folder_of_a_repository_is_read_as_a_path(hub, tmp_path):
 def test_an_unreachable_hub_is_named(hub, monkeypatch):
     hub.close()
     monkeypatch.setattr("huggingface_hub.utils._http.time.sleep", lambda seconds: None)  # between attempts
-    with pytest.raises(FileNotFoundError, match=r"owner/vggt: the hub cannot be reached"):
+    with pytest.raises(FileNotFoundError, match=r"owner/vggt: no such path here, the hub cannot be reached"):
         download("owner/vggt")
 
 

@@ -70,8 +70,8 @@ def has_no_times(container: av.container.InputContainer) -> bool:
 def average_rate(container: av.container.InputContainer, stream: av.video.stream.VideoStream) -> Fraction | None:
     """Frames a second on average."""
     if has_no_times(container):
-        # What the codec states; the average is a default.
-        return stream.guessed_rate or stream.average_rate
+        # What the codec states, if it does: the library guesses 24 for 12, and the average is a default.
+        return stream.codec_context.framerate or stream.guessed_rate or stream.average_rate
     # Of some formats the library takes the unit of time for the distance of two frames.
     return min((rate for rate in (stream.average_rate, stream.guessed_rate) if rate), default=None)
 
