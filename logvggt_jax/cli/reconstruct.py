@@ -31,8 +31,9 @@ def _reconstruct(options: argparse.Namespace) -> int:
     from logvggt_jax.reconstruction.method import choose_method
     from logvggt_jax.reconstruction.points.point_filter import PointFilter
     from logvggt_jax.reconstruction.reconstruct import LONGER_EDGE, reconstruct
-    from logvggt_jax.reconstruction.request import check_masks, check_request, describe
+    from logvggt_jax.reconstruction.request import check_masks, check_request, describe, what_decides
     from logvggt_jax.reconstruction.sources import open_source
+    from logvggt_jax.reconstruction.work_folder import check_leftovers
     from logvggt_jax.weights import resolve
     from logvggt_jax.weights.checkpoints import from_pretrained, read_config, read_provenance
 
@@ -53,6 +54,7 @@ def _reconstruct(options: argparse.Namespace) -> int:
         longer_edge=options.longer_edge,
         overwrite=options.overwrite,
         calibration=calibration,
+        num_previews=options.previews,
     )
     checkpoint = resolve(options.checkpoint)
     provenance = read_provenance(checkpoint)
@@ -65,6 +67,8 @@ def _reconstruct(options: argparse.Namespace) -> int:
     method = choose_method(provenance, None if options.method == "auto" else options.method)
     check_masks(source, method)
     settings = _settings(options, method)
+    decides = what_decides(source, config, method, settings, longer_edge, point_filter, calibration)
+    check_leftovers(target, decides, overwrite=options.overwrite)
     needs = describe(source, target, config if options.dry_run else None, method, settings, longer_edge, point_filter)
     if provenance.longer_edge not in (None, longer_edge):
         source.notes.append(f"these weights were trained at {provenance.longer_edge} pixels, not {longer_edge}")

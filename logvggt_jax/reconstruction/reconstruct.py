@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import importlib.metadata
 import json
 import time
 import warnings
 from pathlib import Path
 from typing import Any
 
-import jax
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -25,7 +23,6 @@ from rich.progress import (
 from rich.text import Text
 
 from logvggt_jax.data.feeding.transforms import LONGER_EDGE
-from logvggt_jax.errors import InputError
 from logvggt_jax.interruption import StopRequest
 from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.model.low_precision import precision_of
@@ -35,7 +32,7 @@ from logvggt_jax.reconstruction.finishing import finish
 from logvggt_jax.reconstruction.frame_pool import FramePool
 from logvggt_jax.reconstruction.points.point_filter import PointFilter
 from logvggt_jax.reconstruction.points.selection import PointSelection
-from logvggt_jax.reconstruction.request import check_masks, check_request
+from logvggt_jax.reconstruction.request import check_masks, check_request, what_decides
 from logvggt_jax.reconstruction.result import Reconstruction
 from logvggt_jax.reconstruction.run import Run
 from logvggt_jax.reconstruction.sources import Source, open_source
@@ -97,25 +94,20 @@ def reconstruct(
       InputError: bad source or parameters, or a sequence that the method cannot predict.
       Interrupted: a signal ended the run before anything was final, or asked it to save and end.
     """
-    if num_previews < 0:
-        raise InputError(f"num_previews must not be negative, got {num_previews}")
     source = source if isinstance(source, Source) else open_source(source)
     calibration, point_filter = calibration or Calibration(), point_filter or PointFilter()
-    target = check_request(source, output, longer_edge=longer_edge, overwrite=overwrite, calibration=calibration)
+    target = check_request(
+        source,
+        output,
+        longer_edge=longer_edge,
+        overwrite=overwrite,
+        calibration=calibration,
+        num_previews=num_previews,
+    )
     check_masks(source, method)
     request = {
-        "version": importlib.metadata.version("logvggt-jax"),
-        "jax": jax.__version__,
-        "device": jax.devices()[0].device_kind,
-        "model": str(model.config),
+        **what_decides(source, model.config, method, settings, longer_edge, point_filter, calibration),
         "weights": hashlib.blake2b(json.dumps(digests(variables)).encode(), digest_size=16).hexdigest(),
-        "method": method,
-        "settings": str(settings),
-        "longer_edge": str(longer_edge),
-        "point_filter": str(point_filter),
-        "calibration": str(calibration),
-        # Left out where there are none, as by earlier versions, whose runs can be taken up.
-        **({} if source.masks is None else {"masks": str(source.masks.path.resolve())}),
         **({} if (precision := precision_of(variables)) is None else {"precision": precision}),
     }
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Rate(), TimeRemainingColumn())

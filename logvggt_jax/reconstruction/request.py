@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.metadata
 import math
 from pathlib import Path
 from typing import Any
@@ -39,12 +40,15 @@ def check_request(
     longer_edge: int | None,
     overwrite: bool,
     calibration: Calibration | None = None,
+    num_previews: int = 0,
 ) -> Path:
     """The absolute path of the output, if `reconstruct` can begin; for callers that want to know before they load a
     large model. Arguments and errors as in `reconstruct`.
     """
     if longer_edge is not None:
         check_longer_edge(longer_edge)
+    if num_previews < 0:
+        raise InputError(f"previews must not be negative, got {num_previews}")
     if calibration is not None and source.image_size is not None:
         calibration.check(source.image_size)
     target = Path(output).expanduser().resolve()
@@ -54,6 +58,31 @@ def check_request(
         check_output(target, overwrite=overwrite, marker=CAMERAS_FILE)
     check_writable(target)
     return target
+
+
+def what_decides(
+    source: Source,
+    config: ModelConfig,
+    method: str,
+    settings: Any,
+    longer_edge: int,
+    point_filter: PointFilter,
+    calibration: Calibration,
+) -> dict[str, str]:
+    """What decides a result beside frames and weights; a run can be taken up by another that has the same."""
+    return {
+        "version": importlib.metadata.version("logvggt-jax"),
+        "jax": jax.__version__,
+        "device": jax.devices()[0].device_kind,
+        "model": str(config),
+        "method": method,
+        "settings": str(settings),
+        "longer_edge": str(longer_edge),
+        "point_filter": str(point_filter),
+        "calibration": str(calibration),
+        # Left out where there are none, as by earlier versions, whose runs can be taken up.
+        **({} if source.masks is None else {"masks": str(source.masks.path.resolve())}),
+    }
 
 
 def check_masks(source: Source, method: str) -> None:

@@ -79,6 +79,7 @@ class Run:
         self.num_taken = 0
         if (saved := work.saved()) is not None:
             self._restore(saved)
+        work.go_on()
 
     def stream(self, stop: StopRequest, *, advance: Callable[[], object], refined: Progress) -> bool:
         """The rest of the sequence through the predictor; images and depth go to disk, and the selection sees all.

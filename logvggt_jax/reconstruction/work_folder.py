@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from types import TracebackType
 
@@ -17,6 +17,7 @@ from logvggt_jax.streaming.state_file import State, read_state, write_state
 _PROGRESS = ".progress"
 _REQUEST, _STATE, _RESERVE = "request.json", "state.safetensors", "reserve"
 _MEND = "pass --overwrite to start anew"
+_ELSEWHERE = "choose another output"
 
 
 class WorkFolder:
@@ -41,16 +42,18 @@ class WorkFolder:
         self.path = work_path(output)
         self._progress = self.path / _PROGRESS
         self._lock: FolderLock | None = None
+        # Whether the folder was the incomplete result at `output`, and is still as it was.
+        self._unchanged_result = False
 
     def __enter__(self) -> WorkFolder:
         with disk_errors(self.path):
             if not self._overwrite and is_unfinished(self._output) and not self.path.exists():
                 _check_request(self._output, self._request)
                 self._output.rename(self.path)
+                self._unchanged_result = True
             check_output(self._output, overwrite=self._overwrite, marker=CAMERAS_FILE)
-            if self.path.exists() and not self._progress.is_dir() and any(self.path.iterdir()):
-                raise OutputExists(f"{self.path} is in the way and was not made by this program: move it elsewhere")
-        self._lock = FolderLock(self._progress, "choose another output")
+            _check_ours(self.path)
+        self._lock = FolderLock(self._progress, _ELSEWHERE)
         try:
             with disk_errors(self.path):
                 self._take_over()
@@ -60,9 +63,11 @@ class WorkFolder:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: object, trace: TracebackType | None) -> None:
-        """Lets go of the folder; without a saved state nobody can use it, and it goes."""
+        """Lets go of the folder; without a saved state nobody can use it, and it goes. A result goes back."""
         if self._progress.is_dir() and not (self._progress / _STATE).is_file():
             shutil.rmtree(self.path, ignore_errors=True)
+        elif self._unchanged_result and not self._output.exists():
+            self.path.rename(self._output)
         if self._lock is not None:
             self._lock.release()
 
@@ -76,6 +81,10 @@ class WorkFolder:
                     shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
             (self._progress / _STATE).unlink(missing_ok=True)
         write_text(stored, json.dumps(self._request, indent=1))
+
+    def go_on(self) -> None:
+        """To be called once the saved state is taken over: what is in the folder changes from here on."""
+        self._unchanged_result = False
 
     def saved(self) -> State | None:
         """Where the last `save` was; None for a new run. InputError where the file is damaged."""
@@ -119,11 +128,30 @@ def is_unfinished(folder: Path) -> bool:
     return (folder / _PROGRESS / _STATE).is_file() and not is_complete(folder / CAMERAS_FILE)
 
 
-def _check_request(folder: Path, request: Mapping[str, str]) -> None:
+def check_leftovers(output: Path, request: Mapping[str, str], *, overwrite: bool) -> None:
+    """Raises what a `WorkFolder` would for what another run has left or is at work on, as far as that can be known
+    without the weights: `request` lacks them and their precision; nothing is taken over."""
+    path = work_path(output)
+    with disk_errors(path):
+        _check_ours(path)
+        if (path / _PROGRESS).is_dir():
+            FolderLock(path / _PROGRESS, _ELSEWHERE).release()
+        unfinished = path if path.exists() else output
+        if not overwrite and (unfinished / _PROGRESS / _REQUEST).exists():
+            _check_request(unfinished, request, unknown=("weights", "precision"))
+
+
+def _check_ours(path: Path) -> None:
+    if path.exists() and not (path / _PROGRESS).is_dir() and any(path.iterdir()):
+        raise OutputExists(f"{path} is in the way and was not made by this program: move it elsewhere")
+
+
+def _check_request(folder: Path, request: Mapping[str, str], unknown: Collection[str] = ()) -> None:
     file = folder / _PROGRESS / _REQUEST
     try:
         stored = json.loads(file.read_text())
-        others = sorted(name for name in stored.keys() | request.keys() if stored.get(name) != request.get(name))
+        names = (stored.keys() | request.keys()).difference(unknown)
+        others = sorted(name for name in names if stored.get(name) != request.get(name))
     except (ValueError, AttributeError, RecursionError) as error:
         raise InputError(f"{file}: damaged ({one_line(error)}); {_MEND}") from error
     if others:

@@ -15,7 +15,7 @@ from PIL import Image
 from recorder import LONGER_EDGE, Recorder, reconstruct_recorded
 
 from logvggt_jax import LogVGGT, ModelConfig
-from logvggt_jax.errors import DiskError
+from logvggt_jax.errors import DiskError, InputError
 from logvggt_jax.reconstruction import PointFilter, open_source
 from logvggt_jax.reconstruction.request import check_request, describe, device_needs, disk_bytes
 from logvggt_jax.streaming import METHODS, ChunkPlan
@@ -59,6 +59,8 @@ def test_an_output_that_cannot_be_made_is_refused(walk: Path, tmp_path: Path, mo
     assert check_request(source, tmp_path / "new" / "out", **options) == tmp_path / "new" / "out"
     with pytest.raises(DiskError, match=r"file is no folder"):
         check_request(source, tmp_path / "file" / "out", **options)
+    with pytest.raises(InputError, match="previews must not be negative"):
+        check_request(source, tmp_path / "new" / "out", **options, num_previews=-1)
     monkeypatch.setattr(os, "access", lambda *_: False)
     with pytest.raises(DiskError, match="no permission"):
         check_request(source, tmp_path / "new" / "out", **options)

@@ -19,7 +19,7 @@ from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.errors import InputError, OutputExists
 from logvggt_jax.interruption import Interrupted
 from logvggt_jax.reconstruction import PointFilter, Reconstruction, open_source, reconstruct
-from logvggt_jax.reconstruction.work_folder import WorkFolder
+from logvggt_jax.reconstruction.work_folder import WorkFolder, check_leftovers
 from logvggt_jax.streaming import ChunkPlan
 from logvggt_jax.streaming.chunks import ChunkSession
 from logvggt_jax.streaming.state_file import State
@@ -289,6 +289,37 @@ def test_a_folder_of_somebody_else_is_left_alone(tmp_path: Path) -> None:
     ):
         pass
     assert (tmp_path / "out.partial" / "thesis.tex").read_text() == "x"
+
+
+def test_leftovers_are_known_before_the_weights(tmp_path: Path) -> None:
+    output, request = tmp_path / "out", {"method": "windows", "weights": "1f"}
+    known, other = {"method": "windows"}, {"method": "chunks"}
+    check_leftovers(output, other, overwrite=False)
+    with WorkFolder(output, request, overwrite=False) as work:
+        work.save(State({}, {}), [])
+        with pytest.raises(InputError, match="another run is using this folder"):
+            check_leftovers(output, known, overwrite=True)
+    check_leftovers(output, known, overwrite=False)
+    check_leftovers(output, other, overwrite=True)
+    with pytest.raises(OutputExists, match=r"out\.partial holds an unfinished.*differs in method;"):
+        check_leftovers(output, other, overwrite=False)
+    work.path.rename(output)  # as Ctrl-C leaves it
+    with pytest.raises(OutputExists, match=r"out holds an unfinished.*differs in method;"):
+        check_leftovers(output, other, overwrite=False)
+    work.path.mkdir()
+    (work.path / "thesis.tex").write_text("x")
+    with pytest.raises(OutputExists, match="was not made by this program"):
+        check_leftovers(output, known, overwrite=True)
+
+
+def test_a_partial_result_that_cannot_be_taken_up_stays_where_it_is(walk: Path, tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    run(Recorder(send_at(6, signal.SIGINT)), walk, output)
+    before = contents(output)
+    Image.new("RGB", (42, 28)).save(walk / "002.png")
+    with pytest.raises(InputError, match=r"walk has changed.*--overwrite"):
+        run(Recorder(), walk, output)
+    assert contents(output) == before and not (tmp_path / "out.partial").exists()
 
 
 def test_a_killed_process_can_be_taken_up(walk: Path, tmp_path: Path, straight: dict[str, bytes]) -> None:
