@@ -12,7 +12,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
-from logvggt_jax.errors import InputError, disk_errors, one_line
+from logvggt_jax.errors import DiskError, InputError, disk_errors, one_line
 from logvggt_jax.files import atomic_file, to_disk
 from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.streaming.predictor import METHODS, Predictor, open_predictor
@@ -80,12 +80,15 @@ def load_stream(
 
 
 def write_state(path: str | Path, state: State) -> None:
-    """Writes arrays and facts with their digest, whole or not at all, and on the disk on return."""
+    """Writes arrays and facts with their digest, whole or not at all, and on the disk on return. Raises DiskError."""
     path = Path(path)
     arrays = {name: np.ascontiguousarray(array) for name, array in state.arrays.items()}
     facts = json.dumps(state.facts)
     with disk_errors(path), atomic_file(path) as temporary:
-        save_file(arrays, temporary, metadata={"facts": facts, "digest": _digest(facts, arrays)})
+        try:
+            save_file(arrays, temporary, metadata={"facts": facts, "digest": _digest(facts, arrays)})
+        except SafetensorError as error:  # what the library makes of a full disk
+            raise DiskError(f"{path}: cannot be written ({one_line(error)})") from error
         to_disk([temporary])
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -16,7 +17,7 @@ from PIL import Image
 from recorder import LONGER_EDGE, Recorder, reconstruct_recorded
 
 from logvggt_jax import LogVGGT, ModelConfig
-from logvggt_jax.errors import InputError, OutputExists
+from logvggt_jax.errors import DiskError, InputError, OutputExists
 from logvggt_jax.interruption import Interrupted
 from logvggt_jax.reconstruction import PointFilter, Reconstruction, open_source, reconstruct
 from logvggt_jax.reconstruction.work_folder import WorkFolder, check_leftovers
@@ -278,6 +279,20 @@ def test_every_damage_of_a_saved_state_is_noticed(tmp_path: Path) -> None:
             else:
                 assert found is not None and found.facts == saved.facts and found.arrays.keys() == arrays.keys()
         file.write_bytes(sound)
+
+
+def test_a_full_disk_is_named_and_keeps_the_state_before(tmp_path: Path) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with WorkFolder(tmp_path / "out", {}, overwrite=False) as work:
+        work.save(State({}, {"num_taken": 1}), [])
+        resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, hard))
+        try:
+            with pytest.raises(DiskError, match=r"state\.safetensors: cannot be written"):
+                work.save(State({"tokens": np.zeros(10_000, np.float32)}, {"num_taken": 2}), [])
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        saved = work.saved()
+    assert saved is not None and saved.facts == {"num_taken": 1}
 
 
 def test_a_folder_of_somebody_else_is_left_alone(tmp_path: Path) -> None:
