@@ -564,6 +564,16 @@ def test_damaged_packets_are_skipped_and_named(tmp_path: Path, library: str) -> 
     np.testing.assert_allclose(times(frames), np.array(names(frames)) / 10, atol=1e-6)
 
 
+def test_frames_that_may_lack_what_a_damaged_one_showed_are_counted(tmp_path: Path) -> None:
+    path, (broken,) = damaged(tmp_path / "noise.mp4", [7])
+    source = open_source(path)
+    assert len(list(source)) == 23
+    with av.open(str(path)) as container:
+        shown = sorted((packet.pts, packet.is_keyframe) for packet in container.demux(video=0) if packet.size)
+    after = [is_key for _, is_key in shown[int(broken.removeprefix("frame-")) + 1 :]]
+    assert source.notes[-1].endswith(f"next key frame, which may lack what it showed: {after.index(True)}")
+
+
 def test_damage_to_a_stream_without_times_is_named_where_it_is(tmp_path: Path) -> None:
     path = write(tmp_path / "raw.h264", [busy(i) for i in range(12)], options={"bf": "0", "x264-params": "threads=1"})
     content = bytearray(path.read_bytes())

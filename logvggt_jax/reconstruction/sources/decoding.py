@@ -39,6 +39,7 @@ class Picture(NamedTuple):
       convert: gives the picture as [H, W, 3] uint8 RGB, in any thread.
       damaged: the decoder had to guess parts of it.
       lasts: seconds for which it is shown; None where the file does not say.
+      alone: it refers to no other frame; None where the library does not say.
     """
 
     seconds: float | None
@@ -46,6 +47,7 @@ class Picture(NamedTuple):
     convert: Callable[[], np.ndarray]
     damaged: bool = False
     lasts: float | None = None
+    alone: bool | None = None
 
 
 class Damage(NamedTuple):

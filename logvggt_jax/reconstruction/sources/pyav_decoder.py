@@ -119,6 +119,7 @@ class PyAVDecoder:
             convert=partial(self._convert, whole, matrix),
             damaged=decoded.is_corrupt,
             lasts=float(decoded.duration * stream.time_base) if decoded.duration else None,
+            alone=decoded.key_frame,
         )
 
     def _convert(self, frame: av.VideoFrame, matrix: np.ndarray | None) -> np.ndarray:

@@ -123,12 +123,14 @@ class VideoSource(Source):
         clock, selection = FrameClock(header.rate if header else _STREAM_RATE), FrameSelection(self.options)
         size = header.size if header else None
         taken, guessed, position, seconds, lasts = 0, 0, -1, 0.0, None
+        lost, doubtful = False, 0  # whether a frame is missing since the last that refers to no other
         for position, picture in enumerate(self._decoder.pictures()):
             name, seconds = f"frame-{position:06d}", clock.time(picture.seconds)
             if selection.is_over(seconds):
                 break
             wanted = selection.wants(position, seconds)
             if isinstance(picture, Damage):
+                lost = True
                 if wanted:
                     self._skip(name, picture.reason, taken)
             else:
@@ -136,7 +138,9 @@ class VideoSource(Source):
                 if selection.has_begun(seconds) and picture.size != size:
                     self._refuse_size(position, picture.size, size)
                 guessed += picture.damaged
+                lost = lost and picture.alone is False
                 if wanted:
+                    doubtful += lost
                     selection.take(seconds)
                     taken += 1
                     if taken > first:
@@ -147,6 +151,11 @@ class VideoSource(Source):
             self._check_end(position + 1, seconds, lasts)
         if guessed:
             self._add_note(f"{self.name}: frames with damaged parts, which the decoder filled by guesses: {guessed}")
+        if doubtful:
+            self._add_note(
+                f"{self.name}: frames between one that is left out and the next key frame, which may lack what it "
+                f"showed: {doubtful}"
+            )
         if not taken:
             raise InputError(
                 f"{self.name} gave no frame between {self.options.start or 0:g} s and "
