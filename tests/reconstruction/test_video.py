@@ -676,6 +676,17 @@ def test_an_edited_video_is_whole(tmp_path: Path) -> None:
     assert abs(frames[0].image.mean() - 40 - 8 * 10) < 10
 
 
+def test_a_damaged_index_of_a_short_video_is_told(tmp_path: Path) -> None:
+    path = write(tmp_path / "walk.mp4", [busy(i) for i in range(6)], codec="mpeg4")
+    content = bytearray(path.read_bytes())
+    # The fourth frame's size, so that the two after it lie beyond the file's end.
+    content[content.index(b"stsz") + 16 + 3 * 4 + 2] |= 0x80
+    path.write_bytes(content)
+    source = open_source(path)
+    assert len(list(source)) == 4
+    assert "shows 4 of the 6 frames in it" in source.notes[-1]
+
+
 def test_a_matroska_video_cut_short_says_so(tmp_path: Path) -> None:
     path = write(tmp_path / "cut.mkv", [busy(i) for i in range(24)])
     path.write_bytes(path.read_bytes()[: packets(path)[12][0]])

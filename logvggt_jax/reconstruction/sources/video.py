@@ -197,7 +197,7 @@ class VideoSource(Source):
             raise InputError(f"{self.name} lasts {header.seconds:.3g} s, but start is {start:g} s: choose less")
 
     def _check_end(self, frames: int, seconds: float, lasts: float | None) -> None:
-        """Warns of a file that ends before its header says. Headers are often off by a frame or two.
+        """Warns of a file that ends before its header says, and notes where a few frames of it are not shown.
 
         The last frame, at `seconds`, may be shown for long, as in recordings of a screen.
         """
@@ -212,10 +212,9 @@ class VideoSource(Source):
             short = lacks_time
             told = f"{end:.4g} s decoded, its header announces {header.seconds or 0:.4g} s"
         else:
-            lacks_frames = frames < 0.99 * header.announced - 2
-            short = lacks_frames and (lacks_time or header.seconds is None)
+            short = frames < 0.99 * header.announced - 2 and (lacks_time or header.seconds is None)
             told = f"{frames} frames decoded, its header announces {header.announced}"
-            if lacks_frames and not short:
+            if frames < header.announced and not short:
                 self._add_note(
                     f"{self.name} shows {frames} of the {header.announced} frames in it: it was cut without encoding "
                     "it anew, holds empty ones where nothing changes, or its index is damaged"
