@@ -6,6 +6,7 @@ import math
 import re
 from collections import defaultdict
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from itertools import pairwise
 from typing import Any
 
@@ -14,6 +15,11 @@ _DECIMALS = re.compile(r"(\d+(?:\.\d+)?)")
 # Before a fraction, or a time of day.
 _NO_COUNTER = re.compile(r"\d\.$|(?:19|20)\d\d[-_.:]?[01]\d[-_.:]?[0-3]\d\D")
 _SECONDS = re.compile(r"\d+\.\d+|\d{10}")
+# A date and a time of day, as cameras and recorders write it, perhaps with a fraction of the second.
+_DATE = re.compile(
+    r"(.*?)(?<!\d)((?:19|20)\d\d)[-_.:]?([01]\d)[-_.:]?([0-3]\d)[-_.T ]?([0-2]\d)[-_.:h]?([0-5]\d)[-_.:m]?([0-5]\d)"
+    r"(?:[.,](\d{1,9})|[-_]?(\d{3}|\d{6}|\d{9}))?Z?"
+)
 # Whole numbers are moments if they lie between 2001 and 2100 in one of these units (per second).
 _EPOCH_UNITS = (1, 10**3, 10**6, 10**9)
 _EPOCH_BEGIN, _EPOCH_END = 10**9, 41 * 10**8
@@ -41,8 +47,9 @@ def time_stamps(stems: Sequence[str]) -> list[float] | None:
     """Seconds, if all names in their order are moments that increase; None otherwise.
 
     Names are moments if they are decimal numbers (`1403636579.763555584`, `0.5`; among them whole seconds since
-    1970), or all whole numbers of seconds, milli-, micro- or nanoseconds since 1970 that lie between 2001 and 2100.
-    Other whole numbers are positions.
+    1970), all whole numbers of seconds, milli-, micro- or nanoseconds since 1970 that lie between 2001 and 2100, or end
+    with date and time of day after the same letters (`PXL_20240501_123001250`, `2024-05-01T12:30:01.25`), which are
+    taken for universal time. Other whole numbers are positions.
     """
     if len(stems) < 2:
         return None
@@ -54,9 +61,22 @@ def time_stamps(stems: Sequence[str]) -> list[float] | None:
         for unit in _EPOCH_UNITS:
             if all(_EPOCH_BEGIN * unit <= number < _EPOCH_END * unit for number in numbers):
                 times = [number / unit for number in numbers]
+    times = times or _dates(stems)
     if times is None or any(after <= before for before, after in pairwise(times)):
         return None
     return times
+
+
+def _dates(stems: Sequence[str]) -> list[float] | None:
+    found = [match for stem in stems if (match := _DATE.fullmatch(stem))]
+    if len(found) < len(stems) or len({match[1] for match in found}) > 1:
+        return None
+    try:
+        moments = [datetime.strptime("".join(match.group(2, 3, 4, 5, 6, 7)), "%Y%m%d%H%M%S") for match in found]
+    except ValueError:  # 31 February
+        return None
+    fractions = [float(f"0.{match[8] or match[9] or 0}") for match in found]
+    return [moment.replace(tzinfo=UTC).timestamp() + f for moment, f in zip(moments, fractions, strict=True)]
 
 
 def missing_numbers(stems: Sequence[str]) -> list[str]:
