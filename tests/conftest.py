@@ -4,6 +4,7 @@ import ctypes
 import gc
 import inspect
 import os
+import resource
 import sys
 import time
 from collections.abc import Iterator
@@ -60,6 +61,8 @@ DEAREST = (
     "evaluation/test_run.py",
 )
 
+# Bytes of a test process at its peak: laptops of 8 GB run two.
+MOST_MEMORY = 2_500_000_000
 SHARED = Path(os.environ.get("LOGVGGT_SHARED", Path(__file__).parents[2] / "shared"))
 
 
@@ -112,13 +115,15 @@ def programs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RootPrograms]
 
 
 @pytest.fixture(autouse=True, scope="module")
-def _programs_go_with_their_file() -> Iterator[None]:
-    """What one file compiled does not weigh on the next: a worker stays below 2.5 GB."""
+def _programs_go_with_their_file(request: pytest.FixtureRequest) -> Iterator[None]:
+    """What one file compiled does not weigh on the next: a worker of the quick suite stays below 2.5 GB."""
     yield
     jax.clear_caches()
     gc.collect()
     if sys.platform == "linux":
         ctypes.CDLL(None).malloc_trim(0)
+        peak = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        assert request.config.option.markexpr != "not slow" or peak < MOST_MEMORY, f"{peak / 1e9:.2f} GB at most so far"
 
 
 @pytest.fixture
