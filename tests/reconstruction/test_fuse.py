@@ -231,7 +231,7 @@ def test_a_folder_without_poses_and_targets_in_the_way(
     with pytest.raises(InputError, match=r"nowhere\.txt: No such file"):
         fuse(disordered, tmp_path / "out", poses=tmp_path / "nowhere.txt")
     with pytest.raises(OutputExists, match="--overwrite"):
-        fuse(disordered, tmp_path / "empty", poses=tmp_path / "empty")
+        fuse(disordered, disordered.folder, poses=tmp_path / "empty")
     with pytest.raises(InputError, match="is the result itself"):
         fuse(disordered, disordered.folder, poses=tmp_path / "empty", overwrite=True)
     with pytest.raises(InputError, match="nothing to fuse"):
