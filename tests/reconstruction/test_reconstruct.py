@@ -357,7 +357,7 @@ def test_bad_arguments_are_named(
         run(output=result.folder)
     with pytest.raises(ValueError, match="contains the source"):
         run(output=room.parent, overwrite=True)
-    with pytest.raises(ValueError, match="num_previews"):
+    with pytest.raises(ValueError, match="previews must not be negative"):
         run(num_previews=-1)
     with pytest.raises(ValueError, match="workers must be at least 1"):
         run(workers=0)
