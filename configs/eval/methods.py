@@ -1,13 +1,13 @@
 """Every method on the same weights, rooms and clock: ATE, depth, frames/s and bytes kept as sequences grow.
 
-    python eval.py --config=configs/eval/methods.py --checkpoint=runs/demo/training/model --output=runs/eval-methods
+    python eval.py --config=configs/eval/methods.py --checkpoint=rooms --output=runs/eval-methods
 
 The report has a table and a panel of figures/by_length.png for each of the four. The network is trained for one method,
 LoG-VGGT's windows as configs/demo.py and configs/tiny.py train it, or whatever the checkpoint was trained for: the
 others show what they make of weights that are not theirs. Some of them:
 
     python eval.py --config=configs/eval/methods.py --config.methods="('windows', 'causal', 'rolling')" \
-        --checkpoint=runs/demo/training/model --output=runs/eval-three-methods
+        --checkpoint=rooms --output=runs/eval-three-methods
 """
 
 from ml_collections import ConfigDict
