@@ -49,20 +49,20 @@ class Format:
       write: the exporter.
       file: name of the file or folder that an export makes.
       marker: a file that every such folder holds; None where a format is one file.
-      library: that it is written with; None for this package's own means.
+      needs: the library that it is written with; None for this package's own means.
     """
 
     write: Exporter
     file: str
     marker: str | None = None
-    library: str | None = None
+    needs: str | None = None
 
 
 EXPORTERS: dict[str, Format] = {
     "colmap": Format(export_colmap, "colmap", "sparse/0/cameras.bin", "pycolmap"),
     "colmap-text": Format(export_colmap_text, "colmap-text", "sparse/0/cameras.txt", "pycolmap"),
     "nerfstudio": Format(export_nerfstudio, "nerfstudio", TRANSFORMS_FILE),
-    "glb": Format(export_glb, "scene.glb", library="trimesh"),
+    "glb": Format(export_glb, "scene.glb", needs="trimesh"),
     "ply": Format(export_ply, "points.ply"),
     "tum": Format(export_tum, "tum.txt"),
     "kitti": Format(export_kitti, "kitti.txt"),
@@ -80,8 +80,8 @@ def check_formats(names: Sequence[str]) -> None:
     for name in names:
         if name not in EXPORTERS:
             raise InputError(f"there is no format {name!r}: choose among {', '.join(EXPORTERS)}")
-        if (needed := EXPORTERS[name].library) is not None:
-            check_library(needed)
+        if (library := EXPORTERS[name].needs) is not None:
+            check_library(library)
 
 
 def export(
