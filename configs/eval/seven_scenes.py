@@ -3,7 +3,7 @@
     python eval.py --config=configs/eval/seven_scenes.py --checkpoint=runs/tiny/model --data_root=7scenes \
         --output=runs/eval-7scenes
 
-The folder holds `<scene>/seq-XX/frame-XXXXXX.{color.png|jpg,depth.png,pose.txt}`. This is a short setting for
+The folder holds `<scene>/seq-NN/frame-NNNNNN.{color.png|jpg,depth.png,pose.txt}`. This is a short setting for
 small models; it is not the paper's protocol.
 """
 

@@ -1,9 +1,9 @@
 """BlendedMVS, BlendedMVS+ and BlendedMVS++, together BlendedMVG (Yao et al., CVPR 2020): photographs of 502 scenes
 blended with renderings of their meshes.
 
-Layout, as the set's README and MVSNet's describe it: `<root>/<PID>/blended_images/XXXXXXXX.jpg`,
-`cams/XXXXXXXX_cam.txt`, `cams/pair.txt`, `rendered_depth_maps/XXXXXXXX.pfm`, where PID is 24 hexadecimal digits; the
-three sets are unpacked into one root. `XXXXXXXX_masked.jpg` are ignored. The lists `BlendedMVG_training.txt` and
+Layout, as the set's README and MVSNet's describe it: `<root>/<PID>/blended_images/NNNNNNNN.jpg`,
+`cams/NNNNNNNN_cam.txt`, `cams/pair.txt`, `rendered_depth_maps/NNNNNNNN.pfm`, where PID is 24 hexadecimal digits; the
+three sets are unpacked into one root. `NNNNNNNN_masked.jpg` are ignored. The lists `BlendedMVG_training.txt` and
 `validation_list.txt` of the set's repository lie in the root or in `<root>/project_lists`.
 
 Extrinsics are world-to-camera with OpenCV axes, depth is z, both in units of the scene. The release does not say where

@@ -1,6 +1,6 @@
 """MVS-Synth (Huang et al., CVPR 2018, "DeepMVS"): 120 sequences of 100 frames from the game GTA V.
 
-Layout, as on the DeepMVS project page: `<root>/GTAV_720/XXXX/{images/XXXX.png, depths/XXXX.exr, poses/XXXX.json}`.
+Layout, as on the DeepMVS project page: `<root>/GTAV_720/NNNN/{images/NNNN.png, depths/NNNN.exr, poses/NNNN.json}`.
 A pose file holds `extrinsic` (4 x 4 rows, world-to-camera, OpenCV camera, left-handed world) and `f_x, f_y, c_x, c_y`
 in pixels. Depth is z in units of about 0.1 m, infinite in the sky. Of the three sizes published, 720 is read: the
 intrinsics stored with GTAV_540 do not fit its pictures.
@@ -38,7 +38,7 @@ class MVSSynth(FolderDataset):
 
     name = "mvs_synth"
     title = "MVS-Synth"
-    expects = "GTAV_720/XXXX with images, depths and poses (unpack GTAV_720.tar.gz)"
+    expects = "GTAV_720/NNNN with images, depths and poses (unpack GTAV_720.tar.gz)"
     metric = False
     splits = ("all",)
     about = About(

@@ -1,6 +1,6 @@
 """PointOdyssey v1.2 (Zheng et al., ICCV 2023): 159 long synthetic videos of moving people, animals and things.
 
-Layout: `<root>/{train,val,test}/<sequence>/` with `rgbs/rgb_XXXXX.jpg`, `depths/depth_XXXXX.png` and `anno.npz`. Of
+Layout: `<root>/{train,val,test}/<sequence>/` with `rgbs/rgb_NNNNN.jpg`, `depths/depth_NNNNN.png` and `anno.npz`. Of
 the latter's arrays `intrinsics` [T, 3, 3] (pixels) and `extrinsics` [T, 4, 4] (world-to-camera, OpenCV, metres) are
 read; the point tracks beside them, a hundred times larger, are not. Depth is 16-bit, 65535 for 1000 m.
 """

@@ -1,7 +1,7 @@
 """7-Scenes (Glocker et al., ISMAR 2013; Shotton et al., CVPR 2013): Kinect sequences of seven rooms.
 
-Layout: `<root>/<scene>/seq-XX/frame-XXXXXX.{color.png|color.jpg, depth.png, pose.txt}`, optionally
-`frame-XXXXXX.depth.proj.png`, and per scene `TrainSplit.txt` and `TestSplit.txt` with lines `sequence1`. Poses are
+Layout: `<root>/<scene>/seq-NN/frame-NNNNNN.{color.png|color.jpg, depth.png, pose.txt}`, optionally
+`frame-NNNNNN.depth.proj.png`, and per scene `TrainSplit.txt` and `TestSplit.txt` with lines `sequence1`. Poses are
 camera-to-world in metres, OpenCV axes, of the depth camera. Colour and raw depth come from two cameras that the
 set does not register: depth has focal length 585, colour 525, and lies 25 mm to the side.
 """
@@ -45,7 +45,7 @@ class SevenScenes(FolderDataset):
 
     name = "seven_scenes"
     title = "7-Scenes"
-    expects = "<scene>/seq-XX or seq-XX with frame-XXXXXX.color.png (unpack the sequences' zip files)"
+    expects = "<scene>/seq-NN or seq-NN with frame-NNNNNN.color.png (unpack the sequences' zip files)"
     metric = True
     plausible_depth = INDOORS
     splits = ("train", "test", "all")

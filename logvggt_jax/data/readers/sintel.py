@@ -1,7 +1,7 @@
 """MPI Sintel (Butler et al., ECCV 2012) with its depth and camera ground truth: 23 training sequences of a film.
 
 Layout, the archives of pictures and of depth unpacked into one folder: `<root>/training/final/<sequence>/
-frame_XXXX.png`, `training/depth/<sequence>/frame_XXXX.dpt`, `training/camdata_left/<sequence>/frame_XXXX.cam`, numbered
+frame_NNNN.png`, `training/depth/<sequence>/frame_NNNN.dpt`, `training/camdata_left/<sequence>/frame_NNNN.cam`, numbered
 from 1. All binary values are little-endian. A `.dpt` file is the float32 tag 202021.25, int32 width and height, and
 float32 z-depth row by row. A `.cam` file is the same tag, nine float64 of the intrinsic matrix and twelve of the 3 x 4
 world-to-camera matrix, OpenCV axes, rows first.

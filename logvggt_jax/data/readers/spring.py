@@ -1,6 +1,6 @@
 """Spring (Mehl et al., CVPR 2023): 37 training sequences, 5,000 frames, of a Blender film in stereo.
 
-Layout: `<root>/train/XXXX/` with `frame_left/frame_left_XXXX.png`, numbered from 1, `disp1_left/disp1_left_XXXX.dsp5`
+Layout: `<root>/train/NNNN/` with `frame_left/frame_left_NNNN.png`, numbered from 1, `disp1_left/disp1_left_NNNN.dsp5`
 and `cam_data/{intrinsics.txt, extrinsics.txt}`. A `.dsp5` file is HDF5 with the array `disparity` at twice the
 picture's width and height, in pixels of the picture. The text files have a row for each frame: `fx fy cx cy` in
 pixels, and sixteen numbers of the world-to-camera matrix of the left camera, rows first, OpenCV axes, metres.
@@ -36,7 +36,7 @@ class Spring(FolderDataset):
 
     name = "spring"
     title = "Spring"
-    expects = "train/XXXX with frame_left, disp1_left and cam_data (unpack these three archives into one folder)"
+    expects = "train/NNNN with frame_left, disp1_left and cam_data (unpack these three archives into one folder)"
     metric = True
     splits = ("train", "all")
     about = About(

@@ -1,7 +1,7 @@
 """Virtual KITTI 2 (Cabon et al., 2020), version 2.0.3: five synthetic drives, ten variations, two cameras.
 
-Layout, the archives of pictures, depth and text ground truth unpacked into one folder: `<root>/SceneXX/<variation>/`
-with `frames/rgb/Camera_N/rgb_XXXXX.jpg`, `frames/depth/Camera_N/depth_XXXXX.png`, `intrinsic.txt` and `extrinsic.txt`.
+Layout, the archives of pictures, depth and text ground truth unpacked into one folder: `<root>/SceneNN/<variation>/`
+with `frames/rgb/Camera_N/rgb_NNNNN.jpg`, `frames/depth/Camera_N/depth_NNNNN.png`, `intrinsic.txt` and `extrinsic.txt`.
 After a header line, `intrinsic.txt` has rows `frame camera fx fy cx cy` (pixels) and `extrinsic.txt` rows `frame
 camera` and sixteen numbers of the world-to-camera matrix, rows first, OpenCV axes, metres; both cameras' rows are
 interleaved. Depth is 16-bit z in centimetres, 65535 in the sky and beyond 655.35 m.
@@ -37,7 +37,7 @@ class VirtualKITTI(FolderDataset):
 
     name = "virtual_kitti"
     title = "Virtual KITTI 2"
-    expects = "SceneXX/<variation>/frames with rgb and depth (unpack rgb, depth and textgt into one folder)"
+    expects = "SceneNN/<variation>/frames with rgb and depth (unpack rgb, depth and textgt into one folder)"
     metric = True
     splits = ("train", "test", "all")
     about = About(

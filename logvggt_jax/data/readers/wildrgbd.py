@@ -1,6 +1,6 @@
 """WildRGB-D (Xia et al., CVPR 2024): phone videos with depth around objects of 46 categories.
 
-Layout, as in the set's zip files: `<root>/<category>/scenes/scene_XXX/{rgb,depth,masks}/XXXXX.png`, beside them
+Layout, as in the set's zip files: `<root>/<category>/scenes/scene_NNN/{rgb,depth,masks}/NNNNN.png`, beside them
 `metadata` (JSON with the picture's width `w` and height `h` and the nine intrinsics `K`, column by column) and
 `cam_poses.txt` (a line a frame: its number and 16 numbers, camera-to-world row by row, OpenCV axes, metres); per
 category the lists `nvs_list.json` and `camera_eval_list.json`. (The set's README writes `scenes_<id>`; its files have
@@ -42,7 +42,7 @@ class WildRGBD(FolderDataset):
 
     name = "wildrgbd"
     title = "WildRGB-D"
-    expects = "<category>/scenes/scene_XXX/rgb (unpack the categories' zip files)"
+    expects = "<category>/scenes/scene_NNN/rgb (unpack the categories' zip files)"
     metric = True
     plausible_depth = INDOORS
     splits = ("train", "test", "all")
