@@ -16,7 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from logvggt_jax.data.dataset import Dataset, check_indices, check_sequence
 from logvggt_jax.data.rooms.same_rooms import SameRooms
 from logvggt_jax.errors import InputError, OutputExists
-from logvggt_jax.files import atomic_folder
+from logvggt_jax.files import atomic_folder, check_space
 from logvggt_jax.frames import Frames
 
 _ARRAYS = ("images", "depth", "intrinsics", "extrinsics")
@@ -70,26 +70,30 @@ def render_pool(
         when complete. None keeps the pool in memory.
       workers: rendering processes, default one a core; 1 renders in this process, as small pools do anyway.
         Worker processes import the main script: guard it with `if __name__ == "__main__"`.
-      max_bytes: refuse larger pools.
+      max_bytes: the largest pool that is kept in memory.
       progress: show a progress bar.
 
     Raises:
-      InputError: the pool is larger than `max_bytes`, or the cache is damaged.
+      InputError: the pool in memory is larger than `max_bytes`, or the cache is damaged.
+      DiskError: the folder's disk has no room for it.
     """
     shapes = _shapes(rooms)
     size = sum(int(np.prod(shape)) * dtype.itemsize for shape, dtype in shapes.values())
-    if size > max_bytes:
-        raise InputError(
-            f"a pool of {len(rooms.sequences)} rooms takes {size:,} bytes, more than max_bytes={max_bytes:,}: "
-            "use fewer rooms, fewer frames or smaller images, or raise max_bytes"
-        )
     if cache_dir is None:
+        if size > max_bytes:
+            raise InputError(
+                f"{len(rooms.sequences)} rooms take {size / 1e9:.1f} GB of memory, more than the "
+                f"{max_bytes / 1e9:.1f} GB that are kept there: give data.cache_dir a folder to keep them on "
+                "disk, lower the source's num_rooms, num_frames, height or width, or let the device draw them "
+                '(renderer="device")'
+            )
         arrays = {name: np.empty(shape, dtype) for name, (shape, dtype) in shapes.items()}
         _render_into(arrays, rooms, workers, progress)
         return RoomPool(rooms, arrays, None)
 
     folder = Path(cache_dir).absolute() / f"rooms-{_digest(rooms)}"
     if not folder.exists():
+        check_space(folder, size, "make room, give data.cache_dir another folder or draw fewer rooms")
         # Another process may finish the same pool meanwhile; its bytes are the same.
         with contextlib.suppress(OutputExists), atomic_folder(folder) as unfinished:
             maps: dict[str, np.ndarray] = {

@@ -1,7 +1,9 @@
 """The pool holds what `Rooms` renders, is opened rather than rendered again, and is never left half-written."""
 
 import pickle
+import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ import pytest
 from logvggt_jax.data.rooms import pool as room_pool
 from logvggt_jax.data.rooms.pool import render_pool
 from logvggt_jax.data.rooms.rooms import Rooms
+from logvggt_jax.errors import DiskError, InputError
 
 ROOMS = Rooms("val", height=28, width=42, num_frames=5, num_rooms=3)
 
@@ -73,8 +76,16 @@ def test_a_damaged_cache_is_named(tmp_path: Path):
 
 
 def test_a_pool_too_large_for_memory_is_refused():
-    with pytest.raises(ValueError, match="max_bytes"):
+    with pytest.raises(InputError, match=r"more than the 8\.6 GB .* data\.cache_dir .* num_rooms"):
         render_pool(Rooms("train", num_frames=1000))
+
+
+def test_a_pool_on_disk_is_bounded_by_its_free_space_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    assert_same_frames(render_pool(ROOMS, cache_dir=tmp_path / "pools", max_bytes=1, progress=False), ROOMS)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=10))
+    with pytest.raises(DiskError, match=r"needs about .* give data\.cache_dir another folder"):
+        render_pool(ROOMS, cache_dir=tmp_path / "full", progress=False)
+    assert not (tmp_path / "full").exists()
 
 
 def test_worker_processes_render_the_same(monkeypatch: pytest.MonkeyPatch):
