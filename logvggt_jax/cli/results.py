@@ -95,9 +95,10 @@ def add_to(commands: Any) -> None:
         "logvggt export runs/walk --format colmap --format glb --output scenes/walk",
         details=" Every format becomes a file or folder of its own in the output: colmap/ and colmap-text/ (pictures, "
         "model and cloud with tracks, as 3D Gaussian splatting starts from), nerfstudio/ (transforms.json), scene.glb, "
-        "points.ply, the camera's path as tum.txt, kitti.txt and euroc.csv, depth at the size of the original images "
-        "as depth-png/ (16 bits and a scale), depth-exr/ and depth-npz/, and rosbag2/. Pictures are read from the "
-        "source once more; where it is gone or has changed, those that the result keeps are taken, and that is said.",
+        "points.ply, splats.ply (a Gaussian for each point, for SuperSplat), the camera's path as tum.txt, kitti.txt "
+        "and euroc.csv, depth at the size of the original images as depth-png/ (16 bits and a scale), depth-exr/ and "
+        "depth-npz/, and rosbag2/. Pictures are read from the source once more; where it is gone or has changed, "
+        "those that the result keeps are taken, and that is said.",
     )
     _result_argument(sub)
     sub.add_argument(

@@ -23,7 +23,7 @@ from logvggt_jax.geometry import camera_centres, invert, project, unproject_pixe
 from logvggt_jax.reconstruction import EXPORTERS, PointFilter, Reconstruction, export
 from logvggt_jax.reconstruction.exporters.frame_names import file_stems
 from logvggt_jax.reconstruction.exporters.original_depth import depth_at
-from logvggt_jax.reconstruction.points.cloud_file import read_points
+from logvggt_jax.reconstruction.points.cloud_file import read_cloud, read_points
 
 COUNT = 6
 FEW_POINTS = PointFilter(max_points=600)
@@ -142,7 +142,7 @@ def test_frames_of_one_calibration_share_a_camera(tmp_path: Path) -> None:
     assert model.image(1).camera_id == model.image(3).camera_id != model.image(2).camera_id
 
 
-# nerfstudio, GLB, PLY
+# nerfstudio, GLB, PLY, splats
 
 
 def test_transforms_json_has_the_cameras_in_opengls_axes(result: Reconstruction, exports: Path) -> None:
@@ -162,6 +162,35 @@ def test_transforms_json_has_the_cameras_in_opengls_axes(result: Reconstruction,
         assert (frame["h"], frame["w"]) == (picture.height, picture.width) == result.image_size
     points, colours = read_points(folder / document["ply_file_path"])
     assert len(points) == 600 and colours.std() > 10
+
+
+def splats_of(path: Path) -> np.ndarray:
+    trimesh = pytest.importorskip("trimesh", reason="extra `formats` is not installed")
+    return trimesh.load(path).metadata["_ply_raw"]["vertex"]["data"]
+
+
+def test_splats_are_as_wide_as_their_neighbours_are_far(result: Reconstruction, exports: Path) -> None:
+    splats, cloud = splats_of(exports / "splats.ply"), read_cloud(exports / "points.ply")
+    np.testing.assert_array_equal(np.stack([splats[axis] for axis in "xyz"], axis=-1), cloud.points)
+    # A harmonic of degree 0 has one value everywhere, 1 / sqrt(4 pi).
+    shown = 0.5 + np.stack([splats[f"f_dc_{channel}"] for channel in range(3)], axis=-1) / np.sqrt(4 * np.pi)
+    np.testing.assert_allclose(shown * 255, cloud.colours, atol=1e-3)
+    np.testing.assert_allclose(1 / (1 + np.exp(-splats["opacity"])), 0.95, atol=1e-6)
+    np.testing.assert_array_equal([splats[f"rot_{part}"][0] for part in range(4)], [1, 0, 0, 0])
+    distances = np.sort(np.linalg.norm(cloud.points[:, None] - cloud.points[None], axis=-1), axis=1)
+    near = np.sqrt(np.mean(distances[:, 1:4] ** 2, axis=1))
+    frame = cloud.frame
+    z = np.einsum("ni,ni->n", result.extrinsics[frame, 2, :3], cloud.points) + result.extrinsics[frame, 2, 3]
+    # Between the pixels that a frame of 42 x 56 hands out, at their depth.
+    gap = z / result.depth_intrinsics[frame, 0, 0] * np.sqrt(42 * 56 / np.bincount(frame)[frame])
+    for axis in range(3):
+        np.testing.assert_allclose(np.exp(splats[f"scale_{axis}"]), np.clip(near / 2, gap / 10, gap), rtol=1e-4)
+
+
+def test_splats_of_two_points_have_a_width(result: Reconstruction, tmp_path: Path) -> None:
+    (path,) = export(result, ["splats"], tmp_path, point_filter=PointFilter(max_points=2), progress=False)
+    widths = np.exp(splats_of(path)["scale_0"])
+    assert len(widths) == 2 and np.isfinite(widths).all() and (widths > 0).all()
 
 
 def test_trimesh_reads_points_and_frusta_of_the_scene(result: Reconstruction, exports: Path) -> None:

@@ -27,6 +27,7 @@ from logvggt_jax.reconstruction.exporters.nerfstudio import export_nerfstudio
 from logvggt_jax.reconstruction.exporters.original_depth import DEPTH_INDEX
 from logvggt_jax.reconstruction.exporters.ply import export_ply
 from logvggt_jax.reconstruction.exporters.rosbag import export_rosbag
+from logvggt_jax.reconstruction.exporters.splats import export_splats
 from logvggt_jax.reconstruction.exporters.tum import export_tum
 from logvggt_jax.reconstruction.points.point_filter import PointFilter
 from logvggt_jax.reconstruction.result import EXPORT_FOLDER, Reconstruction
@@ -64,6 +65,7 @@ EXPORTERS: dict[str, Format] = {
     "nerfstudio": Format(export_nerfstudio, "nerfstudio", TRANSFORMS_FILE),
     "glb": Format(export_glb, "scene.glb", needs="trimesh"),
     "ply": Format(export_ply, "points.ply"),
+    "splats": Format(export_splats, "splats.ply"),
     "tum": Format(export_tum, "tum.txt"),
     "kitti": Format(export_kitti, "kitti.txt"),
     "euroc": Format(export_euroc, "euroc.csv"),

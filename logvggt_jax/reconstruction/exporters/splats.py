@@ -1,0 +1,79 @@
+"""Gaussian splats as SuperSplat and other viewers and trainers of splats open them, one for each point of the cloud."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from logvggt_jax.files import atomic_file
+from logvggt_jax.geometry import project
+from logvggt_jax.reconstruction.exporters.cloud import frame_cloud, select_points
+from logvggt_jax.reconstruction.frame_pool import FramePool
+from logvggt_jax.reconstruction.points.point_filter import PointFilter
+from logvggt_jax.reconstruction.result import Reconstruction
+
+_NUM_SPLATS = 500_000
+_OPACITY = 0.95
+# The spherical harmonic of degree 0.
+_HARMONIC = 0.28209479177387814
+_NEIGHBOURS = 3
+_PROPERTIES = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *(f"scale_{i}" for i in range(3)))
+_ROTATION = tuple(f"rot_{i}" for i in range(4))
+
+
+def export_splats(
+    result: Reconstruction, path: Path, *, point_filter: PointFilter | None = None, progress: bool = True
+) -> None:
+    """Writes a ball at each point: its colour from everywhere, nearly opaque, as wide as its neighbours are far.
+
+    The file has the layout of trained splats without view-dependent colours: logarithms of standard deviations in the
+    world's units, logits of opacity, quaternions (w, x, y, z), harmonics of degree 0. Nothing has been trained: it is
+    what training would start from. Axes are the result's own, y down, which viewers of splats expect.
+
+    Args:
+      result: the reconstruction.
+      path: the PLY file.
+      point_filter: which pixels become points; None for 500,000 points.
+      progress: show a progress bar.
+    """
+    with FramePool() as pool:
+        chosen = point_filter or PointFilter(max_points=_NUM_SPLATS)
+        selection = select_points(result, chosen, pool, progress=progress)
+        clouds = list(pool.map(lambda index: frame_cloud(result, selection, index), iter(range(result.num_frames))))
+    widths = _widths(result, clouds)
+    vertices = np.concatenate(clouds)
+    splats = np.zeros(len(vertices), [(name, "<f4") for name in (*_PROPERTIES, *_ROTATION)])
+    for axis in "xyz":
+        splats[axis] = vertices[axis]
+    for channel, name in enumerate(("red", "green", "blue")):
+        splats[f"f_dc_{channel}"] = (vertices[name] / 255 - 0.5) / _HARMONIC
+    splats["opacity"] = np.log(_OPACITY / (1 - _OPACITY))
+    for axis in range(3):
+        splats[f"scale_{axis}"] = np.log(widths)
+    splats["rot_0"] = 1.0
+    properties = "".join(f"property float {name}\n" for name in splats.dtype.names or ())
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(splats)}\n{properties}end_header\n"
+    with atomic_file(path) as temporary, temporary.open("wb") as stream:
+        stream.write(header.encode())
+        stream.write(splats.data)
+
+
+def _widths(result: Reconstruction, clouds: list[np.ndarray]) -> np.ndarray:
+    """Standard deviations [n]: half of the root mean square distance to the nearest neighbours.
+
+    What stands alone is no wider than the gap between the chosen pixels of its own frame, and what lies upon another
+    point no narrower than a tenth of that.
+    """
+    height, width = result.depth_size
+    gaps = []
+    for index, cloud in enumerate(clouds):
+        points = np.stack([cloud[axis] for axis in "xyz"], axis=-1)
+        _, depth = project(points, result.depth_intrinsics[index], result.extrinsics[index])
+        pixels = np.sqrt(height * width / max(len(cloud), 1))
+        gaps.append(pixels * depth / result.depth_intrinsics[index, 0, 0])
+    most = np.concatenate(gaps)
+    points = np.concatenate([np.stack([cloud[axis] for axis in "xyz"], axis=-1) for cloud in clouds])
+    distances, _ = KDTree(points).query(points, _NEIGHBOURS + 1, workers=-1)
+    return np.clip(np.sqrt(np.mean(distances[:, 1:] ** 2, axis=1)) / 2, most / 10, most)
