@@ -19,8 +19,9 @@ _OPACITY = 0.95
 # The spherical harmonic of degree 0.
 _HARMONIC = 0.28209479177387814
 _NEIGHBOURS = 3
-_PROPERTIES = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *(f"scale_{i}" for i in range(3)))
-_ROTATION = tuple(f"rot_{i}" for i in range(4))
+_SCALES = ("scale_0", "scale_1", "scale_2")
+_ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
+_PROPERTIES = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *_SCALES, *_ROTATION)
 
 
 def export_splats(
@@ -44,16 +45,16 @@ def export_splats(
         clouds = list(pool.map(lambda index: frame_cloud(result, selection, index), iter(range(result.num_frames))))
     widths = _widths(result, clouds)
     vertices = np.concatenate(clouds)
-    splats = np.zeros(len(vertices), [(name, "<f4") for name in (*_PROPERTIES, *_ROTATION)])
+    splats = np.zeros(len(vertices), [(name, "<f4") for name in _PROPERTIES])
     for axis in "xyz":
         splats[axis] = vertices[axis]
     for channel, name in enumerate(("red", "green", "blue")):
         splats[f"f_dc_{channel}"] = (vertices[name] / 255 - 0.5) / _HARMONIC
     splats["opacity"] = np.log(_OPACITY / (1 - _OPACITY))
-    for axis in range(3):
-        splats[f"scale_{axis}"] = np.log(widths)
-    splats["rot_0"] = 1.0
-    properties = "".join(f"property float {name}\n" for name in splats.dtype.names or ())
+    for name in _SCALES:
+        splats[name] = np.log(widths)
+    splats[_ROTATION[0]] = 1.0
+    properties = "".join(f"property float {name}\n" for name in _PROPERTIES)
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(splats)}\n{properties}end_header\n"
     with atomic_file(path) as temporary, temporary.open("wb") as stream:
         stream.write(header.encode())
