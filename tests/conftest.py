@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import jax
-import numpy as np
 import pytest
 from absl import flags
 
@@ -26,7 +25,7 @@ jax.config.update("jax_num_cpu_devices", 16)
 from root_programs import RootPrograms, loaded  # noqa: E402
 
 from logvggt_jax import LogVGGT, ModelConfig  # noqa: E402
-from logvggt_jax.doctor.subject import tiny_config  # noqa: E402
+from logvggt_jax.doctor.subject import random_variables, tiny_config  # noqa: E402
 
 # Tracing makes many objects and little garbage: by default the collector takes an eighth of a tracer's time.
 gc.set_threshold(100_000, 50, 100)
@@ -183,10 +182,5 @@ def small_config() -> ModelConfig:
 
 @pytest.fixture(scope="session")
 def small_variables(small_config: ModelConfig) -> dict:
-    """Parameters of the small model, all of them moved off their initial value: no gate is zero."""
-    images = np.zeros((1, 1, 28, 42, 3), np.float32)
-    variables = LogVGGT(small_config).init(jax.random.key(0), images)
-    generator = np.random.default_rng(0)
-    return jax.tree.map(
-        lambda x: x + 0.1 * generator.standard_normal(x.shape).astype(np.float32), jax.device_get(variables)
-    )
+    """Parameters of the small model, all of them off their initial value: no gate is zero."""
+    return random_variables(LogVGGT(small_config), scale=0.2)

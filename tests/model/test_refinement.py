@@ -66,8 +66,10 @@ def test_zero_output_projection_is_the_identity(small_config, small_variables):
 
 def test_fresh_parameters_leave_camera_tokens_alone(small_config):
     model = LogVGGT(small_config)
-    variables = model.init(jax.random.key(3), np.zeros((1, 1, 28, 42, 3), np.float32))
+    images = np.zeros((1, 1, 28, 42, 3), np.float32)
+    fresh = jax.jit(lambda: model.init(jax.random.key(3), images)["params"]["gccr"])()
     camera, register = tokens()
+    variables = {"params": {"gccr": fresh}}
     np.testing.assert_array_equal(model.refinement.refine_tokens(variables, camera, register, full()), camera)
 
 
