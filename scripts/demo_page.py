@@ -47,6 +47,8 @@ def write_page(folder: Path) -> Path:
             f"{result.folder}: {result.num_frames} frames of {result.depth_size}, the room has {len(room.images)} of "
             f"{room.depth.shape[1:]}; reconstruct {folder / 'room'} at its own size"
         )
+    # Pictures take seconds: what is missing is told before they are drawn.
+    measured, trained = _evaluation(folder / "evaluation"), _training(folder / "training", folder / "figures")
     parts = [
         page.paragraph(
             "LoG-VGGT saw the frames of a walk through a room, nothing else, and gave a depth map and a camera pose "
@@ -54,8 +56,8 @@ def write_page(folder: Path) -> Path:
             "The model is the one that ships with the package under the name rooms."
         ),
         *_room_pictures(room, result, folder / "figures"),
-        *_evaluation(folder / "evaluation"),
-        *_training(folder / "training", folder / "figures"),
+        *measured,
+        *trained,
         page.heading("Walk through it"),
         page.paragraph("The same point cloud and cameras in a viewer, in the browser, until Ctrl-C:"),
         page.command(f".venv/bin/logvggt view {result.folder}"),

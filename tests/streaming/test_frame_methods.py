@@ -146,7 +146,7 @@ def test_four_bits_are_another_model_from_the_second_frame_on(
         ("anchored-window", AnchoredWindowSettings(window=2)),
         ("rolling", SMALL_BUDGET),
         ("pruned", PrunedSettings(SMALL_CAP, 16)),
-        ("pruned", PrunedSettings(SMALL_CAP, camera_cache="single")),
+        pytest.param("pruned", PrunedSettings(SMALL_CAP, camera_cache="single"), marks=pytest.mark.slow),
     ],
 )
 def test_no_output_depends_on_a_later_frame(
@@ -337,9 +337,9 @@ def test_a_cap_below_a_frame(small_config: ModelConfig, small_variables: dict) -
 @pytest.mark.parametrize(
     ("method", "settings"),
     [
-        ("causal", CausalSettings(first_capacity=2)),
+        pytest.param("causal", CausalSettings(first_capacity=2), marks=pytest.mark.slow),
         ("rolling", RollingSettings(budget=2 * LAYERS * (5 + 1 * 2))),
-        ("pruned", PrunedSettings(cap=16)),
+        pytest.param("pruned", PrunedSettings(cap=16), marks=pytest.mark.slow),
     ],
 )
 def test_sequences_of_a_batch_do_not_meet(

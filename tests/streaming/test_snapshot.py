@@ -49,6 +49,8 @@ CASES = {
 }
 # A method of which nothing else is to be shown goes on with its own defaults.
 CASES |= {name: (name, None, RefinementConfig()) for name in METHODS.keys() - {method for method, *_ in CASES.values()}}
+# Sessions and states that other cases have as well.
+MORE = ("merged", "causal with one camera cache", "pruned in 16 bits")
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +67,7 @@ def _through_a_file(arrays: dict[str, np.ndarray], file: Path) -> dict[str, np.n
     return load_file(file)
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", [pytest.param(name, marks=[pytest.mark.slow] * (name in MORE)) for name in CASES])
 def test_a_stream_goes_on_from_a_snapshot(
     case: str, small_config: ModelConfig, small_variables: dict, frames: np.ndarray, tmp_path: Path
 ) -> None:
