@@ -32,7 +32,7 @@ def test_a_step_that_does_not_end_ends_the_process_with_its_stacks() -> None:
 def test_a_validation_may_take_longer_than_a_step_but_not_for_ever() -> None:
     waiting = "with watched.other('the validation'): time.sleep(2)"
     assert run(waiting).stdout == "the end\n"
-    finished = run(waiting, other=0.2)
+    finished = run(waiting, other=1.0)
     assert finished.returncode == 1 and "the validation has not ended" in finished.stderr
 
 
