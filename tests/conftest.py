@@ -183,4 +183,4 @@ def small_config() -> ModelConfig:
 @pytest.fixture(scope="session")
 def small_variables(small_config: ModelConfig) -> dict:
     """Parameters of the small model, all of them off their initial value: no gate is zero."""
-    return random_variables(LogVGGT(small_config), scale=0.2)
+    return random_variables(LogVGGT(small_config), scale=0.1)

@@ -75,7 +75,7 @@ def test_every_part_finds_a_cpu_sound(part: str, monkeypatch: pytest.MonkeyPatch
     assert wanted[part] <= names
 
 
-@pytest.mark.parametrize(("method", "rates"), [("rolling", 2), ("chunks", 1)])
+@pytest.mark.parametrize(("method", "rates"), [("rolling", 2), pytest.param("chunks", 1, marks=pytest.mark.slow)])
 def test_a_method_is_timed_and_on_a_cpu_compared_with_nothing(method: str, rates: int) -> None:
     findings = list(examination.part_findings(method, tiny=True, quick=True))
     assert {finding.part for finding in findings} == {method}

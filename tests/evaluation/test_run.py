@@ -73,16 +73,10 @@ def test_what_cannot_be_used_is_named_before_anything_is_written(
     assert "\n" not in str(raised.value) and not (tmp_path / "out").exists()
 
 
-def test_images_are_of_the_size_that_the_model_was_trained_at(
+def test_a_model_that_does_not_say_its_size_asks_for_one(
     small_config: ModelConfig, small_variables: dict[str, Any], tmp_path: Path
 ) -> None:
-    clips = {"clip_lengths": (2,), "max_points": 100, "figures": 0}
-    changes: dict[str, Any] = {f"evaluation.{name}": value for name, value in clips.items()}
-    changes |= {"options.num_rooms": 1, "methods": ("windows",), "baselines": False}
-    values = configuration("rooms", changes)
-    save_model(tmp_path / "model", small_config, small_variables["params"], Provenance("windows", 42))
-    results = run_evaluation(values, tmp_path / "model", tmp_path / "out", command="command")
-    assert results["benchmarks"][0]["images"].startswith("42 x 28 pixels")
+    values = configuration("rooms", {"options.num_rooms": 1, "methods": ("windows",)})
     save_model(tmp_path / "model", small_config, small_variables["params"])
     with pytest.raises(InputError, match=r"does not say at which image size .*--config\.evaluation\.image_size"):
         run_evaluation(values, tmp_path / "model", tmp_path / "other", command="command")
@@ -91,14 +85,15 @@ def test_images_are_of_the_size_that_the_model_was_trained_at(
 def test_the_model_and_all_baselines_make_a_table(
     small_config: ModelConfig, small_variables: dict[str, Any], tmp_path: Path
 ) -> None:
-    save_model(tmp_path / "model", small_config, small_variables["params"])
-    clips = {"image_size": (28, 42), "clip_lengths": (4,), "max_points": 800, "figures": 1}
+    save_model(tmp_path / "model", small_config, small_variables["params"], Provenance("windows", 42))
+    clips = {"clip_lengths": (4,), "max_points": 800, "figures": 1}
     changes = {f"evaluation.{name}": value for name, value in clips.items()}
     changes |= {"options.num_rooms": 1, "methods": ("windows",)}
     values, output = configuration("rooms", changes), tmp_path / "out"
     results = run_evaluation(values, tmp_path / "model", output, command="command")
     assert json.loads((output / "results.json").read_text()) == results
     assert not results["skipped"] and not results["failures"]
+    assert results["benchmarks"][0]["images"].startswith("42 x 28 pixels"), "as the model was trained at"
     names = ["LoG-VGGT", "constant depth", "mean depth map", "static camera", "untrained network"]
     assert [method["name"] for method in results["methods"]] == names
     assert [entry["method"] for entry in results["summary"]] == names
