@@ -3,6 +3,7 @@
 import ctypes
 import gc
 import inspect
+import math
 import os
 import resource
 import sys
@@ -11,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import jax
+import numpy as np
 import pytest
 from absl import flags
 
@@ -24,8 +26,9 @@ jax.config.update("jax_num_cpu_devices", 16)
 
 from root_programs import RootPrograms, loaded  # noqa: E402
 
-from logvggt_jax import LogVGGT, ModelConfig  # noqa: E402
-from logvggt_jax.doctor.subject import random_variables, tiny_config  # noqa: E402
+from logvggt_jax import ModelConfig  # noqa: E402
+from logvggt_jax.doctor.subject import tiny_config  # noqa: E402
+from logvggt_jax.model.logvggt import variable_shapes  # noqa: E402
 
 # Tracing makes many objects and little garbage: by default the collector takes an eighth of a tracer's time.
 gc.set_threshold(100_000, 50, 100)
@@ -182,5 +185,16 @@ def small_config() -> ModelConfig:
 
 @pytest.fixture(scope="session")
 def small_variables(small_config: ModelConfig) -> dict:
-    """Parameters of the small model, all of them off their initial value: no gate is zero."""
-    return random_variables(LogVGGT(small_config), scale=0.1)
+    """Parameters of the small model as `init` spreads them, all of them moved off their initial value: no gate is zero.
+
+    `init` itself would compile some 270 programs in each process.
+    """
+    generator = np.random.default_rng(0)
+    gains = {"scale": 1.0, "gamma": 0.5}
+
+    def drawn(path: tuple, leaf: jax.ShapeDtypeStruct) -> np.ndarray:
+        name, inputs = path[-1].key, math.prod(leaf.shape[:-1])
+        spread = inputs**-0.5 if name == "kernel" else 0.0
+        return np.float32(gains.get(name, 0.0) + math.hypot(spread, 0.1) * generator.standard_normal(leaf.shape))
+
+    return jax.tree_util.tree_map_with_path(drawn, variable_shapes(small_config))
