@@ -164,10 +164,10 @@ def test_bfloat16_stays_close_to_float32(small_config, small_variables):
     # Depths of ordinary size: of exponentials up to a million, one pixel would make up the whole norm.
     variables = jax.tree.map(np.asarray, small_variables)
     output = variables["params"]["depth_head"]["output_2"]
-    variables["params"]["depth_head"]["output_2"] = jax.tree.map(lambda x: 0.5 * x, output)
+    variables["params"]["depth_head"]["output_2"] = jax.tree.map(lambda x: 0.3 * x, output)
     expected = applied(model.config)(variables, video())
     actual = applied(half.config)(variables, video())
-    assert 1.5 < np.asarray(expected.depth).max() < 100
+    assert 1.2 < np.asarray(expected.depth).max() < 100
     for name in ("camera_tokens", "register_tokens", "depth", "depth_confidence", "pose_encodings"):
         a, b = np.asarray(getattr(actual, name)), np.asarray(getattr(expected, name))
         assert a.dtype == np.float32
