@@ -213,7 +213,7 @@ def at_constant_rate(run_config: TrainConfig, pixel_model: Any, pixel_params: An
     return workdir
 
 
-@pytest.mark.parametrize("added", [pytest.param(True, marks=pytest.mark.slow), False])
+@pytest.mark.parametrize("added", [True, False])
 def test_a_finished_run_that_is_to_go_further_trains_the_new_steps_and_no_others(
     run_config: TrainConfig, at_constant_rate: Path, tmp_path: Path, added: bool
 ) -> None:
