@@ -3,7 +3,6 @@
 import ctypes
 import gc
 import inspect
-import math
 import os
 import resource
 import sys
@@ -26,9 +25,8 @@ jax.config.update("jax_num_cpu_devices", 16)
 
 from root_programs import RootPrograms, loaded  # noqa: E402
 
-from logvggt_jax import ModelConfig  # noqa: E402
+from logvggt_jax import LogVGGT, ModelConfig  # noqa: E402
 from logvggt_jax.doctor.subject import tiny_config  # noqa: E402
-from logvggt_jax.model.logvggt import variable_shapes  # noqa: E402
 
 # Tracing makes many objects and little garbage: by default the collector takes an eighth of a tracer's time.
 gc.set_threshold(100_000, 50, 100)
@@ -185,16 +183,10 @@ def small_config() -> ModelConfig:
 
 @pytest.fixture(scope="session")
 def small_variables(small_config: ModelConfig) -> dict:
-    """Parameters of the small model as `init` spreads them, all of them moved off their initial value: no gate is zero.
-
-    `init` itself would compile some 270 programs in each process.
-    """
+    """Parameters of the small model, all of them moved off their initial value: no gate is zero."""
+    images = np.zeros((1, 1, 28, 42, 3), np.float32)
+    variables = LogVGGT(small_config).init(jax.random.key(0), images)
     generator = np.random.default_rng(0)
-    gains = {"scale": 1.0, "gamma": 0.5}
-
-    def drawn(path: tuple, leaf: jax.ShapeDtypeStruct) -> np.ndarray:
-        name, inputs = path[-1].key, math.prod(leaf.shape[:-1])
-        spread = inputs**-0.5 if name == "kernel" else 0.0
-        return np.float32(gains.get(name, 0.0) + math.hypot(spread, 0.1) * generator.standard_normal(leaf.shape))
-
-    return jax.tree_util.tree_map_with_path(drawn, variable_shapes(small_config))
+    return jax.tree.map(
+        lambda x: x + 0.1 * generator.standard_normal(x.shape).astype(np.float32), jax.device_get(variables)
+    )

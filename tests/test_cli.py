@@ -181,9 +181,9 @@ def test_public_weights_run_in_chunks_unless_told_otherwise(
     printed = capsys.readouterr()
     assert "warning" not in printed.err
     assert "loops closed: 0" in printed.out
-    assert main([*arguments, "--method", "windows", "--overwrite", "--dry-run"]) == 0
+    assert main([*arguments, "--method", "windows", "--overwrite"]) == 0
     assert "logvggt: warning: these weights are public VGGT's, which never learned" in capsys.readouterr().err
-    assert main([*arguments, "--method", "rolling", "--overwrite", "--dry-run"]) == 0
+    assert main([*arguments, "--method", "rolling", "--overwrite"]) == 0
     assert "rolling shows a frame earlier ones alone" in capsys.readouterr().err
 
 

@@ -164,10 +164,10 @@ def test_bfloat16_stays_close_to_float32(small_config, small_variables):
     # Depths of ordinary size: of exponentials up to a million, one pixel would make up the whole norm.
     variables = jax.tree.map(np.asarray, small_variables)
     output = variables["params"]["depth_head"]["output_2"]
-    variables["params"]["depth_head"]["output_2"] = jax.tree.map(lambda x: 0.3 * x, output)
+    variables["params"]["depth_head"]["output_2"] = jax.tree.map(lambda x: 0.1 * x, output)
     expected = applied(model.config)(variables, video())
     actual = applied(half.config)(variables, video())
-    assert 1.2 < np.asarray(expected.depth).max() < 100
+    assert 1.5 < np.asarray(expected.depth).max() < 100
     for name in ("camera_tokens", "register_tokens", "depth", "depth_confidence", "pose_encodings"):
         a, b = np.asarray(getattr(actual, name)), np.asarray(getattr(expected, name))
         assert a.dtype == np.float32
@@ -176,25 +176,27 @@ def test_bfloat16_stays_close_to_float32(small_config, small_variables):
 
 def test_parameters_are_float32_whatever_the_compute_type(small_config):
     for dtype in ("float32", "bfloat16"):
-        shapes = variable_shapes(dataclasses.replace(small_config, dtype=dtype))
+        model = LogVGGT(dataclasses.replace(small_config, dtype=dtype))
+        shapes = jax.eval_shape(model.init, jax.random.key(0), video())
         assert {leaf.dtype for leaf in jax.tree.leaves(shapes)} == {jnp.dtype("float32")}
 
 
 def test_uint8_and_float_images_agree(small_config, small_variables):
-    pixels = (video(2) * 255).astype(np.uint8)
-    encode = jax.jit(Windows(small_config).encode)
-    a, b = encode(small_variables, pixels), encode(small_variables, pixels.astype(np.float32) / 255)
-    np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
+    pixels = (video() * 255).astype(np.uint8)
+    apply = applied(small_config)
+    a, b = apply(small_variables, pixels), apply(small_variables, pixels.astype(np.float32) / 255)
+    np.testing.assert_allclose(a.depth, b.depth, rtol=1e-5)
 
 
 def test_point_head_is_optional(small_config):
     head = DPTConfig(features=8, out_channels=(8, 8, 8, 8))
     model = LogVGGT(dataclasses.replace(small_config, point_head=head))
-    variables = variable_shapes(model.config)
-    out = jax.eval_shape(model.apply, variables, video())
-    assert out.points.shape == (1, FRAMES, 28, 42, 3) and out.points_confidence.shape == (1, FRAMES, 28, 42)
-    without = {"params": {name: part for name, part in variables["params"].items() if name != "point_head"}}
-    assert jax.eval_shape(LogVGGT(small_config).apply, without, video()).points is None
+    variables = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), variable_shapes(model.config))
+    out = applied(model.config)(variables, video())
+    assert out.points.shape == (1, FRAMES, 28, 42, 3)
+    assert (np.asarray(out.points_confidence) >= 1).all()
+    del variables["params"]["point_head"]
+    assert applied(small_config)(variables, video()).points is None
 
 
 def test_every_prediction_starts_with_the_batch(small_config, small_variables):

@@ -11,7 +11,7 @@ import pytest
 
 from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.evaluation.costs import streams, throughput
-from logvggt_jax.evaluation.costs.parts import PARTS, PartTime
+from logvggt_jax.evaluation.costs.parts import PARTS, time_part
 from logvggt_jax.evaluation.costs.streams import TimingConfig, random_pictures, time_stream
 from logvggt_jax.evaluation.costs.throughput import measured_timings
 from logvggt_jax.evaluation.methods.method import Checkpoint, model_row
@@ -21,9 +21,7 @@ from logvggt_jax.streaming import OfflineSettings, StreamSession
 def test_every_row_is_timed_once_and_kept(
     small_config: ModelConfig, small_variables: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Parts are compiled and timed in test_efficiency.
-    timed = functools.partial(PartTime, compilation=0.0, median=1e-3, temporary_bytes=None)
-    monkeypatch.setattr(throughput, "time_part", lambda part, *_, **__: timed(part.name, part.calls))
+    monkeypatch.setattr(throughput, "time_part", functools.partial(time_part, least_seconds=0.0))
     checkpoint = Checkpoint(LogVGGT(small_config), small_variables, "digest")
     references = [model_row("offline", checkpoint, OfflineSettings(max_frames=5))]
     config = TimingConfig(lengths=(7, 5), rounds=2)
