@@ -44,6 +44,14 @@ def frame_cloud(result: Reconstruction, selection: PointSelection, index: int) -
     return frame_vertices(points, result.depth_size, *cameras, index)
 
 
+def whole_cloud(result: Reconstruction, point_filter: PointFilter, *, progress: bool) -> np.ndarray:
+    """All points that a filter lets through, [n] of dtype `VERTEX`, frame by frame."""
+    with FramePool() as pool:
+        selection = select_points(result, point_filter, pool, progress=progress)
+        clouds = pool.map(lambda index: frame_cloud(result, selection, index), iter(range(result.num_frames)))
+        return np.concatenate(list(clouds))
+
+
 def tracked(items: Iterable[Item], what: str, total: int, *, progress: bool) -> Iterator[Item]:
     """The same items, with a progress bar where one is wanted and standard error is a terminal."""
     console = Console(stderr=True)

@@ -12,9 +12,8 @@ from logvggt_jax.data.formats.calibration import OPENGL_AXES
 from logvggt_jax.files import atomic_file
 from logvggt_jax.frames import evenly_spaced
 from logvggt_jax.geometry import invert, matrix_to_quaternion
-from logvggt_jax.reconstruction.exporters.cloud import frame_cloud, select_points
+from logvggt_jax.reconstruction.exporters.cloud import whole_cloud
 from logvggt_jax.reconstruction.exporters.libraries import library
-from logvggt_jax.reconstruction.frame_pool import FramePool
 from logvggt_jax.reconstruction.points.point_filter import PointFilter
 from logvggt_jax.reconstruction.result import Reconstruction
 
@@ -52,11 +51,7 @@ def export_glb(
       MissingPackage: trimesh is not installed.
     """
     trimesh = library("trimesh")
-    with FramePool() as pool:
-        chosen = point_filter or PointFilter(max_points=_NUM_POINTS)
-        selection = select_points(result, chosen, pool, progress=progress)
-        clouds = pool.map(lambda index: frame_cloud(result, selection, index), iter(range(result.num_frames)))
-        vertices = np.concatenate(list(clouds))
+    vertices = whole_cloud(result, point_filter or PointFilter(max_points=_NUM_POINTS), progress=progress)
     turn = OPENGL_AXES.diagonal()[:3]
     points = np.stack([vertices[axis] for axis in "xyz"], axis=-1) * turn
     colours = _LINEAR[np.stack([vertices[channel] for channel in ("red", "green", "blue")], axis=-1)]

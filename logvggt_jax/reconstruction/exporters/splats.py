@@ -8,9 +8,8 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from logvggt_jax.files import atomic_file
-from logvggt_jax.geometry import project
-from logvggt_jax.reconstruction.exporters.cloud import frame_cloud, select_points
-from logvggt_jax.reconstruction.frame_pool import FramePool
+from logvggt_jax.reconstruction.exporters.cloud import whole_cloud
+from logvggt_jax.reconstruction.points.cloud_file import ply_header
 from logvggt_jax.reconstruction.points.point_filter import PointFilter
 from logvggt_jax.reconstruction.result import Reconstruction
 
@@ -39,12 +38,8 @@ def export_splats(
       point_filter: which pixels become points; None for 500,000 points.
       progress: show a progress bar.
     """
-    with FramePool() as pool:
-        chosen = point_filter or PointFilter(max_points=_NUM_SPLATS)
-        selection = select_points(result, chosen, pool, progress=progress)
-        clouds = list(pool.map(lambda index: frame_cloud(result, selection, index), iter(range(result.num_frames))))
-    widths = _widths(result, clouds)
-    vertices = np.concatenate(clouds)
+    vertices = whole_cloud(result, point_filter or PointFilter(max_points=_NUM_SPLATS), progress=progress)
+    widths = _widths(result, vertices)
     splats = np.zeros(len(vertices), [(name, "<f4") for name in _PROPERTIES])
     for axis in "xyz":
         splats[axis] = vertices[axis]
@@ -54,27 +49,21 @@ def export_splats(
     for name in _SCALES:
         splats[name] = np.log(widths)
     splats[_ROTATION[0]] = 1.0
-    properties = "".join(f"property float {name}\n" for name in _PROPERTIES)
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(splats)}\n{properties}end_header\n"
     with atomic_file(path) as temporary, temporary.open("wb") as stream:
-        stream.write(header.encode())
+        stream.write(ply_header(splats.dtype, str(len(splats))).encode())
         stream.write(splats.data)
 
 
-def _widths(result: Reconstruction, clouds: list[np.ndarray]) -> np.ndarray:
+def _widths(result: Reconstruction, vertices: np.ndarray) -> np.ndarray:
     """Standard deviations [n]: half of the root mean square distance to the nearest neighbours.
 
     What stands alone is no wider than the gap between the chosen pixels of its own frame, and what lies upon another
     point no narrower than a tenth of that.
     """
+    points, frames = np.stack([vertices[axis] for axis in "xyz"], axis=-1), vertices["frame"]
+    towards = result.extrinsics[frames, 2]
+    depth = np.einsum("nc,nc->n", towards[:, :3], points) + towards[:, 3]
     height, width = result.depth_size
-    gaps = []
-    for index, cloud in enumerate(clouds):
-        points = np.stack([cloud[axis] for axis in "xyz"], axis=-1)
-        _, depth = project(points, result.depth_intrinsics[index], result.extrinsics[index])
-        pixels = np.sqrt(height * width / max(len(cloud), 1))
-        gaps.append(pixels * depth / result.depth_intrinsics[index, 0, 0])
-    most = np.concatenate(gaps)
-    points = np.concatenate([np.stack([cloud[axis] for axis in "xyz"], axis=-1) for cloud in clouds])
+    gap = depth / result.depth_intrinsics[frames, 0, 0] * np.sqrt(height * width / np.bincount(frames)[frames])
     distances, _ = KDTree(points).query(points, _NEIGHBOURS + 1, workers=-1)
-    return np.clip(np.sqrt(np.mean(distances[:, 1:] ** 2, axis=1)) / 2, most / 10, most)
+    return np.clip(np.sqrt(np.mean(distances[:, 1:] ** 2, axis=1)) / 2, gap / 10, gap)

@@ -26,7 +26,8 @@ _VERTICES = (VERTEX, np.dtype(_COLOURED))
 _PLY_TYPES = {np.dtype("<f4"): "float", np.dtype("u1"): "uchar", np.dtype("<i4"): "int"}
 
 
-def _header(vertex: np.dtype, count: str) -> str:
+def ply_header(vertex: np.dtype, count: str) -> str:
+    """The header of a binary PLY file of so many vertices of this structured dtype."""
     properties = "".join(f"property {_PLY_TYPES[vertex[name]]} {name}\n" for name in vertex.names or ())
     return f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}end_header\n"
 
@@ -84,7 +85,7 @@ def write_points(path: str | Path, most: int, frames: Iterable[np.ndarray]) -> N
     """
     written = 0
     with atomic_file(path) as temporary, temporary.open("wb") as stream:
-        stream.write(_header(VERTEX, str(most)).encode())
+        stream.write(ply_header(VERTEX, str(most)).encode())
         for vertices in frames:
             stream.write(vertices.data)
             written += len(vertices)
@@ -92,7 +93,7 @@ def write_points(path: str | Path, most: int, frames: Iterable[np.ndarray]) -> N
             raise ValueError(f"{path}: {most} vertices announced, {written} given")
         stream.seek(0)
         # As long as before: readers skip blanks.
-        stream.write(_header(VERTEX, str(written).rjust(len(str(most)))).encode())
+        stream.write(ply_header(VERTEX, str(written).rjust(len(str(most)))).encode())
 
 
 def count_points(path: str | Path) -> int:
@@ -133,11 +134,11 @@ def _stored_points(path: Path) -> np.ndarray:
     """The vertices [M] of a file, mapped and not read."""
     try:
         with open_regular(path) as stream:
-            start, found = stream.read(2 * len(_header(VERTEX, ""))), os.fstat(stream.fileno()).st_size
+            start, found = stream.read(2 * len(ply_header(VERTEX, ""))), os.fstat(stream.fileno()).st_size
             # More digits could not be a size.
             match = re.search(rb"element vertex ( *\d{1,18})\n", start)
             count = int(match[1]) if match else 0
-            headers = {each: _header(each, match[1].decode()).encode() for each in _VERTICES} if match else {}
+            headers = {each: ply_header(each, match[1].decode()).encode() for each in _VERTICES} if match else {}
             vertex = next((each for each, header in headers.items() if start.startswith(header)), None)
             if vertex is None:
                 raise InputError(f"{path} is {_other_file(start)}: expected the output of `logvggt reconstruct`")
