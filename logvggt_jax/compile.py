@@ -1,6 +1,7 @@
 """Compilation: the devices that were asked for, a cache of compiled programs, and how many were made."""
 
 import contextlib
+import functools
 import importlib.metadata
 import os
 import re
@@ -12,12 +13,14 @@ from typing import Any
 
 import jax
 import jax.monitoring
+import jax.numpy as jnp
 
 from logvggt_jax.errors import InputError, install_line, one_line
 from logvggt_jax.files import user_cache_folder
 
 # What JAX reports for every program it makes.
 _COMPILATION = "/jax/core/compile/backend_compile_duration"
+_QUICK = {"xla_gpu_experimental_enable_fusion_autotuner": False, "xla_gpu_enable_triton_gemm": False}
 # Of each of these one build may be installed, for one version of CUDA; JAX loads whichever it finds first.
 _BUILD = re.compile(r"(nvidia-(?:nccl|cudnn|cublas)-cu|jax-cuda)\d+(-plugin|-pjrt)?")
 
@@ -74,6 +77,28 @@ def check_devices() -> None:
             "JAX_PLATFORMS=cpu",
             stacklevel=2,
         )
+
+
+@functools.cache
+def quick_compilation(device: jax.Device) -> dict[str, bool]:
+    """Options for `jax.jit` under which a large program for `device` compiles in a fraction of the time; none but for
+    GPUs.
+
+    XLA would compile each of a training step's thousand fusions twice, with two emitters, and time both, and compile
+    dozens of Triton kernels for each product beside those of cuBLAS. Options that this XLA does not know are left out.
+    """
+    return {
+        name: value for name, value in _QUICK.items() if device.platform == "gpu" and _accepted(device, name, value)
+    }
+
+
+def _accepted(device: jax.Device, name: str, value: bool) -> bool:
+    program = jax.jit(lambda: jnp.zeros(()), out_shardings=jax.sharding.SingleDeviceSharding(device))
+    try:
+        program.lower().compile({name: value})
+    except jax.errors.JaxRuntimeError:
+        return False
+    return True
 
 
 @contextlib.contextmanager

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import optax
 from jax.sharding import PartitionSpec as P
 
+from logvggt_jax.compile import quick_compilation
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.training.config import LossConfig
 from logvggt_jax.training.losses.clip_errors import clip_errors
@@ -164,7 +165,8 @@ def make_train_step(
             check_vma=False,
         )(state, batch)
 
-    return jax.jit(on_all_devices, donate_argnums=0)
+    options = quick_compilation(layout.mesh.devices.flat[0])
+    return jax.jit(on_all_devices, donate_argnums=0, compiler_options=options)
 
 
 def _finite_clips(predictions: Predictions, targets: Targets) -> jax.Array:
