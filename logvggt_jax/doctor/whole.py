@@ -49,6 +49,8 @@ def examine(subject: Subject) -> Iterator[Finding]:
             seconds, cores = time.perf_counter() - started, time.process_time() - cores
     yield Finding("whole", "frames", float(result.num_frames), ok=result.num_frames == count)
     yield Finding("whole", "rate, files to files", count / seconds, "frames/s")
+    assert result.seconds is not None  # it was made just now
+    yield Finding("whole", "rate, first frame to last", count / result.seconds, "frames/s")
     # On a CPU this is the model as well.
     note = "the model included" if jax.default_backend() == "cpu" else "all threads of this process"
     yield Finding("whole", "processor time a frame", 1e3 * cores / count, "ms", note=note)
