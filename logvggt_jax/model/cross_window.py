@@ -13,6 +13,8 @@ from window to window climbs one key layer: frame 0 reaches as many later window
 
 from __future__ import annotations
 
+import functools
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -48,13 +50,11 @@ class CachedTokens:
                 jnp.concatenate([valid, there.reshape(batch, frames * tokens)], axis=1),
             )
             return attention(own.query, both), self
-        empty = self.length == 0
-        count = jnp.int32(key.shape[1]) if valid is None else valid
-        keys = Keys(
-            _joined(key, cached.key, empty),
-            _joined(value, cached.value, empty),
-            count + self.length * tokens,
-        )
+        if valid is None:
+            joined, count = _cache_last, jnp.int32(key.shape[1])
+        else:
+            joined, count = functools.partial(_joined, empty=self.length == 0), valid
+        keys = Keys(joined(key, cached.key), joined(value, cached.value), count + self.length * tokens)
         return attention(own.query, keys), self
 
 
@@ -86,11 +86,15 @@ class CrossWindowMemory:
         return self
 
 
+def _cache_last(own: jax.Array, cached: jax.Array) -> jax.Array:
+    return jnp.concatenate([own, cached], axis=1)
+
+
 def _joined(own: jax.Array, cached: jax.Array, empty: jax.Array) -> jax.Array:
     """Both halves [B, N + E, …] such that those that count come first: attention does not care for the order.
 
     The cache is whole or empty, and padding ends the window: before the window's own keys it leaves no gap but when
     it is empty, and then it goes to the end.
     """
-    cache_last, cache_first = jnp.concatenate([own, cached], axis=1), jnp.concatenate([cached, own], axis=1)
-    return jnp.where(empty[:, None, None, None], cache_last, cache_first)
+    cache_first = jnp.concatenate([cached, own], axis=1)
+    return jnp.where(empty[:, None, None, None], _cache_last(own, cached), cache_first)

@@ -40,9 +40,9 @@ class GCCR(nn.Module):
     def setup(self) -> None:
         self.camera_norm = layer_norm(1e-5, "camera_norm")
         self.register_norm = layer_norm(1e-5, "register_norm")
-        self.query = dense(self.width, "query", self.dtype, out=self.dtype)
-        self.key = dense(self.width, "key", self.dtype, out=self.dtype)
-        self.value = dense(self.width, "value", self.dtype, out=self.dtype)
+        self.query = dense(self.width, "query", self.dtype, sums=self.dtype)
+        self.key = dense(self.width, "key", self.dtype, sums=self.dtype)
+        self.value = dense(self.width, "value", self.dtype, sums=self.dtype)
         self.output = dense(self.width, "output", self.dtype, kernel_init=nn.initializers.zeros_init())
 
     def __call__(self, camera_tokens: jax.Array, register_tokens: jax.Array, frames: jax.Array) -> jax.Array:
@@ -52,7 +52,7 @@ class GCCR(nn.Module):
     def project(self, register_tokens: jax.Array) -> RegisterKeys:
         """Keys and values of register tokens [B, M, 4, 2C]."""
         normed = self.register_norm(register_tokens)
-        return RegisterKeys(self.key(normed), self.value(normed))
+        return RegisterKeys(self.key(normed).astype(self.dtype), self.value(normed).astype(self.dtype))
 
     def attend(self, camera_tokens: jax.Array, registers: RegisterKeys, frames: jax.Array) -> jax.Array:
         """Refined tokens [B, N, 2C] of camera tokens [B, N, 2C].
@@ -60,7 +60,7 @@ class GCCR(nn.Module):
         `frames` says whose registers count: bool [B, M], or the first so many, int32 [B].
         """
         a_frame = registers.key.shape[2]
-        queries = self.query(self.camera_norm(camera_tokens))
+        queries = self.query(self.camera_norm(camera_tokens)).astype(self.dtype)
 
         def heads(tokens: jax.Array) -> jax.Array:
             return tokens.reshape(len(tokens), -1, self.num_heads, self.width // self.num_heads)
@@ -72,4 +72,4 @@ class GCCR(nn.Module):
             frames * a_frame if frames.ndim == 1 else jnp.repeat(frames, a_frame, axis=1),
             implementation=self.implementation,
         )
-        return camera_tokens + self.output(out.reshape(camera_tokens.shape)).astype(jnp.float32)
+        return camera_tokens + self.output(out.reshape(camera_tokens.shape))

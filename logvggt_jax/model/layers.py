@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from typing import Any
 
@@ -20,46 +19,61 @@ from logvggt_jax.model.shape_check import Dense, LayerNorm, ShapeCheck
 
 
 class _Dense(Dense):
-    """A linear layer whose kernel may come in eight bits, see `low_precision.py`; its result is of type `out`."""
+    """A linear layer whose kernel may come in eight bits, see `low_precision.py`; see `dense`."""
 
-    out: str = "float32"
+    sums: str = "float32"
 
-    def __call__(self, inputs: jax.Array) -> jax.Array:
-        if not self.has_variable("params", "codes"):
-            return super().__call__(inputs)
-        given: Any = self.variables["params"]
-        return (product(inputs, given["codes"], given["scale"]) + given["bias"]).astype(self.out)
+    @nn.compact
+    def __call__(self, inputs: jax.Array, part: slice = slice(None)) -> jax.Array:
+        """Float32 [..., features], or a part of the features: the product of all is the same for every part, and made
+        once. Biases come after the cut, where the kernels that read a part add them."""
+        if self.has_variable("params", "codes"):
+            given: Any = self.variables["params"]
+            sums, bias = product(inputs, given["codes"], given["scale"]), given["bias"]
+        else:
+            kernel = self.param("kernel", self.kernel_init, (inputs.shape[-1], self.features))
+            bias = self.param("bias", self.bias_init, (self.features,))
+            sums = jnp.matmul(
+                inputs.astype(self.dtype),
+                kernel.astype(self.dtype),
+                precision=self.precision,
+                preferred_element_type=jnp.dtype(self.sums),
+            )
+        return sums[..., part].astype(jnp.float32) + bias.astype(self.dtype)[part].astype(jnp.float32)
 
 
 def dense(
-    features: int, name: str, dtype: str = "float32", *, out: str = "float32", kernel_init: Any = fan_in_normal
-) -> nn.Dense:
-    """Linear layer: products of `dtype`, summed in float32 and handed out in `out`, float32 unless what follows would
-    round it anyway. Wide sums that leave the matrix unit in 16 bits are half of the memory traffic."""
+    features: int, name: str, dtype: str = "float32", *, sums: str = "float32", kernel_init: Any = fan_in_normal
+) -> _Dense:
+    """Linear layer: products of `dtype`, summed in float32, which leave the matrix unit in `sums`; the bias is added in
+    float32, and the result is float32. Wide sums in 16 bits are half of the memory traffic, and where the next product
+    rounds what they become they cost little accuracy."""
     return _Dense(
         features,
-        out=out,
+        sums=sums,
         dtype=dtype,
         precision=product_precision(dtype),
-        dot_general=functools.partial(jax.lax.dot_general, preferred_element_type=jnp.dtype(out)),
         kernel_init=kernel_init,
         bias_init=constant(0.0),
         name=name,
     )
 
 
-def layer_norm(epsilon: float, name: str, dtype: str = "float32", *, affine: bool = True) -> nn.LayerNorm:
+def layer_norm(
+    epsilon: float, name: str, dtype: str = "float32", *, affine: bool = True, in_one_pass: bool = False
+) -> nn.LayerNorm:
     """LayerNorm over the last axis, in float32, of what products of `dtype` read.
 
     For float32 products PyTorch's variance; for 16-bit ones the shortcut E[x²] − E[x]², whose error their rounding
-    hides and which reads the tokens once less.
+    hides: both sums come out of the kernel that makes the tokens. `in_one_pass` keeps PyTorch's variance there too, for
+    tokens that nothing else has to write: XLA's GPU compiler knows this form, and reads them once, in one kernel.
     """
     return LayerNorm(
         epsilon=epsilon,
         dtype=jnp.float32,
         use_bias=affine,
         use_scale=affine,
-        use_fast_variance=dtype != "float32",
+        use_fast_variance=dtype != "float32" and not in_one_pass,
         scale_init=constant(1.0),
         bias_init=constant(0.0),
         name=name,
@@ -84,13 +98,32 @@ def with_special(seen: jax.Array, count: int) -> jax.Array:
 
 
 def _gelu(x: jax.Array, dtype: str) -> jax.Array:
-    """x Φ(x), exact, of float32 values that products of `dtype` read.
+    """x Φ(x), exact, of float32 values that products of `dtype` read."""
+    return jax.nn.gelu(x, approximate=False) if dtype == "float32" else _gelu_before_rounding(x)
 
-    Φ by erfc keeps the relative accuracy of its tail, which 16-bit products round away: by erf it costs half.
-    """
-    if dtype == "float32":
-        return jax.nn.gelu(x, approximate=False)
-    return x * (0.5 + 0.5 * jax.lax.erf(x * math.sqrt(0.5)))
+
+@jax.custom_jvp
+def _gelu_before_rounding(x: jax.Array) -> jax.Array:
+    """x Φ(x) to 3e-7, for what is rounded to 16 bits next: an elementary Φ costs a GPU no more than reading and writing
+    the values, where `erf` costs as much again."""
+    return x * _normal_distribution(x)
+
+
+@_gelu_before_rounding.defjvp
+def _gelu_slope(values: tuple[jax.Array], tangents: tuple[jax.Array]) -> tuple[jax.Array, jax.Array]:
+    (x,), (tangent,) = values, tangents
+    below = _normal_distribution(x)
+    density = math.sqrt(0.5 / math.pi) * jnp.exp(-0.5 * x * x)
+    return x * below, (below + x * density) * tangent
+
+
+def _normal_distribution(x: jax.Array) -> jax.Array:
+    """Φ(x) to 1e-7 (Abramowitz and Stegun, Handbook of Mathematical Functions, 7.1.26), in the lower tail to a few
+    thousandths of its value."""
+    t = 1.0 / (1.0 + 0.3275911 * math.sqrt(0.5) * jnp.abs(x))
+    series = t * (0.254829592 + t * (-0.284496736 + t * (1.421413741 + t * (-1.453152027 + t * 1.061405429))))
+    tail = 0.5 * series * jnp.exp(-0.5 * x * x)
+    return jnp.where(x < 0, tail, 1.0 - tail)
 
 
 class MLP(nn.Module):
@@ -102,9 +135,9 @@ class MLP(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        x = dense(self.hidden, "fc1", self.dtype, out=self.dtype)(x)
-        x = _gelu(x.astype(jnp.float32), self.dtype).astype(self.dtype)
-        return dense(self.features, "fc2", self.dtype)(x)
+        x = dense(self.hidden, "fc1", self.dtype, sums=self.dtype)(x)
+        x = _gelu(x, self.dtype).astype(self.dtype)
+        return dense(self.features, "fc2", self.dtype, sums=self.dtype)(x)
 
 
 class Attention(nn.Module):
@@ -112,7 +145,8 @@ class Attention(nn.Module):
 
     `queries` and `keys` project the block's tokens, `attend` lets queries see keys and has no parameters, and calling
     the module projects the result back to the residual stream. With `qk_norm` queries and keys are normalised per head,
-    before the rotary embedding.
+    before the rotary embedding, in float32. Parameters for streams have the first two projections side by side, as
+    `query_key_value`, see `parameters.in_compute_type`.
     """
 
     num_heads: int
@@ -122,25 +156,25 @@ class Attention(nn.Module):
     implementation: str
 
     def setup(self) -> None:
-        # Norm and rotation want what the products would round off.
-        out = "float32" if self.qk_norm else self.dtype
-        self.query = dense(self.width, "query", self.dtype, out=out)
-        self.key_value = dense(2 * self.width, "key_value", self.dtype, out=out)
-        self.output = dense(self.width, "output", self.dtype)
+        self.query = dense(self.width, "query", self.dtype, sums=self.dtype)
+        self.key_value = dense(2 * self.width, "key_value", self.dtype, sums=self.dtype)
+        self.query_key_value = dense(3 * self.width, "query_key_value", self.dtype, sums=self.dtype)
+        self.output = dense(self.width, "output", self.dtype, sums=self.dtype)
         if self.qk_norm:
             self.query_norm = layer_norm(1e-5, "query_norm", self.dtype)
             self.key_norm = layer_norm(1e-5, "key_norm", self.dtype)
 
     def queries(self, normed: jax.Array, rope: RopeTable | None) -> jax.Array:
         """Queries [B, N, heads, head_dim] in the compute type of tokens [B, N, C] after the block's LayerNorm."""
-        query = self._heads(self.query(normed))
+        query = self._heads(self.query_key_value(normed, slice(self.width)) if self._joint else self.query(normed))
         if self.qk_norm:
             query = self.query_norm(query)
         return (query if rope is None else apply_rope(query, rope)).astype(self.dtype)
 
     def keys(self, normed: jax.Array, rope: RopeTable | None, valid: jax.Array | None = None) -> Keys:
         """Keys and values in the compute type of tokens [B, N, C] after the block's LayerNorm; see `Keys`."""
-        key, value = (self._heads(x) for x in jnp.split(self.key_value(normed), 2, axis=-1))
+        both = self.query_key_value(normed, slice(self.width, None)) if self._joint else self.key_value(normed)
+        key, value = (self._heads(x) for x in jnp.split(both, 2, axis=-1))
         if self.qk_norm:
             key = self.key_norm(key)
         key = key if rope is None else apply_rope(key, rope)
@@ -154,6 +188,10 @@ class Attention(nn.Module):
         """The residual branch [B, N, C], before its LayerScale, of what `attend` gave, [B, N, heads, head_dim]."""
         return self.output(taken.reshape(*taken.shape[:2], self.width))
 
+    @property
+    def _joint(self) -> bool:
+        return self.has_variable("params", "query_key_value")
+
     def _heads(self, x: jax.Array) -> jax.Array:
         return x.reshape(*x.shape[:-1], self.num_heads, self.width // self.num_heads)
 
@@ -161,7 +199,7 @@ class Attention(nn.Module):
 class Block(nn.Module):
     """x + γ₁ Attn(LN(x)), then x + γ₂ MLP(LN(x)): the pre-norm transformer block of DINOv2 and VGGT.
 
-    The residual stream stays float32 whatever `dtype` the products use.
+    The residual stream stays float32 whatever `dtype` the products use; what is added to it comes in that type.
     """
 
     num_heads: int
@@ -199,14 +237,16 @@ class Block(nn.Module):
         width = x.shape[-1]
         norm1 = layer_norm(self.epsilon, "norm1", self.dtype)
         attention_ = Attention(self.num_heads, width, self.qk_norm, self.dtype, self.implementation, name="attention")
-        normed = norm1(x)
+        # Token by token, for any number of frames at once: so the same kernels serve frame and global blocks.
+        rows, shape = x.reshape(-1, width), x.shape
+        normed = norm1(rows).reshape(shape)
         own = OwnTokens(normed, attention_.queries(normed, rope), attention_.keys(normed, rope, valid))
         if memory is None:
             taken = attention_.attend(own.query, own.keys)
         else:
             taken, memory = memory.attend(own, attention_.attend, lambda tokens: attention_.keys(norm1(tokens), rope))
-        x = x + LayerScale(self.layer_scale, name="scale1")(attention_(taken))
+        rows += LayerScale(self.layer_scale, name="scale1")(attention_(taken).reshape(-1, width))
         branch = MLP(self.mlp_ratio * width, width, self.dtype, name="mlp")(
-            layer_norm(self.epsilon, "norm2", self.dtype)(x)
+            layer_norm(self.epsilon, "norm2", self.dtype, in_one_pass=True)(rows)
         )
-        return x + LayerScale(self.layer_scale, name="scale2")(branch), memory
+        return (rows + LayerScale(self.layer_scale, name="scale2")(branch)).reshape(shape), memory

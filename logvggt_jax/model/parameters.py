@@ -133,14 +133,25 @@ def _is_stacked(node: Any) -> bool:
 
 
 def in_compute_type(variables: Variables, config: ModelConfig) -> Variables:
-    """The kernels and biases of products in the compute type, as the products would round them at every call."""
+    """Parameters as streams want them, layer by layer or stacked: kernels and biases of products in the compute type,
+    as the products would round them at every call, and in every block `query` and `key_value` side by side as one
+    product, `query_key_value`, as a compiler would put them at every call. What has this form stays as it is.
+    """
 
     def cast(tree: Any) -> Any:
         if not isinstance(tree, dict):
             return tree
         if "kernel" in tree:
             return {name: x.astype(jnp.dtype(config.dtype)) for name, x in tree.items()}
-        return {name: cast(inner) for name, inner in tree.items()}
+        return side_by_side({name: cast(inner) for name, inner in tree.items()})
+
+    def side_by_side(tree: dict[str, Any]) -> dict[str, Any]:
+        """Of kernels in eight bits the tokens' codes would be shared as well; they stay apart."""
+        query, key_value = tree.get("query"), tree.get("key_value")
+        if query is None or key_value is None or "kernel" not in query:
+            return tree
+        both = {name: jnp.concatenate([query[name], key_value[name]], axis=-1) for name in query}
+        return {name: x for name, x in tree.items() if name not in ("query", "key_value")} | {"query_key_value": both}
 
     params = variables["params"]
     return {"params": {part: cast(tree) if part in _COMPUTE_TYPE_PARTS else tree for part, tree in params.items()}}
