@@ -68,7 +68,7 @@ _WANDB = flags.DEFINE_string(
 _DRY_RUN = flags.DEFINE_bool("dry_run", False, "Say what every step needs and how many clips fit; train nothing.")
 _PREFLIGHT = flags.DEFINE_bool("preflight", False, "Try network, data, folder and step in minutes; train nothing.")
 _DESCRIBED = flags.DEFINE_string(
-    "described", None, "TPU slice to compile for instead of the devices at hand, such as v5p:2x2x4; with --dry_run."
+    "described", None, "Devices to compile for in place of those at hand, such as v5p:2x2x4 or h100:16; with --dry_run."
 )
 _CACHE = flags.DEFINE_string(
     "compilation_cache", None, "Folder that keeps compiled programs, `none` for none; by default the user's cache."

@@ -1,12 +1,13 @@
-"""Lowers and compiles the 1B inference step for this machine's CPU, described TPUs, or CUDA (lowering only).
+"""Lowers and compiles the 1B inference step for this machine's CPU, described TPUs and GPUs, or CUDA (lowering only).
 
     python benchmarks/compile_step.py --target cpu
     python benchmarks/compile_step.py --target v5e:2x2x1 --target v5p:2x2x1
+    python benchmarks/compile_step.py --target h100
     python benchmarks/compile_step.py --target cuda --masks
 
-TPU targets need the `libtpu` wheel and no TPU: the compiler runs on the CPU for one device of a described slice,
-the memory figures are its own. The CUDA program is lowered with a stand-in for JAX's check of the installed cuDNN;
-nothing of it is compiled or run.
+Described devices need their compiler and not themselves, see `logvggt_jax/described.py`: it runs on the CPU for one of
+them, and the memory figures are its own. Kernels are counted, with the bytes of what they read and write. `cuda` needs
+nothing: the program is lowered with a stand-in for JAX's check of the installed cuDNN, and nothing of it is compiled.
 """
 
 from __future__ import annotations
@@ -17,16 +18,17 @@ import functools
 import os
 import re
 import time
-from unittest import mock
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
-os.environ.setdefault("TPU_SKIP_MDS_QUERY", "1")
 
 import jax
 import jax.numpy as jnp
+from kernels import kernels
 
 from logvggt_jax import LogVGGT, ModelConfig
+from logvggt_jax.described import attention_kernels, cudnn_by_description, described_devices
 from logvggt_jax.model.logvggt import variable_shapes
+from logvggt_jax.model.parameters import in_compute_type
 
 IMAGE_SIZE = (392, 518)
 GIB = 2**30
@@ -42,7 +44,8 @@ def abstract_step(model: LogVGGT, masked: bool, sharding: jax.sharding.Sharding 
     def masks(count: int) -> jax.ShapeDtypeStruct | None:
         return jax.ShapeDtypeStruct((1, count, *IMAGE_SIZE), bool) if masked else None
 
-    variables, overlap = variable_shapes(model.config), windows.size - windows.stride
+    variables = jax.eval_shape(lambda given: in_compute_type(given, model.config), variable_shapes(model.config))
+    overlap = windows.size - windows.stride
     state = jax.eval_shape(model.start, variables, frames(overlap), None, masks(overlap))
     mask = jax.ShapeDtypeStruct((1, windows.stride), bool)
     place = lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding)  # noqa: E731
@@ -60,28 +63,21 @@ def compile_for_cpu(config: ModelConfig, masked: bool) -> tuple[float, float, ja
     return lowered_at - started, time.perf_counter() - lowered_at, compiled
 
 
-def compile_for_tpu(config: ModelConfig, masked: bool, topology: str) -> jax.stages.Compiled:
-    """The step for one device of a described TPU slice, such as "v5e:2x2x1", with the Pallas flash kernel."""
-    from jax.experimental import topologies
-
-    described = topologies.get_topology_desc(topology_name=topology, platform="tpu")
-    sharding = jax.sharding.SingleDeviceSharding(described.devices[0])
-    model = LogVGGT(dataclasses.replace(config, attention="tpu_flash"))
-    step = jax.jit(model.step, donate_argnums=1)
-    return step.lower(*abstract_step(model, masked, sharding)).compile()
+def compile_for_described(config: ModelConfig, masked: bool, name: str) -> jax.stages.Compiled:
+    """The step for one of the devices that `described_devices` knows by `name`, with the attention that it would have;
+    the parameters are those of a stream."""
+    device = described_devices(name)[0]
+    with attention_kernels(device) as attention:
+        model = LogVGGT(dataclasses.replace(config, attention=attention))
+        step = jax.jit(model.step, donate_argnums=1)
+        return step.lower(*abstract_step(model, masked, jax.sharding.SingleDeviceSharding(device))).compile()
 
 
 def lower_for_cuda(config: ModelConfig, masked: bool) -> str:
     """The step's StableHLO for CUDA with cuDNN attention, lowered with a stand-in for the cuDNN version check."""
-    from jax._src.cudnn import fused_attention_stablehlo
-
-    model = LogVGGT(dataclasses.replace(config, attention="cudnn"))
-    step = jax.jit(model.step, donate_argnums=1)
-    with (
-        mock.patch.object(fused_attention_stablehlo, "check_cudnn_version", lambda: 91000),
-        mock.patch.object(fused_attention_stablehlo, "check_compute_capability", lambda _: True),
-        mock.patch.object(fused_attention_stablehlo, "is_cuda_compute_capability_equal", lambda _: False),
-    ):
+    with cudnn_by_description():
+        model = LogVGGT(dataclasses.replace(config, attention="cudnn"))
+        step = jax.jit(model.step, donate_argnums=1)
         return step.trace(*abstract_step(model, masked)).lower(lowering_platforms=("cuda",)).as_text()
 
 
@@ -109,10 +105,16 @@ def describe_memory(compiled: jax.stages.Compiled) -> str:
     )
 
 
+def describe_kernels(compiled: jax.stages.Compiled) -> str:
+    """How many of each kind, and what they move."""
+    found = kernels(compiled.as_text() or "").items()
+    return ", ".join(f"{each.count} {kind} ({each.size / 1e9:.2f} GB)" for kind, each in found)
+
+
 def main() -> None:
     """Prints a line or two for every target."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--target", action="append", help="cpu, cuda, or a TPU topology; default cpu")
+    parser.add_argument("--target", action="append", help="cpu, cuda, v5p:2x2x1, h100, …; default cpu")
     parser.add_argument("--dtype", default="bfloat16")
     parser.add_argument("--masks", action="store_true", help="a step of a stream with masks of pixels")
     options = parser.parse_args()
@@ -127,9 +129,10 @@ def main() -> None:
             calls = count_calls(text, "__cudnn$fmha")
             print(f"cuda: lowered, {calls} calls of cuDNN attention (not compiled, not run)")
         else:
-            compiled = compile_for_tpu(config, options.masks, target)
-            kernels = compiled.as_text().count("tpu_custom_call")
-            print(f"{target}: compiled, {kernels} calls of the flash kernel; {describe_memory(compiled)}")
+            started = time.perf_counter()
+            compiled = compile_for_described(config, options.masks, target)
+            seconds = time.perf_counter() - started
+            print(f"{target}: compiled in {seconds:.0f} s; {describe_memory(compiled)}; {describe_kernels(compiled)}")
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ GROUND_FLOOR = {
     "files",
     "errors",
     "compile",
+    "described",
     "operations",
     "interruption",
     "terminal",

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from unittest import mock
 
 import jax
 import pytest
@@ -35,6 +36,16 @@ def test_programs_are_counted_as_they_are_made() -> None:
         assert compilations() == first > 0
     double(jax.numpy.ones(4))
     assert compilations() == first, "what came after is not counted"
+
+
+def test_options_for_gpus_are_those_that_this_xla_knows(monkeypatch: pytest.MonkeyPatch) -> None:
+    device = jax.devices()[0]
+    assert module.quick_compilation(device) == {}, "a CPU's programs compile as they do"
+    monkeypatch.setattr(module, "_QUICK", {"xla_gpu_enable_triton_gemm": False, "xla_gpu_no_such_option": True})
+    assert [module._accepted(device, *option) for option in module._QUICK.items()] == [True, False]
+    gpu = mock.Mock(platform="gpu")
+    monkeypatch.setattr(module, "_accepted", lambda device, name, value: device is gpu and "no_such" not in name)
+    assert module.quick_compilation(gpu) == {"xla_gpu_enable_triton_gemm": False}
 
 
 @pytest.mark.parametrize(("asked", "refused"), [(None, True), ("cuda,cpu", True), ("cpu", False)])

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import importlib.util
 import math
-import os
 from collections.abc import Callable
 
 import numpy as np
 from jax.sharding import AxisType, Mesh
 
 from logvggt_jax.compile import device_bytes
-from logvggt_jax.errors import InputError, MissingPackage, one_line
+from logvggt_jax.described import attention_kernels, described_bytes, described_devices
 from logvggt_jax.training.config import StageConfig, TrainConfig
 from logvggt_jax.training.parallel.sharding import DATA_AXIS, check_batch_size
 from logvggt_jax.training.step.costs import StepCosts, step_costs, step_flops
@@ -30,10 +28,15 @@ def dry_run(config: TrainConfig, mesh: Mesh, say: Callable[[str], None] = print)
     """
     for stage in config.stages:
         check_batch_size(stage, mesh, accumulate=config.accumulate)
-    if mesh.devices.flat[0].platform == "tpu" and config.model.attention == "auto":
-        # Chosen by the device at hand, which a described one is not.
-        config = dataclasses.replace(config, model=dataclasses.replace(config.model, attention="tpu_flash"))
-    limit = device_bytes(mesh.devices.flat[0])
+    with attention_kernels(mesh.devices.flat[0]) as attention:
+        if config.model.attention == "auto":
+            # Chosen by the device at hand, which a described one is not.
+            config = dataclasses.replace(config, model=dataclasses.replace(config.model, attention=attention))
+        _say_all(config, mesh, say)
+
+
+def _say_all(config: TrainConfig, mesh: Mesh, say: Callable[[str], None]) -> None:
+    limit = device_bytes(mesh.devices.flat[0]) or described_bytes(mesh.devices.flat[0])
     memory = "memory not known" if limit is None else f"{limit / _GIB:.1f} GiB each"
     say(f"{mesh.size} x {mesh.devices.flat[0].device_kind}, {memory}; nothing is allocated or run")
 
@@ -52,24 +55,9 @@ def dry_run(config: TrainConfig, mesh: Mesh, say: Callable[[str], None] = print)
         say(f"{stage.name}: {_largest_that_fits(costs_of, mesh, stage, limit, config.accumulate)}")
 
 
-def described_mesh(topology: str) -> Mesh:
-    """A mesh over a TPU slice that is described alone, such as "v5p:2x2x4"; needs the `libtpu` wheel and no TPU.
-
-    Raises InputError for a topology that libtpu does not know, MissingPackage without libtpu.
-    """
-    if importlib.util.find_spec("libtpu") is None:
-        raise MissingPackage("--described compiles with the libtpu package: pip install libtpu")
-    # Otherwise it asks the network which TPU this machine has.
-    os.environ.setdefault("TPU_SKIP_MDS_QUERY", "1")
-    from jax.experimental import topologies
-
-    try:
-        devices = topologies.get_topology_desc(topology_name=topology, platform="tpu").devices
-    except Exception as error:  # of whatever kind the library raises
-        raise InputError(
-            f"--described={topology}: no such TPU slice, expected one like v5p:2x2x4 ({one_line(error):.200})"
-        ) from error
-    return Mesh(np.array(devices), (DATA_AXIS,), axis_types=(AxisType.Auto,))
+def described_mesh(name: str) -> Mesh:
+    """A mesh over devices that are described alone, see `described_devices`."""
+    return Mesh(np.array(described_devices(name)), (DATA_AXIS,), axis_types=(AxisType.Auto,))
 
 
 def _largest_that_fits(

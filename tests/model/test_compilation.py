@@ -49,12 +49,22 @@ def figure(pattern: str, line: str) -> float:
 @pytest.mark.parametrize(("topology", "memory"), [("v5e:2x2x1", 16e9), ("v5p:2x2x1", 95e9)])
 def test_compiles_for_a_described_tpu_with_the_flash_kernel(topology: str, memory: float) -> None:
     line = described(topology)
-    assert figure(r"(\d+) calls of the flash kernel", line) >= ATTENTIONS
+    assert figure(r"(\d+) attention", line) >= ATTENTIONS
     arguments = figure(r"arguments ([\d.]+) GiB", line) * GIB
     temporaries = figure(r"temporaries ([\d.]+) GiB", line) * GIB
-    assert arguments > 3.7e9, "what the step reads: encoder, aggregator and depth head, 0.94 billion float32"
+    assert arguments > 1.85e9, "what the step reads: encoder, aggregator and depth head, 0.94 billion in bfloat16"
     assert temporaries > 0
     assert arguments + temporaries < memory
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(importlib.util.find_spec("jax_cuda13_plugin") is None, reason="needs JAX for CUDA, and no GPU")
+def test_compiles_for_a_described_gpu_with_few_kernels() -> None:
+    line = described("h100")
+    assert figure(r"(\d+) attention", line) == ATTENTIONS
+    # 846 kernels that moved 25 GB, before sums left products in 16 bits.
+    assert figure(r"(\d+) others", line) < 720
+    assert figure(r"others \(([\d.]+) GB\)", line) < 18.0
 
 
 @pytest.mark.slow

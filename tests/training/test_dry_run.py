@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import importlib
-import importlib.util
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import jax
 import pytest
 
-from logvggt_jax.errors import InputError, MissingPackage
+from logvggt_jax.errors import InputError
 from logvggt_jax.training import dry_run as module
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.dry_run import dry_run
@@ -112,19 +113,28 @@ def test_batches_have_to_split_over_the_devices(config: TrainConfig) -> None:
         dry_run(config, data_mesh(3))
 
 
-def test_an_unknown_slice_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    from jax.experimental import topologies
+def test_described_devices_have_their_own_attention_and_memory(
+    config: TrainConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kinds: list[str] = []
 
-    def refuse(**_: object) -> None:
-        raise RuntimeError("INVALID_ARGUMENT:\nunknown topology")
+    def given(config: TrainConfig, mesh: object, clips: int, *_: object) -> StepCosts:
+        kinds.append(config.model.attention)
+        return StepCosts(5, 10 * clips, {}, 0.0)
 
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
-    monkeypatch.setattr(topologies, "get_topology_desc", refuse)
-    with pytest.raises(InputError, match=r"--described=v9:1x1: no such TPU slice.*v5p:2x2x4.*unknown topology"):
-        module.described_mesh("v9:1x1")
+    @contextlib.contextmanager
+    def kernels(device: jax.Device) -> Iterator[str]:
+        yield "cudnn"
+
+    monkeypatch.setattr(module, "step_costs", given)
+    monkeypatch.setattr(module, "attention_kernels", kernels)
+    monkeypatch.setattr(module, "described_bytes", lambda device: 45)
+    lines: list[str] = []
+    dry_run(config, data_mesh(2), lines.append)
+    assert set(kinds) == {"cudnn"}
+    assert "4 is the largest of 1, 2, 4, 8 clips" in lines[-1]
 
 
-def test_without_libtpu_no_slice_can_be_described(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(MissingPackage, match="pip install libtpu"):
-        module.described_mesh("v5p:2x2x4")
+def test_a_mesh_is_made_of_described_devices(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "described_devices", lambda name: jax.devices()[: int(name)])
+    assert module.described_mesh("2").shape == {"data": 2}

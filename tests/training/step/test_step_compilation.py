@@ -16,7 +16,7 @@ from logvggt_jax.training.feeding.batches import stage_batches
 from logvggt_jax.training.feeding.sources import open_sources
 from logvggt_jax.training.loop import train
 from logvggt_jax.training.parallel.sharding import data_mesh, put_batch
-from logvggt_jax.training.step import compilation
+from logvggt_jax.training.step import compilation, train_step
 from logvggt_jax.training.step.compilation import compiled_steps
 from logvggt_jax.training.step.program import make_program
 
@@ -38,6 +38,18 @@ def test_each_size_has_a_step_that_takes_its_clips(
     batch = put_batch({name: value for name, value in clips.items() if name != "frame_mask"}, data_mesh(2))
     state, metrics, _ = steps[batch["images"].shape].run(state, batch)
     assert int(state.step) == 1 and float(metrics["loss/total"]) > 0
+
+
+def test_steps_are_compiled_with_the_devices_options(
+    run_config: TrainConfig, pixel_model: Any, pixel_params: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[jax.Device] = []
+    monkeypatch.setattr(train_step, "quick_compilation", lambda device: asked.append(device) or {"xla_no_such": True})
+    mesh = data_mesh(2)
+    program = make_program(pixel_model, run_config, jax.eval_shape(lambda: pixel_params), mesh)
+    assert asked == [mesh.devices.flat[0]]
+    with pytest.raises(jax.errors.JaxRuntimeError, match="xla_no_such"):
+        next(compiled_steps(program, program.abstract_state(pixel_params), run_config.stages[0], SIZES[:1]))
 
 
 def test_the_step_of_a_distillation_takes_clips_with_the_teachers_confidence(

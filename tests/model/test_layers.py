@@ -1,0 +1,94 @@
+"""Parts of the transformer block in 16 bits: what they round, and what a stream's parameters look like."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.special import erf
+
+from logvggt_jax import LogVGGT, ModelConfig
+from logvggt_jax.model.layers import MLP, _gelu, dense
+from logvggt_jax.model.parameters import in_compute_type, stack_layers
+
+FRAMES = jax.ShapeDtypeStruct((1, 2, 28, 42, 3), jnp.uint8)
+
+
+def exact(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """x Φ(x) and its slope, float64."""
+    below = 0.5 * (1 + erf(x * math.sqrt(0.5)))
+    return x * below, below + x * np.exp(-x * x / 2) / math.sqrt(2 * math.pi)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+def test_gelu_is_exact_before_it_is_rounded(dtype: str) -> None:
+    x = np.concatenate([np.linspace(-12, 12, 20_001), [0.0, -0.0]]).astype(np.float32)
+    value, slope = exact(x.astype(np.float64))
+    assert np.abs(_gelu(x, dtype) - value).max() < 1e-6
+    assert np.abs(jax.vmap(jax.grad(lambda x: _gelu(x, dtype)))(x) - slope).max() < 1e-6
+    # A sixteenth of what bfloat16 rounds off, where that is more than nothing at all.
+    tail = (x > -4) & (x < 0)
+    assert (np.abs(_gelu(x, dtype) - value)[tail] < 2**-8 / 16 * np.abs(value[tail]) + 1e-6).all()
+
+
+def test_biases_are_added_to_sums_in_16_bits_without_another_rounding() -> None:
+    layer = dense(4, "layer", "bfloat16", sums="bfloat16")
+    x = jnp.ones((1, 8), jnp.bfloat16)
+    params = {"kernel": jnp.full((8, 4), 2.0), "bias": jnp.full(4, 2.0**-7)}
+    found = layer.apply({"params": params}, x)
+    # 16 + 1/128 has more digits than bfloat16.
+    assert found.dtype == jnp.float32 and (found == 16 + 2.0**-7).all()
+    part = layer.apply({"params": params | {"bias": jnp.arange(4.0)}}, x, slice(1, 3))
+    np.testing.assert_array_equal(part, [[17.0, 18.0]])
+
+
+def test_wide_values_are_16_bits_in_memory() -> None:
+    """Of the values between an MLP's products none is both wide and float32 when the first product hands it out."""
+    mlp = MLP(64, 16, "bfloat16")
+    x = jax.ShapeDtypeStruct((8, 16), jnp.float32)
+    text = jax.jit(mlp.apply).lower(jax.eval_shape(mlp.init, jax.random.key(0), x), x).as_text()
+    products = re.findall(r"dot_general.*-> tensor<(8x\d+x\w+)>", text)
+    assert products == ["8x64xbf16", "8x16xbf16"]
+
+
+@pytest.fixture
+def model(small_config: ModelConfig) -> LogVGGT:
+    return LogVGGT(dataclasses.replace(small_config, dtype="bfloat16"))
+
+
+def test_streams_have_queries_keys_and_values_side_by_side(model: LogVGGT, small_variables: Any) -> None:
+    given = small_variables["params"]["aggregator"]["global_block_0"]["attention"]
+    streamed = in_compute_type(small_variables, model.config)
+    found = streamed["params"]["aggregator"]["global_block_0"]["attention"]
+    assert found.keys() == given.keys() - {"query", "key_value"} | {"query_key_value"}
+    for name in ("kernel", "bias"):
+        both = np.concatenate([given["query"][name], given["key_value"][name]], axis=-1)
+        np.testing.assert_array_equal(found["query_key_value"][name], both.astype(jnp.bfloat16))
+    # GCCR's queries and keys are of different tokens; the camera head computes in float32.
+    assert (
+        "query" in streamed["params"]["gccr"] and "query" in streamed["params"]["camera_head"]["trunk_0"]["attention"]
+    )
+    again = in_compute_type(streamed, model.config)
+    jax.tree.map(np.testing.assert_array_equal, again, streamed)
+    stacked = in_compute_type(stack_layers(small_variables), model.config)
+    jax.tree.map(np.testing.assert_array_equal, stacked, stack_layers(streamed))
+
+
+def test_a_step_of_real_frames_selects_and_sorts_no_keys(model: LogVGGT, small_variables: Any) -> None:
+    variables = in_compute_type(small_variables, model.config)
+    state = jax.eval_shape(model.start, variables, FRAMES)
+
+    def keys_at_hand(operation: str, *mask: Any) -> list[str]:
+        text = jax.jit(model.step).lower(variables, state, FRAMES, *mask).as_text()
+        # [batch, keys of window and cache, heads, head_dim] of 11 tokens a frame.
+        return re.findall(rf"stablehlo\.{operation}.*1x66x2x16xbf16", text)
+
+    assert not keys_at_hand("select")
+    assert keys_at_hand("concatenate"), "keys of the cache come behind the window's own"
+    assert keys_at_hand("select", jax.ShapeDtypeStruct((1, 2), bool)), "padding may end the window"
