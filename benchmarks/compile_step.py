@@ -106,9 +106,12 @@ def describe_memory(compiled: jax.stages.Compiled) -> str:
 
 
 def describe_kernels(compiled: jax.stages.Compiled) -> str:
-    """How many of each kind, and what they move."""
-    found = kernels(compiled.as_text() or "").items()
-    return ", ".join(f"{each.count} {kind} ({each.size / 1e9:.2f} GB)" for kind, each in found)
+    """How many of each kind, and what they move; where the compiler counts that itself, which it does for TPUs and
+    whose programs hold what are no kernels, what it says, and those of attention."""
+    found = kernels(compiled.as_text() or "")
+    if moved := (compiled.cost_analysis() or {}).get("bytes accessed"):
+        return f"{found['attention'].count} attention, {moved / 1e9:.2f} GB accessed in all"
+    return ", ".join(f"{each.count} {kind} ({each.size / 1e9:.2f} GB)" for kind, each in found.items())
 
 
 def main() -> None:
