@@ -4,10 +4,13 @@
     python benchmarks/compile_step.py --target v5e:2x2x1 --target v5p:2x2x1
     python benchmarks/compile_step.py --target h100
     python benchmarks/compile_step.py --target cuda --masks
+    python benchmarks/compile_step.py --target h100 --train 4x12
 
 Described devices need their compiler and not themselves, see `logvggt_jax/described.py`: it runs on the CPU for one of
 them, and the memory figures are its own. Kernels are counted, with the bytes of what they read and write. `cuda` needs
 nothing: the program is lowered with a stand-in for JAX's check of the installed cuDNN, and nothing of it is compiled.
+`--train` compiles the training step of `configs/h20.py` instead, for so many clips of so many frames and a described
+device.
 """
 
 from __future__ import annotations
@@ -18,17 +21,24 @@ import functools
 import os
 import re
 import time
+from typing import Any
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh
 from kernels import kernels
 
 from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.described import attention_kernels, cudnn_by_description, described_devices
+from logvggt_jax.doctor.training import h20_step
 from logvggt_jax.model.logvggt import variable_shapes
-from logvggt_jax.model.parameters import in_compute_type
+from logvggt_jax.model.parameters import in_compute_type, stack_layers
+from logvggt_jax.training.parallel.sharding import DATA_AXIS, replicated, split
+from logvggt_jax.training.step.costs import abstract_clips
+from logvggt_jax.training.step.state import initial_state
 
 IMAGE_SIZE = (392, 518)
 GIB = 2**30
@@ -48,8 +58,7 @@ def abstract_step(model: LogVGGT, masked: bool, sharding: jax.sharding.Sharding 
     overlap = windows.size - windows.stride
     state = jax.eval_shape(model.start, variables, frames(overlap), None, masks(overlap))
     mask = jax.ShapeDtypeStruct((1, windows.stride), bool)
-    place = lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding)  # noqa: E731
-    return jax.tree.map(place, (variables, state, frames(windows.stride), mask, masks(windows.stride)))
+    return _placed((variables, state, frames(windows.stride), mask, masks(windows.stride)), sharding)
 
 
 def compile_for_cpu(config: ModelConfig, masked: bool) -> tuple[float, float, jax.stages.Compiled]:
@@ -71,6 +80,23 @@ def compile_for_described(config: ModelConfig, masked: bool, name: str) -> jax.s
         model = LogVGGT(dataclasses.replace(config, attention=attention))
         step = jax.jit(model.step, donate_argnums=1)
         return step.lower(*abstract_step(model, masked, jax.sharding.SingleDeviceSharding(device))).compile()
+
+
+def compile_training(config: ModelConfig, name: str, clips: int, frames: int) -> jax.stages.Compiled:
+    """The training step that `logvggt doctor` examines, for one of the devices that `described_devices` knows."""
+    device = described_devices(name)[0]
+    mesh = Mesh(np.array([device]), (DATA_AXIS,))
+    with attention_kernels(device) as attention:
+        model = LogVGGT(dataclasses.replace(config, attention=attention))
+        params = jax.eval_shape(stack_layers, variable_shapes(model.config)["params"])
+        step, optimizer = h20_step(model, params, mesh)
+        state = jax.eval_shape(lambda params: initial_state(params, optimizer), params)
+        arguments = (state, replicated(mesh)), (abstract_clips(clips, frames, IMAGE_SIZE), split(mesh))
+        return step.lower(*(_placed(tree, sharding) for tree, sharding in arguments)).compile()
+
+
+def _placed(tree: Any, sharding: jax.sharding.Sharding) -> Any:
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding), tree)
 
 
 def lower_for_cuda(config: ModelConfig, masked: bool) -> str:
@@ -120,9 +146,11 @@ def main() -> None:
     parser.add_argument("--target", action="append", help="cpu, cuda, v5p:2x2x1, h100, …; default cpu")
     parser.add_argument("--dtype", default="bfloat16")
     parser.add_argument("--masks", action="store_true", help="a step of a stream with masks of pixels")
+    parser.add_argument("--train", metavar="CLIPSxFRAMES", help="the training step, for described devices")
     options = parser.parse_args()
     config = ModelConfig(dtype=options.dtype)
-    print(f"VGGT-1B sizes, one step of 2 new frames {IMAGE_SIZE[0]}x{IMAGE_SIZE[1]}, {options.dtype}")
+    what = f"training step, clips {options.train} of" if options.train else "one step of 2 new frames"
+    print(f"VGGT-1B sizes, {what} {IMAGE_SIZE[0]}x{IMAGE_SIZE[1]}, {options.dtype}")
     for target in options.target or ["cpu"]:
         if target == "cpu":
             lowering, compilation, compiled = compile_for_cpu(config, options.masks)
@@ -133,7 +161,11 @@ def main() -> None:
             print(f"cuda: lowered, {calls} calls of cuDNN attention (not compiled, not run)")
         else:
             started = time.perf_counter()
-            compiled = compile_for_described(config, options.masks, target)
+            if options.train:
+                clips, frames = (int(number) for number in options.train.split("x"))
+                compiled = compile_training(config, target, clips, frames)
+            else:
+                compiled = compile_for_described(config, options.masks, target)
             seconds = time.perf_counter() - started
             print(f"{target}: compiled in {seconds:.0f} s; {describe_memory(compiled)}; {describe_kernels(compiled)}")
 

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections import defaultdict
 from typing import NamedTuple
 
+from logvggt_jax.doctor.inference import ATTENTION_CALLS
+from logvggt_jax.training.step.costs import bytes_of
+
 _COMPUTATION = re.compile(r"^(ENTRY )?%?([\w.\-]+) \(.*\) -> .* \{$")
 _INSTRUCTION = re.compile(r"^\s+(?:ROOT )?%?([\w.\-]+) = (\([^=]*?\)|\S+) ([\w\-]+)\((.*)$")
-_ARRAY = re.compile(r"\b(pred|[a-z]+(\d+)\w*)\[([\d,]*)\]")
 # What takes no kernel of its own.
 _FREE = {"parameter", "constant", "get-tuple-element", "tuple", "bitcast", "after-all"}
-_ATTENTION, _PRODUCT = ("__cudnn$fmha", "tpu_custom_call"), ("__cublas", " dot(")
+_PRODUCT = ("__cublas", " dot(")
 
 
 class Kernels(NamedTuple):
@@ -26,14 +27,18 @@ def kernels(program: str) -> dict[str, Kernels]:
     """Kernels of one run by what they are: `attention`, `products`, `convolutions` or `others`.
 
     Loops count as often as they run where the program says how often that is.
+
+    Raises:
+      ValueError: a line of the program is not understood.
     """
     bodies: dict[str, list[str]] = defaultdict(list)
     entry = name = ""
-    for line in program.splitlines():
+    # Wide tuples are numbered in comments.
+    for line in re.sub(r"/\*.*?\*/", "", program).splitlines():
         if match := _COMPUTATION.match(line):
             name = match[2]
             entry = name if match[1] else entry
-        elif line.startswith("  "):
+        elif name and line.startswith("  ") and " = " in line:
             bodies[name].append(line)
     found: dict[str, Kernels] = dict.fromkeys(("attention", "products", "convolutions", "others"), Kernels(0, 0))
 
@@ -42,9 +47,9 @@ def kernels(program: str) -> dict[str, Kernels]:
         for line in bodies[computation]:
             match = _INSTRUCTION.match(line)
             if match is None:
-                continue
+                raise ValueError(f"not an instruction: {line.strip():.100}")
             result, shapes, operation, rest = match.groups()
-            sizes[result] = _size(shapes)
+            sizes[result] = bytes_of(shapes)
             if operation in _FREE:
                 continue
             if operation in ("while", "call"):
@@ -64,16 +69,8 @@ def kernels(program: str) -> dict[str, Kernels]:
     return found
 
 
-def _size(shapes: str) -> int:
-    total = 0
-    for kind, bits, sides in _ARRAY.findall(shapes):
-        items = math.prod(int(side) for side in sides.split(",") if side)
-        total += items * (1 if kind == "pred" else max(1, int(bits) // 8))
-    return total
-
-
 def _kind(text: str) -> str:
-    if any(name in text for name in _ATTENTION):
+    if any(name in text for name in ATTENTION_CALLS.values()):
         return "attention"
     if any(name in text for name in _PRODUCT):
         return "products"

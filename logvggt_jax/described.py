@@ -16,19 +16,19 @@ from logvggt_jax.errors import InputError, MissingPackage, install_line, one_lin
 
 @dataclasses.dataclass(frozen=True)
 class _GPU:
-    """What XLA asks of a GPU of NVIDIA's Hopper generation; makers' data sheets."""
+    """What XLA asks of a GPU of NVIDIA's Hopper generation, by its data sheet."""
 
     kind: str
     multiprocessors: int
-    memory: int  # bytes
+    memory: int  # bytes, as nvidia-smi gives them
     bandwidth: float  # bytes a second
     level_2_cache: int  # bytes
 
 
 _GPUS = {
-    "h20": _GPU("NVIDIA H20", 78, 96 * 10**9, 4.0e12, 60 * 2**20),
-    "h100": _GPU("NVIDIA H100 80GB HBM3", 132, 80 * 2**30, 3.35e12, 50 * 2**20),
-    "h200": _GPU("NVIDIA H200", 132, 141 * 10**9, 4.8e12, 60 * 2**20),
+    "h20": _GPU("NVIDIA H20", 78, 97_871 * 2**20, 4.0e12, 60 * 2**20),
+    "h100": _GPU("NVIDIA H100 80GB HBM3", 132, 81_559 * 2**20, 3.35e12, 50 * 2**20),
+    "h200": _GPU("NVIDIA H200", 132, 143_771 * 2**20, 4.8e12, 60 * 2**20),
 }
 # Of a GPU's memory; what JAX takes unless told otherwise.
 _SHARE = 0.75
@@ -78,21 +78,21 @@ def described_devices(name: str) -> list[jax.Device]:
       InputError: no such devices are known.
       MissingPackage: their compiler is not installed.
     """
-    kind, _, count = name.partition(":")
+    kind, _, count = name.lower().partition(":")
     if kind in _GPUS:
         return _gpus(name, kind, count or "1")
+    expected = f"expected a TPU slice like v5p:2x2x4, or GPUs ({', '.join(_GPUS)}) like h100:16"
     if importlib.util.find_spec("libtpu") is None:
-        raise MissingPackage(f"{name}: TPUs are described by the libtpu package: pip install libtpu")
+        raise MissingPackage(f"{name}: {expected}; TPUs are described by the libtpu package: pip install libtpu")
     # Otherwise it asks the network which TPU this machine has.
     os.environ.setdefault("TPU_SKIP_MDS_QUERY", "1")
-    expected = f"expected a TPU slice like v5p:2x2x4, or GPUs ({', '.join(_GPUS)}) like h100:16"
     return _topology(f"{name}: no such devices, {expected}", topology_name=name, platform="tpu")
 
 
 def _gpus(name: str, kind: str, count: str) -> list[jax.Device]:
     if not count.isdecimal() or int(count) < 1:
         raise InputError(f"{name}: expected a number of GPUs after the colon, as in {kind}:16")
-    if not any(importlib.util.find_spec(f"jax_cuda{version}_plugin") for version in _CUDA_VERSIONS):
+    if not gpu_compiler_installed():
         raise MissingPackage(f"{name}: GPUs are described by JAX for CUDA: {install_line('cuda')}")
     failure = f"{name}: this JAX cannot describe GPUs; where there is none it needs JAX_PLATFORMS=cpu"
     target = _TARGET.format(**dataclasses.asdict(_GPUS[kind]))
@@ -109,6 +109,11 @@ def _topology(failure: str, **description: Any) -> list[jax.Device]:
         raise InputError(f"{failure} ({one_line(error):.200})") from error
 
 
+def gpu_compiler_installed() -> bool:
+    """Whether JAX for CUDA is installed, which brings the compiler."""
+    return any(importlib.util.find_spec(f"jax_cuda{version}_plugin") for version in _CUDA_VERSIONS)
+
+
 def described_bytes(device: jax.Device) -> int | None:
     """Bytes of a described GPU that programs may use, as JAX shares its memory out; None for others."""
     gpu = next((gpu for gpu in _GPUS.values() if gpu.kind == device.device_kind), None)
@@ -117,17 +122,22 @@ def described_bytes(device: jax.Device) -> int | None:
 
 @contextlib.contextmanager
 def attention_kernels(device: jax.Device) -> Iterator[str]:
-    """Gives the `ModelConfig.attention` of a device that `auto` would not know, since it is described."""
-    if device.platform == "gpu":
+    """Gives the `ModelConfig.attention` that a described device would have; `auto` for one that is there, and is asked
+    itself."""
+    if device in jax.devices():
+        yield "auto"
+    elif device.platform == "gpu":
         with cudnn_by_description():
             yield "cudnn"
     else:
-        yield "tpu_flash" if device.platform == "tpu" else "auto"
+        yield "tpu_flash"
 
 
 @contextlib.contextmanager
 def cudnn_by_description() -> Iterator[None]:
-    """JAX lowers cuDNN's attention as for a Hopper GPU with cuDNN 9.10, and does not ask the one at hand."""
+    """JAX lowers cuDNN's attention as for a Hopper GPU with cuDNN 9.10, and does not ask the one at hand.
+
+    Raises InputError where this JAX asks in another way."""
     from jax._src.cudnn import fused_attention_stablehlo as module
 
     answers = {
@@ -135,7 +145,10 @@ def cudnn_by_description() -> Iterator[None]:
         "check_compute_capability": lambda capability: True,
         "is_cuda_compute_capability_equal": lambda capability: capability == "9.0",
     }
-    held = {name: getattr(module, name) for name in answers}
+    try:
+        held = {name: getattr(module, name) for name in answers}
+    except AttributeError as error:
+        raise InputError(f"JAX {jax.__version__} cannot lower cuDNN's attention for GPUs that are not there") from error
     for name, answer in answers.items():
         setattr(module, name, answer)
     try:

@@ -14,6 +14,7 @@ from root_programs import RootPrograms
 from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.data.feeding.holdouts import PUBLISHED
 from logvggt_jax.data.rooms.rooms import Rooms
+from logvggt_jax.described import cudnn_by_description
 from logvggt_jax.errors import MissingInput
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.parallel.sharding import check_batch_size, data_mesh
@@ -224,20 +225,17 @@ def _check_step(
         raise AssertionError("attention takes its general form")
 
     monkeypatch.setattr("logvggt_jax.model.attention._blockwise", refuse)
-    # JAX asks the GPU at hand, which may be none.
-    cudnn = "jax._src.cudnn.fused_attention_stablehlo"
-    monkeypatch.setattr(f"{cudnn}.check_cudnn_version", lambda: 91000)
-    monkeypatch.setattr(f"{cudnn}.check_compute_capability", lambda _: True)
-    monkeypatch.setattr(f"{cudnn}.is_cuda_compute_capability_equal", lambda _: False)
     platform, forward, backward = FAST_ATTENTION[attention]
     config = dataclasses.replace(config, model=dataclasses.replace(config.model, attention=attention))
     state, step = _abstract_run(config, 16)
     stage = config.stages[stage_index]
-    traced = step.trace(state, abstract_clips(stage.batch_size, stage.clip_length, size))
+    # JAX would ask the GPU at hand, which may be none.
+    with cudnn_by_description():
+        traced = step.trace(state, abstract_clips(stage.batch_size, stage.clip_length, size))
+        program = traced.lower(lowering_platforms=(platform,)).as_text()
     after, metrics, _ = traced.out_info
     assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(lambda x: (x.shape, x.dtype), state)
     assert all(value.shape == () for value in metrics.values())
-    program = traced.lower(lowering_platforms=(platform,)).as_text()
     # Layers and windows are loops, so that a kernel is in the program a few times and runs many: attention of a frame
     # and of a window with its cache at least.
     assert program.count(backward) >= 2 and program.count(forward) >= 2

@@ -17,7 +17,8 @@ from logvggt_jax.model.logvggt import LogVGGT, variable_shapes
 from logvggt_jax.model.parameters import in_compute_type, stack_layers
 from logvggt_jax.operations import count_flops, matmul_flops_per_second
 
-_ATTENTION_CALLS = {"gpu": "__cudnn$fmha", "tpu": "tpu_custom_call"}
+# How compiled programs call the fast attention of a platform.
+ATTENTION_CALLS = {"gpu": "__cudnn$fmha", "tpu": "tpu_custom_call"}
 
 
 def examine(subject: Subject) -> Iterator[Finding]:
@@ -89,7 +90,7 @@ def step_seconds(step: Any, variables: Any, state: Any, frames: jax.Array, count
 
 def attention_calls(program: jax.stages.Compiled) -> int | None:
     """Calls of the platform's fast attention in a compiled program; None where the platform has none (CPUs)."""
-    call = _ATTENTION_CALLS.get(jax.default_backend())
+    call = ATTENTION_CALLS.get(jax.default_backend())
     return None if call is None else (program.as_text() or "").count(call)
 
 

@@ -8,11 +8,14 @@ from typing import Any
 
 import jax
 import numpy as np
+import optax
+from jax.sharding import Mesh
 
 from logvggt_jax.compile import out_of_device_memory
 from logvggt_jax.doctor.finding import Finding
 from logvggt_jax.doctor.inference import attention_calls
 from logvggt_jax.doctor.subject import Subject, random_variables
+from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.model.parameters import stack_layers
 from logvggt_jax.operations import matmul_flops_per_second
 from logvggt_jax.training.config import LossConfig, OptimizerConfig
@@ -56,9 +59,7 @@ def examine(subject: Subject) -> Iterator[Finding]:
     length = 3 if subject.tiny else 12
     # On the host: the device holds one state at a time.
     params = jax.tree.map(np.asarray, stack_layers(random_variables(model))["params"])
-    optimizer = make_optimizer(_OPTIMIZER, params, frozen=(ENCODER,))
-    layout = parameter_layout(params, mesh, shard=False)
-    step = make_train_step(make_loss_terms(model, _LOSS), _LOSS, optimizer, lambda _: 1e-6, layout)
+    step, optimizer = h20_step(model, params, mesh)
     peak = matmul_flops_per_second("bfloat16", size=256 if subject.tiny else None)
     begun = time.perf_counter()
     for clips in (1,) if subject.tiny or subject.quick else (4, 1, 2, 3):
@@ -75,6 +76,14 @@ def examine(subject: Subject) -> Iterator[Finding]:
         now = time.perf_counter()
         if 2 * now - started - begun > _SECONDS:  # another one would take as long as this one
             return
+
+
+def h20_step(model: LogVGGT, params: Any, mesh: Mesh) -> tuple[jax.stages.Wrapped, optax.GradientTransformation]:
+    """The training step of `configs/h20.py` for a model whose layers are stacked in `params` (arrays, or their shapes),
+    and its optimiser, see `make_train_step`."""
+    optimizer = make_optimizer(_OPTIMIZER, params, frozen=(ENCODER,))
+    layout = parameter_layout(params, mesh, shard=False)
+    return make_train_step(make_loss_terms(model, _LOSS), _LOSS, optimizer, lambda _: 1e-6, layout), optimizer
 
 
 def _measured(

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from logvggt_jax.model.attention import attention
-from logvggt_jax.model.layers import dense, layer_norm
+from logvggt_jax.model.layers import dense, layer_norm, sums_of
 
 
 class RegisterKeys(NamedTuple):
@@ -40,9 +40,9 @@ class GCCR(nn.Module):
     def setup(self) -> None:
         self.camera_norm = layer_norm(1e-5, "camera_norm")
         self.register_norm = layer_norm(1e-5, "register_norm")
-        self.query = dense(self.width, "query", self.dtype, sums=self.dtype)
-        self.key = dense(self.width, "key", self.dtype, sums=self.dtype)
-        self.value = dense(self.width, "value", self.dtype, sums=self.dtype)
+        self.query = dense(self.width, "query", self.dtype, sums=sums_of(self.dtype))
+        self.key = dense(self.width, "key", self.dtype, sums=sums_of(self.dtype))
+        self.value = dense(self.width, "value", self.dtype, sums=sums_of(self.dtype))
         self.output = dense(self.width, "output", self.dtype, kernel_init=nn.initializers.zeros_init())
 
     def __call__(self, camera_tokens: jax.Array, register_tokens: jax.Array, frames: jax.Array) -> jax.Array:

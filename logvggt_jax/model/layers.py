@@ -24,22 +24,25 @@ class _Dense(Dense):
     sums: str = "float32"
 
     @nn.compact
-    def __call__(self, inputs: jax.Array, part: slice = slice(None)) -> jax.Array:
-        """Float32 [..., features], or a part of the features: the product of all is the same for every part, and made
-        once. Biases come after the cut, where the kernels that read a part add them."""
+    def __call__(self, inputs: jax.Array, *, columns: slice = slice(None), cuts: tuple[int, ...] = ()) -> Any:
+        """Float32 [..., features], those of some `columns` of the kernel alone; with `cuts` a list of the parts between
+        them. Biases are added after the cuts, by the kernels that read a part."""
         if self.has_variable("params", "codes"):
             given: Any = self.variables["params"]
-            sums, bias = product(inputs, given["codes"], given["scale"]), given["bias"]
+            bias = given["bias"]
+            sums = product(inputs, given["codes"][:, columns], given["scale"][:, columns])
         else:
             kernel = self.param("kernel", self.kernel_init, (inputs.shape[-1], self.features))
-            bias = self.param("bias", self.bias_init, (self.features,))
+            bias = self.param("bias", self.bias_init, (self.features,)).astype(self.dtype)
             sums = jnp.matmul(
                 inputs.astype(self.dtype),
-                kernel.astype(self.dtype),
+                kernel[:, columns].astype(self.dtype),
                 precision=self.precision,
                 preferred_element_type=jnp.dtype(self.sums),
             )
-        return sums[..., part].astype(jnp.float32) + bias.astype(self.dtype)[part].astype(jnp.float32)
+        pairs = zip(jnp.split(sums, cuts, axis=-1), jnp.split(bias[columns], cuts), strict=True)
+        parts = [part.astype(jnp.float32) + added.astype(jnp.float32) for part, added in pairs]
+        return parts if cuts else parts[0]
 
 
 def dense(
@@ -57,6 +60,11 @@ def dense(
         bias_init=constant(0.0),
         name=name,
     )
+
+
+def sums_of(dtype: str) -> str:
+    """The type in which wide sums of products of `dtype` are handed on: bfloat16 has float32's range, float16 not."""
+    return "bfloat16" if dtype == "bfloat16" else "float32"
 
 
 def layer_norm(
@@ -98,14 +106,13 @@ def with_special(seen: jax.Array, count: int) -> jax.Array:
 
 
 def _gelu(x: jax.Array, dtype: str) -> jax.Array:
-    """x Φ(x), exact, of float32 values that products of `dtype` read."""
+    """x Φ(x) of float32 values that products of `dtype` read: exact, or to 3e-7 where they round it to 16 bits."""
     return jax.nn.gelu(x, approximate=False) if dtype == "float32" else _gelu_before_rounding(x)
 
 
 @jax.custom_jvp
 def _gelu_before_rounding(x: jax.Array) -> jax.Array:
-    """x Φ(x) to 3e-7, for what is rounded to 16 bits next: an elementary Φ costs a GPU no more than reading and writing
-    the values, where `erf` costs as much again."""
+    """An elementary Φ costs a GPU little more than reading and writing the values, of which `erf` costs half again."""
     return x * _normal_distribution(x)
 
 
@@ -127,7 +134,7 @@ def _normal_distribution(x: jax.Array) -> jax.Array:
 
 
 class MLP(nn.Module):
-    """fc2(GELU(fc1(x))) with the exact (erf) GELU."""
+    """fc2(GELU(fc1(x))) with the exact GELU, see `_gelu`."""
 
     hidden: int
     features: int
@@ -135,18 +142,18 @@ class MLP(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        x = dense(self.hidden, "fc1", self.dtype, sums=self.dtype)(x)
+        x = dense(self.hidden, "fc1", self.dtype, sums=sums_of(self.dtype))(x)
         x = _gelu(x, self.dtype).astype(self.dtype)
-        return dense(self.features, "fc2", self.dtype, sums=self.dtype)(x)
+        return dense(self.features, "fc2", self.dtype, sums=sums_of(self.dtype))(x)
 
 
 class Attention(nn.Module):
     """Multi-head attention in four parts, between which a memory can come in; the block puts them together.
 
-    `queries` and `keys` project the block's tokens, `attend` lets queries see keys and has no parameters, and calling
-    the module projects the result back to the residual stream. With `qk_norm` queries and keys are normalised per head,
-    before the rotary embedding, in float32. Parameters for streams have the first two projections side by side, as
-    `query_key_value`, see `parameters.in_compute_type`.
+    `project` makes queries and keys of the block's own tokens, `keys` those of others; `attend` lets queries see keys
+    and has no parameters, and calling the module projects the result back to the residual stream. With `qk_norm`
+    queries and keys are normalised per head, before the rotary embedding, in float32. Parameters for streams have the
+    projections side by side, as `query_key_value`, see `parameters.in_compute_type`.
     """
 
     num_heads: int
@@ -156,29 +163,43 @@ class Attention(nn.Module):
     implementation: str
 
     def setup(self) -> None:
-        self.query = dense(self.width, "query", self.dtype, sums=self.dtype)
-        self.key_value = dense(2 * self.width, "key_value", self.dtype, sums=self.dtype)
-        self.query_key_value = dense(3 * self.width, "query_key_value", self.dtype, sums=self.dtype)
-        self.output = dense(self.width, "output", self.dtype, sums=self.dtype)
+        self.query = dense(self.width, "query", self.dtype, sums=sums_of(self.dtype))
+        self.key_value = dense(2 * self.width, "key_value", self.dtype, sums=sums_of(self.dtype))
+        self.query_key_value = dense(3 * self.width, "query_key_value", self.dtype, sums=sums_of(self.dtype))
+        self.output = dense(self.width, "output", self.dtype, sums=sums_of(self.dtype))
         if self.qk_norm:
             self.query_norm = layer_norm(1e-5, "query_norm", self.dtype)
             self.key_norm = layer_norm(1e-5, "key_norm", self.dtype)
 
-    def queries(self, normed: jax.Array, rope: RopeTable | None) -> jax.Array:
-        """Queries [B, N, heads, head_dim] in the compute type of tokens [B, N, C] after the block's LayerNorm."""
-        query = self._heads(self.query_key_value(normed, slice(self.width)) if self._joint else self.query(normed))
+    def project(
+        self, normed: jax.Array, rope: RopeTable | None, valid: jax.Array | None = None
+    ) -> tuple[jax.Array, Keys]:
+        """Queries [B, N, heads, head_dim] and keys, in the compute type, of tokens [B, N, C] after the block's
+        LayerNorm; see `Keys`."""
+        if self._joint:
+            query, key, value = self.query_key_value(normed, cuts=(self.width, 2 * self.width))
+        else:
+            query, (key, value) = self.query(normed), self.key_value(normed, cuts=(self.width,))
+        query = self._heads(query)
         if self.qk_norm:
             query = self.query_norm(query)
-        return (query if rope is None else apply_rope(query, rope)).astype(self.dtype)
+        query = (query if rope is None else apply_rope(query, rope)).astype(self.dtype)
+        return query, self._keys(key, value, rope, valid)
 
-    def keys(self, normed: jax.Array, rope: RopeTable | None, valid: jax.Array | None = None) -> Keys:
-        """Keys and values in the compute type of tokens [B, N, C] after the block's LayerNorm; see `Keys`."""
-        both = self.query_key_value(normed, slice(self.width, None)) if self._joint else self.key_value(normed)
-        key, value = (self._heads(x) for x in jnp.split(both, 2, axis=-1))
+    def keys(self, normed: jax.Array, rope: RopeTable | None) -> Keys:
+        """Keys and values in the compute type of tokens [B, N, C] after the block's LayerNorm."""
+        if self._joint:
+            key, value = self.query_key_value(normed, columns=slice(self.width, None), cuts=(self.width,))
+        else:
+            key, value = self.key_value(normed, cuts=(self.width,))
+        return self._keys(key, value, rope, None)
+
+    def _keys(self, key: jax.Array, value: jax.Array, rope: RopeTable | None, valid: jax.Array | None) -> Keys:
+        key = self._heads(key)
         if self.qk_norm:
             key = self.key_norm(key)
         key = key if rope is None else apply_rope(key, rope)
-        return Keys(key.astype(self.dtype), value.astype(self.dtype), valid)
+        return Keys(key.astype(self.dtype), self._heads(value).astype(self.dtype), valid)
 
     def attend(self, query: jax.Array, keys: Keys) -> jax.Array:
         """The softmax-weighted mean of the values for each query [B, Q, heads, head_dim], in the same shape."""
@@ -240,7 +261,7 @@ class Block(nn.Module):
         # Token by token, for any number of frames at once: so the same kernels serve frame and global blocks.
         rows, shape = x.reshape(-1, width), x.shape
         normed = norm1(rows).reshape(shape)
-        own = OwnTokens(normed, attention_.queries(normed, rope), attention_.keys(normed, rope, valid))
+        own = OwnTokens(normed, *attention_.project(normed, rope, valid))
         if memory is None:
             taken = attention_.attend(own.query, own.keys)
         else:

@@ -17,7 +17,7 @@ from logvggt_jax.files import atomic_file, to_disk
 from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.streaming.predictor import METHODS, Predictor, open_predictor
 from logvggt_jax.streaming.results import FrameResult
-from logvggt_jax.weights.digests import json_digest, named_leaves
+from logvggt_jax.weights.digests import bytes_of, json_digest, named_leaves
 
 
 class State(NamedTuple):
@@ -125,5 +125,5 @@ def _digest(facts: str, arrays: Mapping[str, np.ndarray]) -> str:
     digest = hashlib.blake2b(facts.encode(), digest_size=16)
     for name in sorted(arrays):
         digest.update(f"{name} {arrays[name].dtype.name} {arrays[name].shape}".encode())
-        digest.update(np.ascontiguousarray(arrays[name]).reshape(-1).view(np.uint8).data)  # no copy of its bytes
+        digest.update(bytes_of(arrays[name]))
     return digest.hexdigest()

@@ -89,6 +89,11 @@ def whole_array(leaf: Any) -> np.ndarray:
     return np.asarray(leaf)
 
 
+def bytes_of(array: np.ndarray) -> memoryview:
+    """The array's bytes in C order, without a copy where they lie so."""
+    return np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
+
+
 def _on_the_host(leaf: Any) -> np.ndarray:
     if isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
         leaf = jax.random.key_data(leaf)
@@ -97,5 +102,5 @@ def _on_the_host(leaf: Any) -> np.ndarray:
 
 def _digest(array: np.ndarray) -> str:
     digest = hashlib.blake2b(f"{array.dtype.name}{array.shape}".encode(), digest_size=_SIZE)
-    digest.update(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)  # no copy of its bytes
+    digest.update(bytes_of(array))
     return digest.hexdigest()

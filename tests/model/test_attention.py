@@ -11,6 +11,7 @@ import pytest
 from absl import logging
 from jax.experimental.pallas import tpu as pallas_tpu
 
+from logvggt_jax.described import cudnn_by_description
 from logvggt_jax.model import attention as module
 from logvggt_jax.model.attention import attention
 
@@ -140,15 +141,11 @@ def test_the_tpu_kernel_computes_the_textbook(masked):
     np.testing.assert_allclose(np.asarray(out, np.float32), textbook(query, key, value, valid), atol=2e-2)
 
 
-CUDNN = "jax._src.cudnn.fused_attention_stablehlo"
-
-
 @pytest.fixture
-def cudnn_for_lowering(monkeypatch):
+def cudnn_for_lowering():
     """JAX asks the GPU at hand about cuDNN; programs can be lowered without one."""
-    monkeypatch.setattr(f"{CUDNN}.check_cudnn_version", lambda: 91000)
-    monkeypatch.setattr(f"{CUDNN}.check_compute_capability", lambda _: True)
-    monkeypatch.setattr(f"{CUDNN}.is_cuda_compute_capability_equal", lambda _: False)
+    with cudnn_by_description():
+        yield
 
 
 def gradients_of(*arguments, **options):

@@ -12,7 +12,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import pytest
+from kernels import kernels
+
+from logvggt_jax.described import gpu_compiler_installed
 
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "compile_step.py"
 # Encoder, frame and global blocks of VGGT-1B: one attention each.
@@ -58,7 +63,7 @@ def test_compiles_for_a_described_tpu_with_the_flash_kernel(topology: str, memor
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(importlib.util.find_spec("jax_cuda13_plugin") is None, reason="needs JAX for CUDA, and no GPU")
+@pytest.mark.skipif(not gpu_compiler_installed(), reason="needs the compiler that JAX for CUDA brings, and no GPU")
 def test_compiles_for_a_described_gpu_with_few_kernels() -> None:
     line = described("h100")
     assert figure(r"(\d+) attention", line) == ATTENTIONS
@@ -79,3 +84,22 @@ def test_lowers_for_cuda_with_cudnn_attention(options: tuple[str, ...]) -> None:
 def test_lowers_and_compiles_for_a_cpu_within_a_minute() -> None:
     line = described("cpu")
     assert figure(r"lowered in ([\d.]+) s", line) + figure(r"compiled in ([\d.]+) s", line) < 60
+
+
+def test_kernels_are_counted_as_often_as_they_run() -> None:
+    def step(carried: tuple[jax.Array, ...], _: None) -> tuple[tuple[jax.Array, ...], None]:
+        return tuple(jnp.sin(x @ x) for x in carried), None
+
+    factors = tuple(jnp.eye(64) * (1 + i) for i in range(6))
+    program = jax.jit(lambda x: jax.lax.scan(step, x, None, length=5)[0]).lower(factors).compile().as_text()
+    assert "/*index=5*/" in program, "a tuple so wide that XLA numbers it"
+    found = kernels(program)
+    assert found["products"].count == 6 * 5
+    # Two operands, which are one array, and the result.
+    assert found["products"].size >= 6 * 5 * 2 * 4 * 64 * 64
+    assert found["attention"] == (0, 0) == found["convolutions"]
+    wide = ", ".join("f32[4]" for _ in range(6))
+    text = f"ENTRY %main (x: f32[4]) -> ({wide}) {{\n  %x = f32[4] parameter(0)\n  ROOT %y = ({wide}) fusion(%x)\n}}\n"
+    assert kernels(text)["others"] == (1, 7 * 16)
+    with pytest.raises(ValueError, match="not an instruction"):
+        kernels(text.replace("fusion(%x)", "fusion"))

@@ -14,8 +14,10 @@ import pytest
 from scipy.special import erf
 
 from logvggt_jax import LogVGGT, ModelConfig
-from logvggt_jax.model.layers import MLP, _gelu, dense
+from logvggt_jax.described import cudnn_by_description
+from logvggt_jax.model.layers import MLP, _gelu, dense, sums_of
 from logvggt_jax.model.parameters import in_compute_type, stack_layers
+from logvggt_jax.operations import count_flops
 
 FRAMES = jax.ShapeDtypeStruct((1, 2, 28, 42, 3), jnp.uint8)
 
@@ -44,8 +46,28 @@ def test_biases_are_added_to_sums_in_16_bits_without_another_rounding() -> None:
     found = layer.apply({"params": params}, x)
     # 16 + 1/128 has more digits than bfloat16.
     assert found.dtype == jnp.float32 and (found == 16 + 2.0**-7).all()
-    part = layer.apply({"params": params | {"bias": jnp.arange(4.0)}}, x, slice(1, 3))
-    np.testing.assert_array_equal(part, [[17.0, 18.0]])
+    params["bias"] = jnp.arange(4.0)
+    first, second = layer.apply({"params": params}, x, columns=slice(1, None), cuts=(2,))
+    np.testing.assert_array_equal(first, [[17.0, 18.0]])
+    np.testing.assert_array_equal(second, [[19.0]])
+
+
+def test_float16_hands_on_what_it_cannot_hold() -> None:
+    layer = dense(1, "layer", "float16", sums=sums_of("float16"))
+    params = {"kernel": jnp.full((4, 1), 2.0**15), "bias": jnp.zeros(1)}
+    assert layer.apply({"params": params}, jnp.ones((1, 4))) == 2.0**17
+    assert sums_of("bfloat16") == "bfloat16"
+
+
+def test_operations_are_the_same_in_the_form_of_streams(model: LogVGGT, small_variables: Any) -> None:
+    """Queries, keys and values of a block's own tokens are one product, keys of stored ones no more than theirs."""
+    plain = LogVGGT(dataclasses.replace(model.config, attention="xla"))
+    state = jax.eval_shape(plain.start, small_variables, FRAMES)
+    given, streamed = (
+        count_flops(plain.step, variables, state, FRAMES)
+        for variables in (small_variables, in_compute_type(small_variables, model.config))
+    )
+    assert streamed == given
 
 
 def test_wide_values_are_16_bits_in_memory() -> None:
@@ -81,14 +103,21 @@ def test_streams_have_queries_keys_and_values_side_by_side(model: LogVGGT, small
 
 
 def test_a_step_of_real_frames_selects_and_sorts_no_keys(model: LogVGGT, small_variables: Any) -> None:
+    model = LogVGGT(dataclasses.replace(model.config, attention="cudnn"))
     variables = in_compute_type(small_variables, model.config)
-    state = jax.eval_shape(model.start, variables, FRAMES)
 
-    def keys_at_hand(operation: str, *mask: Any) -> list[str]:
-        text = jax.jit(model.step).lower(variables, state, FRAMES, *mask).as_text()
-        # [batch, keys of window and cache, heads, head_dim] of 11 tokens a frame.
-        return re.findall(rf"stablehlo\.{operation}.*1x66x2x16xbf16", text)
+    def lowered(frame_mask: Any = None, masks: Any = None) -> str:
+        held = None if masks is None else jax.ShapeDtypeStruct((1, 2, 28, 42), bool)
+        state = jax.eval_shape(model.start, variables, FRAMES, None, held)
+        traced = jax.jit(model.step).trace(variables, state, FRAMES, frame_mask, masks)
+        return traced.lower(lowering_platforms=("cuda",)).as_text()
 
-    assert not keys_at_hand("select")
-    assert keys_at_hand("concatenate"), "keys of the cache come behind the window's own"
-    assert keys_at_hand("select", jax.ShapeDtypeStruct((1, 2), bool)), "padding may end the window"
+    some_frames, some_pixels = jax.ShapeDtypeStruct((1, 2), bool), jax.ShapeDtypeStruct((1, 2, 28, 42), bool)
+    with cudnn_by_description():
+        all_real, padded, masked = lowered(), lowered(some_frames), lowered(some_frames, some_pixels)
+    # [batch, keys of window and cache, heads, head_dim] of 11 tokens a frame.
+    keys = "1x66x2x16xbf16"
+    assert re.search(rf"stablehlo.concatenate.*{keys}", all_real), "keys of the cache come behind the window's own"
+    assert not re.search(rf"stablehlo.select.*{keys}", all_real) and "stablehlo.sort" not in all_real
+    assert re.search(rf"stablehlo.select.*{keys}", padded), "padding may end the window"
+    assert "stablehlo.sort" in masked, "keys that count go first"

@@ -111,10 +111,15 @@ def collectives(program: str) -> dict[str, tuple[int, int]]:
     """
     found: dict[str, tuple[int, int]] = {}
     for shapes, name in _COLLECTIVE.findall(program):
-        size = 0
-        for kind, bits, shape in _ARRAY.findall(shapes):
-            items = math.prod(int(side) for side in shape.split(",") if side)
-            size += items * (1 if kind == "pred" else int(bits) // 8)
         count, total = found.get(name, (0, 0))
-        found[name] = count + 1, total + size
+        found[name] = count + 1, total + bytes_of(shapes)
     return found
+
+
+def bytes_of(shapes: str) -> int:
+    """Bytes of the arrays whose types and shapes a compiled program's text has, such as `(bf16[2,3]{1,0}, pred[])`."""
+    size = 0
+    for kind, bits, shape in _ARRAY.findall(shapes):
+        items = math.prod(int(side) for side in shape.split(",") if side)
+        size += items * (1 if kind == "pred" else max(1, int(bits) // 8))
+    return size
