@@ -182,8 +182,7 @@ def _attention_of(golden: Golden, layer: int, x: np.ndarray) -> tuple[Attention,
         (images.shape[1] // 14, images.shape[2] // 14), 5, x.shape[-1] // sizes.num_heads, sizes.rope_base
     )
     normed = jnp.asarray(x[None])
-    query = run(module, params, normed, rope, method=Attention.queries)
-    keys = run(module, params, normed, rope, method=Attention.keys)
+    query, keys = run(module, params, normed, rope, method=Attention.project)
     return module, params, OwnTokens(normed, query, keys)
 
 
