@@ -220,7 +220,7 @@ class Attention(nn.Module):
 class Block(nn.Module):
     """x + γ₁ Attn(LN(x)), then x + γ₂ MLP(LN(x)): the pre-norm transformer block of DINOv2 and VGGT.
 
-    The residual stream stays float32 whatever `dtype` the products use; what is added to it comes in that type.
+    The residual stream stays float32 whatever `dtype` the products use.
     """
 
     num_heads: int
