@@ -168,14 +168,15 @@ def test_gif_keeps_its_own_durations(tmp_path: Path, library: str) -> None:
 
 
 @pytest.mark.parametrize("rate", [10, 12])
-def test_a_stream_without_times_is_counted(tmp_path: Path, rate: int) -> None:
+def test_a_stream_without_times_is_counted(tmp_path: Path, library: str, rate: int) -> None:
     source = open_source(write(tmp_path / "raw.h264", [grey(i) for i in range(5)], rate=rate))
-    # The rate is the stream's own, where it states one.
+    # The rate is the stream's own, where it states one; OpenCV does not tell it.
+    rate = rate if library == "pyav" else 25
     np.testing.assert_allclose(times(list(source)), np.arange(5) / rate)
     assert f"states no times: {rate} frames a second are assumed" in source.notes[0]
 
 
-def test_time_stamps_in_the_order_of_storage_are_sorted(tmp_path: Path) -> None:
+def test_time_stamps_in_the_order_of_storage_are_sorted(tmp_path: Path, library: str) -> None:
     """Some recorders number packets as they are stored, though frames with references in both directions are shown in
     another order: nothing is missing, and the k-th frame is shown at the k-th time."""
     images = [grey(i) for i in range(12)]
@@ -197,7 +198,7 @@ def test_time_stamps_in_the_order_of_storage_are_sorted(tmp_path: Path) -> None:
         np.testing.assert_array_equal(ours.image, theirs.image)
 
 
-def test_joined_recordings_go_on_in_time(tmp_path: Path) -> None:
+def test_joined_recordings_go_on_in_time(tmp_path: Path, library: str) -> None:
     one = write(tmp_path / "one.ts", [grey(i) for i in range(8)])
     path = tmp_path / "joined.ts"
     path.write_bytes(one.read_bytes() * 2)
@@ -313,9 +314,6 @@ def test_no_frame_where_the_options_ask_for_it(tmp_path: Path, library: str) -> 
 @pytest.mark.parametrize("degrees", [0, 90, 180, 270])
 @pytest.mark.parametrize("mirrored", [False, True])
 def test_pictures_are_upright(tmp_path: Path, library: str, degrees: int, mirrored: bool) -> None:
-    if mirrored and library == "opencv":
-        assert "mirroring" in open_source(write(tmp_path / "a.mp4", [quarters()] * 2)).notes[0]
-        return
     path = write(tmp_path / "turned.mp4", [quarters()] * 2, turned=(degrees, mirrored))
     expected = np.rot90(quarters(), degrees // 90)
     if mirrored:
@@ -327,7 +325,7 @@ def test_pictures_are_upright(tmp_path: Path, library: str, degrees: int, mirror
 
 
 @pytest.mark.parametrize("degrees", [90, 180, 270])
-def test_pictures_are_upright_by_a_tag(tmp_path: Path, degrees: int) -> None:
+def test_pictures_are_upright_by_a_tag(tmp_path: Path, library: str, degrees: int) -> None:
     path = write(tmp_path / "plain.mkv", [quarters()] * 2)
     tagged = tmp_path / "tagged.mkv"
     with av.open(str(path)) as container, av.open(str(tagged), "w") as output:
@@ -402,22 +400,23 @@ def test_frames_that_stay_the_same_are_taken_by_opencv(tmp_path: Path, opencv_on
     assert len(list(open_source(path))) == 5
 
 
-def test_tags_that_are_no_unicode(tmp_path: Path) -> None:
+def test_tags_that_are_no_unicode(tmp_path: Path, library: str) -> None:
     """As cameras and old programs write them in the encoding of their country."""
     path = write(tmp_path / "clip.mkv", [grey(i) for i in range(3)])
     path.write_bytes(path.read_bytes().replace(b"Lavf", b"L\xe4v\xff"))
     assert len(list(open_source(path))) == 3
 
 
-def test_a_damaged_duration_is_no_duration(tmp_path: Path) -> None:
+def test_a_damaged_duration_is_no_duration(tmp_path: Path, library: str) -> None:
     path = write(tmp_path / "clip.mkv", [grey(i) for i in range(5)])
     path.write_bytes(path.read_bytes().replace(b"00:00:00.5", b"00:0?:0x.5"))
     assert len(list(open_source(path))) == 5
 
 
-def test_opencv_refuses_interlaced_pictures(tmp_path: Path, opencv_only: None) -> None:
-    path = write(tmp_path / "tv.mp4", interlaced(4), context={"field_order": 2}, **INTERLACED["h264.mp4"])
-    with pytest.raises(InputError, match=r"tv\.mp4 is interlaced.*logvggt-jax\[video\].*ffmpeg -i"):
+@pytest.mark.parametrize("name", INTERLACED)
+def test_opencv_refuses_interlaced_pictures(tmp_path: Path, opencv_only: None, name: str) -> None:
+    path = write(tmp_path / f"tv-{name}", interlaced(4), context={"field_order": 2}, **INTERLACED[name])
+    with pytest.raises(InputError, match=r"/tv-\S+ is interlaced.*logvggt-jax\[video\].*ffmpeg -i"):
         open_source(path)
 
 
@@ -439,7 +438,7 @@ def test_an_interlaced_part_after_progressive_frames(tmp_path: Path, library: st
 
 
 @pytest.mark.parametrize("stride", [1, 3])
-def test_a_change_of_size_is_noticed(tmp_path: Path, stride: int) -> None:
+def test_a_change_of_size_is_noticed(tmp_path: Path, library: str, stride: int) -> None:
     one = write(tmp_path / "one.ts", [grey(i) for i in range(6)])
     two = write(tmp_path / "two.ts", [grey(i, WIDTH, HEIGHT) for i in range(6)], stamps=range(6, 12))
     path = tmp_path / "both.ts"
@@ -452,7 +451,50 @@ def test_a_change_of_size_is_noticed(tmp_path: Path, stride: int) -> None:
     assert len(list(open_source(path, end=0.55))) == 6
 
 
-def test_a_change_of_pixel_format_is_converted(tmp_path: Path) -> None:
+def joined(path: Path, parts: Sequence[Path]) -> Path:
+    """One file of the packets of several, one after the other in time."""
+    with av.open(str(path), "w") as output:
+        stream, offset = None, Fraction(0)
+        for part in parts:
+            with av.open(str(part)) as container:
+                source = container.streams.video[0]
+                stream = stream or output.add_stream_from_template(source)
+                end = offset
+                for packet in container.demux(source):
+                    if packet.size:
+                        shift = round(offset / packet.time_base)
+                        end = max(end, offset + (packet.pts + 1) * packet.time_base + Fraction(1, 20))
+                        packet.pts, packet.dts, packet.stream = packet.pts + shift, packet.dts + shift, stream
+                        output.mux(packet)
+                offset = end
+    return path
+
+
+@pytest.mark.parametrize(
+    ("suffix", "codec", "options"),
+    [
+        ("ts", "libx265", {"x265-params": "log-level=none:frame-threads=1:bframes=0"}),
+        ("ts", "mpeg2video", {}),
+        ("webm", "libvpx", {}),
+        ("webm", "libvpx-vp9", {}),
+        ("avi", "mjpeg", {}),
+    ],
+)
+def test_a_change_of_size_is_noticed_in_every_usual_codec(
+    tmp_path: Path, library: str, suffix: str, codec: str, options: dict[str, str]
+) -> None:
+    """As browsers record a call, cameras a night, and joined streams."""
+    how = {"codec": codec, "options": options, "pixels": "yuvj420p" if codec == "mjpeg" else "yuv420p"}
+    sizes = [(96, 128), (128, 96)]
+    parts = [write(tmp_path / f"{size[0]}.{suffix}", [grey(n, *size) for n in range(4)], **how) for size in sizes]
+    frames = iter(open_source(joined(tmp_path / f"call.{suffix}", parts)))
+    assert [next(frames).image.shape for _ in range(3)] == [(96, 128, 3)] * 3
+    # FFmpeg's decoder of MPEG-2 loses the last frame before the change.
+    with pytest.raises(InputError, match=r"frame [34] is 96 x 128 pixels but the video begins with 128 x 96"):
+        list(frames)
+
+
+def test_a_change_of_pixel_format_is_converted(tmp_path: Path, library: str) -> None:
     one = write(tmp_path / "one.ts", [quarters()] * 4)
     two = write(tmp_path / "two.ts", [quarters()] * 4, pixels="yuv444p", stamps=range(4, 8))
     path = tmp_path / "both.ts"
@@ -492,7 +534,7 @@ def test_colours_are_right(tmp_path: Path, library: str, name: str) -> None:
 
 
 @pytest.mark.parametrize(("transfer", "called"), [(16, "PQ"), (18, "HLG")])
-def test_hdr_is_told(tmp_path: Path, transfer: int, called: str) -> None:
+def test_hdr_is_told(tmp_path: Path, library: str, transfer: int, called: str) -> None:
     path = write(
         tmp_path / "hdr.mkv",
         [quarters()] * 2,
@@ -503,11 +545,12 @@ def test_hdr_is_told(tmp_path: Path, transfer: int, called: str) -> None:
         source_pixels={"dst_colorspace": 9},
     )
     source = open_source(path)
-    assert [note for note in source.notes if f"HDR ({called})" in note and "without tone mapping" in note]
-    np.testing.assert_allclose(corners(next(iter(source)).image), corners(quarters()), atol=12)
+    assert [note for note in source.notes if f"HDR ({called})" in note and "8 bits" in note]
+    if library == "pyav":
+        np.testing.assert_allclose(corners(next(iter(source)).image), corners(quarters()), atol=12)
 
 
-def test_a_view_all_around_is_told(tmp_path: Path) -> None:
+def test_a_view_all_around_is_told(tmp_path: Path, library: str) -> None:
     path = write(tmp_path / "around.mp4", [grey(0)] * 2)
     content = bytearray(path.read_bytes())
     # As cameras and stitching programs note it: a box of its own at the end of the track's.
@@ -529,7 +572,7 @@ def test_a_view_all_around_is_told(tmp_path: Path) -> None:
     assert "looks all around (equirectangular)" in note and "v360" in note
 
 
-def test_pixels_that_are_not_square_are_told(tmp_path: Path) -> None:
+def test_pixels_that_are_not_square_are_told(tmp_path: Path, library: str) -> None:
     path = write(tmp_path / "wide.mp4", [grey(0)] * 2, context={"sample_aspect_ratio": Fraction(4, 3)})
     assert any("not square (4:3)" in note for note in open_source(path).notes)
 
@@ -574,7 +617,7 @@ def test_frames_that_may_lack_what_a_damaged_one_showed_are_counted(tmp_path: Pa
     assert source.notes[-1].endswith(f"next key frame, which may lack what it showed: {after.index(True)}")
 
 
-def test_damage_to_a_stream_without_times_is_named_where_it_is(tmp_path: Path) -> None:
+def test_damage_to_a_stream_without_times_is_named_where_it_is(tmp_path: Path, library: str) -> None:
     path = write(tmp_path / "raw.h264", [busy(i) for i in range(12)], options={"bf": "0", "x264-params": "threads=1"})
     content = bytearray(path.read_bytes())
     position, size, stamp = packets(path)[5]
@@ -600,7 +643,7 @@ def test_damage_to_large_videos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
 
 
 @pytest.mark.parametrize("number", [0, 3])
-def test_a_packet_that_gives_neither_picture_nor_error_is_named(tmp_path: Path, number: int) -> None:
+def test_a_packet_that_gives_neither_picture_nor_error_is_named(tmp_path: Path, library: str, number: int) -> None:
     path = write(tmp_path / "walk.mp4", [busy(i) for i in range(8)], codec="mpeg4")
     content = bytearray(path.read_bytes())
     position, size, _ = packets(path)[number]
@@ -657,7 +700,7 @@ def test_a_video_cut_short_says_so(tmp_path: Path, library: str) -> None:
     assert len(list(open_source(moved, max_frames=5))) == 5
 
 
-def test_an_edited_video_is_whole(tmp_path: Path) -> None:
+def test_an_edited_video_is_whole(tmp_path: Path, library: str) -> None:
     path = write(tmp_path / "edited.mp4", [grey(i) for i in range(24)], options={"g": "8", "bf": "0"})
     content = bytearray(path.read_bytes())
     # Its edit list shows the second half: duration and first time stamp, here in 1 / 1000 and 1 / 10240 s.
@@ -676,7 +719,7 @@ def test_an_edited_video_is_whole(tmp_path: Path) -> None:
     assert abs(frames[0].image.mean() - 40 - 8 * 10) < 10
 
 
-def test_a_damaged_index_of_a_short_video_is_told(tmp_path: Path) -> None:
+def test_a_damaged_index_of_a_short_video_is_told(tmp_path: Path, library: str) -> None:
     path = write(tmp_path / "walk.mp4", [busy(i) for i in range(6)], codec="mpeg4")
     content = bytearray(path.read_bytes())
     # The fourth frame's size, so that the two after it lie beyond the file's end.
@@ -687,7 +730,7 @@ def test_a_damaged_index_of_a_short_video_is_told(tmp_path: Path) -> None:
     assert "shows 4 of the 6 frames in it" in source.notes[-1]
 
 
-def test_a_matroska_video_cut_short_says_so(tmp_path: Path) -> None:
+def test_a_matroska_video_cut_short_says_so(tmp_path: Path, library: str) -> None:
     path = write(tmp_path / "cut.mkv", [busy(i) for i in range(24)])
     path.write_bytes(path.read_bytes()[: packets(path)[12][0]])
     with pytest.warns(UserWarning, match=r"ends early: 1\.\d+ s decoded, its header announces 2\.4 s"):
@@ -708,7 +751,7 @@ def test_a_header_that_was_never_filled_in_announces_nothing(tmp_path: Path, lib
 
 
 @pytest.mark.parametrize("name", ["screen.mkv", "screen.webm"])
-def test_a_last_frame_that_is_shown_for_long_is_no_early_end(tmp_path: Path, name: str) -> None:
+def test_a_last_frame_that_is_shown_for_long_is_no_early_end(tmp_path: Path, library: str, name: str) -> None:
     path = tmp_path / name
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libvpx" if name.endswith("webm") else "mpeg4", rate=10)
@@ -720,7 +763,7 @@ def test_a_last_frame_that_is_shown_for_long_is_no_early_end(tmp_path: Path, nam
     assert len(list(open_source(path))) == 4
 
 
-def test_a_file_in_fragments_is_expected_whole(tmp_path: Path) -> None:
+def test_a_file_in_fragments_is_expected_whole(tmp_path: Path, library: str) -> None:
     path = tmp_path / "fragments.mp4"
     images = [grey(i) for i in range(24)]
     with av.open(str(path), "w", options={"movflags": "frag_keyframe"}) as container:
@@ -747,7 +790,7 @@ def test_the_unit_of_time_is_no_rate(tmp_path: Path) -> None:
     np.testing.assert_allclose(times(list(source)), np.arange(3) / 25)
 
 
-def test_of_several_videos_in_a_file_the_one_that_is_read_is_named(tmp_path: Path) -> None:
+def test_of_several_videos_in_a_file_the_one_that_is_read_is_named(tmp_path: Path, library: str) -> None:
     path = tmp_path / "two_lenses.mkv"
     with av.open(str(path), "w") as container:
         streams = [container.add_stream("mpeg4", rate=10) for _ in range(2)]
@@ -765,7 +808,7 @@ def test_of_several_videos_in_a_file_the_one_that_is_read_is_named(tmp_path: Pat
     ]
 
 
-def test_a_recording_that_begins_in_the_middle(tmp_path: Path) -> None:
+def test_a_recording_that_begins_in_the_middle(tmp_path: Path, library: str) -> None:
     path = write(tmp_path / "whole.ts", [busy(i) for i in range(24)], codec="mpeg2video", options={"g": "12"})
     cut = tmp_path / "cut.ts"
     content = path.read_bytes()
@@ -1038,7 +1081,7 @@ def test_the_case_of_interlacing(cases_dir: Path) -> None:
     np.testing.assert_allclose([frame.image.mean() for frame in frames], 84, atol=3)
 
 
-def test_the_case_of_a_change_of_size(cases_dir: Path) -> None:
+def test_the_case_of_a_change_of_size(cases_dir: Path, library: str) -> None:
     with pytest.raises(InputError, match="frame 12 is 240 x 320 pixels but the video begins with 320 x 240"):
         list(open_source(cases_dir / "reschange2.ts"))
 

@@ -4,26 +4,41 @@ from __future__ import annotations
 
 import contextlib
 import math
-import os
 import re
-import sys
-import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
+from typing import NoReturn
 
 import cv2
 import numpy as np
 
 from logvggt_jax.errors import InputError, install_line
 from logvggt_jax.reconstruction.sources.decoding import Damage, Picture, VideoHeader
+from logvggt_jax.reconstruction.sources.media_info import MediaHeader, read_media_header
+from logvggt_jax.reconstruction.sources.mp4_track import Mp4View, read_mp4_view
+from logvggt_jax.reconstruction.sources.opencv_messages import captured_stderr, quiet
+from logvggt_jax.reconstruction.sources.orientation import shown_size, turn
+from logvggt_jax.reconstruction.sources.packet_follower import PacketFollower, TimeStamps, look_at_times
+from logvggt_jax.reconstruction.sources.sampling import likely_frames
+from logvggt_jax.reconstruction.sources.video_notes import (
+    all_around,
+    begins_late,
+    high_dynamic_range,
+    no_times,
+    oblong_pixels,
+    several_videos,
+)
 
 # OpenCV tells neither why a frame failed nor whether the file has ended: after so many failures in a row it has.
 _MOST_FAILURES = 64
+# Frames at the beginning whose order is looked at.
+_FIRST_FRAMES = 16
 # The codec by which FFmpeg draws text as a terminal would.
 _TEXT = "ansi"
 _PYAV = install_line("video")
+_UNDECODED = "cannot be decoded"
 
 
 class OpenCVDecoder:
@@ -37,16 +52,22 @@ class OpenCVDecoder:
 
     def __init__(self, source: str | int, name: str, timeout: float | None = None) -> None:
         self._source, self._name, self._timeout = source, name, timeout
+        self._file = None if isinstance(source, int) or timeout is not None else str(source)
+        self._view = Mp4View()
+        self._media: MediaHeader | None = None
+        self._matrix: np.ndarray | None = None
+        self._times = TimeStamps(exist=True, as_stored=False)
 
     def header(self) -> VideoHeader:
         """See `VideoDecoder.header`."""
-        with _captured_stderr() as messages:
+        self._look_at_file()
+        with captured_stderr() as messages:
             capture = self._open()
             read = any(capture.grab() for _ in range(_MOST_FAILURES))
             image = capture.retrieve()[1] if read else None
             count = capture.get(cv2.CAP_PROP_FRAME_COUNT)
-            frames = int(count) if 0 < count <= self._bytes() else None
-            single = frames is None and not capture.grab()
+            stated = int(count) if 0 < count <= self._bytes() else None
+            single = stated is None and not capture.grab()
             said = messages()
         codec = _fourcc(capture)
         self._check_converted(said)
@@ -58,75 +79,158 @@ class OpenCVDecoder:
         if single or codec == _TEXT:
             kind = "text" if codec == _TEXT else "a single image"
             raise InputError(f"{self._name} is {kind}, not a video: give a video or the folder that holds the images")
-        rate = capture.get(cv2.CAP_PROP_FPS)
+        frequency = capture.get(cv2.CAP_PROP_FPS)
+        rate = frequency if math.isfinite(frequency) and frequency > 0 else None
+        if self._media is not None and self._media.interlaced:
+            self._refuse_interlaced()
+        notes = tuple(self._notes(capture, image.shape[:2], rate))
         capture.release()
+        seconds = self._view.edit or (self._media.seconds if self._media else None)
         return VideoHeader(
-            size=image.shape[:2],
-            rate=rate if math.isfinite(rate) and rate > 0 else None,
-            frames=frames,
-            announced=frames if self._states_frames() else None,
-            seconds=None,
-            notes=(
-                f"{self._name} is decoded by OpenCV, which does not notice a change of size within it, interlacing "
-                f"that only its header tells, mirroring, HDR, or pixels that are not square: {_PYAV}",
-            ),
+            size=shown_size(image.shape[:2], self._matrix),
+            rate=rate,
+            frames=likely_frames(stated, seconds, rate),
+            announced=stated if self._states_frames() else None,
+            seconds=seconds,
+            notes=notes,
         )
 
     def pictures(self) -> Iterator[Picture | Damage]:
         """See `VideoDecoder.pictures`."""
+        self._look_at_file()
         capture = self._open()
-        rate = capture.get(cv2.CAP_PROP_FPS)
-        step = 1.0 / rate if math.isfinite(rate) and rate > 0 else math.inf
-        # Frames that failed are known by the gaps that they leave.
-        failed = in_a_row = 0
-        last: float | None = None
-        before: np.ndarray | None = None
+        follower = self._follower(capture.get(cv2.CAP_PROP_FPS))
         try:
-            while in_a_row < _MOST_FAILURES:
-                asked = time.monotonic()
-                with contextlib.nullcontext() if self._timeout is None else _quiet():
-                    decoded, image = capture.retrieve() if capture.grab() else (False, None)
-                if not decoded or image is None or not image.size:
-                    in_a_row += 1
-                    # A stream that has fallen silent fails but once in that time.
-                    if self._timeout is not None and time.monotonic() - asked >= self._timeout:
-                        break
-                    continue
-                failed, in_a_row = failed + in_a_row, 0
-                seconds = self._stamp(capture, last)
-                while failed and last is not None and seconds is not None and seconds - last > 1.5 * step:
-                    failed, last = failed - 1, last + step
-                    yield Damage(last, "cannot be decoded")
-                if before is not None and np.array_equal(image, before):
-                    # Either nothing moves, or the picture was not converted and the buffer holds the one before.
-                    with _captured_stderr() as messages:
-                        capture.retrieve()
-                        self._check_converted(messages())
-                last, before = seconds, image
-                yield Picture(seconds, image.shape[:2], partial(_to_rgb, image))
-            yield from [Damage(None, "cannot be decoded")] * failed
+            yield from self._follow(capture, follower)
         finally:
             capture.release()
+            if follower is not None:
+                follower.close()
+
+    def _follow(self, capture: cv2.VideoCapture, follower: PacketFollower | None) -> Iterator[Picture | Damage]:
+        failures = 0
+        last: float | None = None
+        before: np.ndarray | None = None
+        first_size: tuple[int, int] | None = None
+        while failures < _MOST_FAILURES:
+            asked = time.monotonic()
+            with contextlib.nullcontext() if self._timeout is None else quiet():
+                decoded, image = capture.retrieve() if capture.grab() else (False, None)
+            if not decoded or image is None or not image.size:
+                failures += 1
+                # A stream that has fallen silent fails but once in that time.
+                if self._timeout is not None and time.monotonic() - asked >= self._timeout:
+                    break
+                continue
+            seconds = self._stamp(capture, last)
+            if follower is None:
+                yield from [Damage(None, _UNDECODED)] * failures
+            else:
+                for _ in range(failures):
+                    follower.fail(_UNDECODED)
+            failures = 0
+            if follower is not None:
+                if seconds is None or self._times.as_stored:
+                    yield from follower.failures()
+                    seconds = follower.next_in_order()
+                elif follower.precedes_key_frame(stamp := round(1e6 * seconds)):
+                    continue
+                else:
+                    yield from follower.before(stamp)
+            if before is not None and np.array_equal(image, before):
+                # Either nothing moves, or the picture was not converted and the buffer holds the one before.
+                with captured_stderr() as messages:
+                    capture.retrieve()
+                    self._check_converted(messages())
+            last, before = seconds, image
+            stated = follower.size if follower else None
+            first_size = first_size or stated
+            yield Picture(seconds, self._size(image.shape[:2], stated, first_size), partial(self._convert, image))
+        if follower is not None:
+            yield from follower.rest() if self._times.exist and not self._times.as_stored else follower.failures()
+
+    def _size(
+        self, decoded: tuple[int, int], stated: tuple[int, int] | None, first: tuple[int, int] | None
+    ) -> tuple[int, int]:
+        """(H, W) as it is shown. OpenCV brings every picture to the size of the first, whatever the packets state."""
+        if stated is not None and stated != first:
+            decoded = stated if decoded == first else stated[::-1]
+        return shown_size(decoded, self._matrix)
+
+    def _convert(self, image: np.ndarray) -> np.ndarray:
+        rgb = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+        return rgb if self._matrix is None else turn(rgb, self._matrix)
+
+    def _notes(self, capture: cv2.VideoCapture, size: tuple[int, int], rate: float | None) -> Iterator[str]:
+        if self._file is None:
+            return
+        media = self._media
+        if media is None:
+            yield (
+                f"{self._name} is decoded by OpenCV, which without MediaInfo, whose library is not there for this "
+                f"system, does not notice HDR, or interlacing that only the header tells: {_PYAV}"
+            )
+        elif len(media.sizes) > 1:
+            read = media.sizes.index(size) if size in media.sizes else 0
+            yield several_videos(self._name, media.sizes, media.numbers, media.numbers[read])
+        if not self._times.exist:
+            yield no_times(self._name, rate or 1.0)
+        if self._view.projection is not None:
+            yield all_around(self._name, self._view.projection)
+        if media is not None and media.transfer is not None:
+            yield high_dynamic_range(
+                self._name, media.transfer, "turned into 8 bits by OpenCV, which alters their colours"
+            )
+        width, height = (round(capture.get(each)) for each in (cv2.CAP_PROP_SAR_NUM, cv2.CAP_PROP_SAR_DEN))
+        if width and height and width != height:
+            yield oblong_pixels(self._name, width, height)
+        follower = self._follower(0.0)
+        if follower is not None:
+            if follower.lead:
+                yield begins_late(self._name, follower.lead)
+            follower.close()
+
+    def _look_at_file(self) -> None:
+        """Learns what OpenCV does not tell: how pictures are turned, what their header says, and which times hold."""
+        if self._file is None or self._media is not None:
+            return
+        capture = self._open()
+        shown: list[int] = []
+        while len(shown) < _FIRST_FRAMES and capture.grab():
+            shown.append(round(1000 * capture.get(cv2.CAP_PROP_POS_MSEC)))
+        capture.release()
+        self._times = look_at_times(self._file, shown)
+        self._view = read_mp4_view(Path(self._file))
+        self._media = read_media_header(Path(self._file))
+        self._matrix = self._view.matrix
+        if self._matrix is None and self._media is not None and self._media.quarter_turns:
+            self._matrix = np.linalg.matrix_power(np.array([[0, 1], [-1, 0]]), self._media.quarter_turns)
+
+    def _follower(self, rate: float) -> PacketFollower | None:
+        if self._file is None:
+            return None
+        return PacketFollower(self._file, rate, timed=self._times.exist, edited=self._view.edit is not None)
 
     def _check_converted(self, said: str) -> None:
         """Raises InputError if OpenCV handed out a buffer into which it could not convert the picture."""
         if "interlaced to progressive" in said:
-            raise InputError(
-                f"{self._name} is interlaced, which OpenCV cannot convert: {_PYAV}, or deinterlace it with "
-                "ffmpeg -i INPUT -vf bwdif=send_frame OUTPUT.mp4"
-            )
+            self._refuse_interlaced()
+
+    def _refuse_interlaced(self) -> NoReturn:
+        raise InputError(
+            f"{self._name} is interlaced, which OpenCV cannot convert: {_PYAV}, or deinterlace it with "
+            "ffmpeg -i INPUT -vf bwdif=send_frame OUTPUT.mp4"
+        )
 
     def _bytes(self) -> float:
         """Size of the file, which has no more frames: headers that were never filled in say more."""
-        if isinstance(self._source, int) or self._timeout is not None:
-            return math.inf
-        return Path(self._source).stat().st_size
+        return math.inf if self._file is None else Path(self._file).stat().st_size
 
     def _states_frames(self) -> bool:
         """Whether the count is the file's own (mp4, mov, avi); OpenCV multiplies duration and rate elsewhere."""
-        if isinstance(self._source, int) or self._timeout is not None:
+        if self._file is None:
             return False
-        with Path(self._source).open("rb") as file:
+        with Path(self._file).open("rb") as file:
             head = file.read(8)
         return head[4:] == b"ftyp" or head[:4] == b"RIFF"
 
@@ -134,6 +238,8 @@ class OpenCVDecoder:
         if isinstance(self._source, int):
             return time.monotonic()
         seconds = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+        if self._file is not None:
+            return seconds if self._times.exist else None
         # Without time stamps OpenCV says 0 every time.
         return None if last is not None and seconds == 0 else seconds
 
@@ -145,9 +251,11 @@ class OpenCVDecoder:
         if re.search("[\ud800-\udfff]", str(self._source)):
             # A name that is no Unicode ends the process.
             raise InputError(f"{self._name!r}: OpenCV cannot open a file of this name: rename it, or {_PYAV}")
-        with _quiet():
+        with quiet():
             capture = cv2.VideoCapture(self._source, cv2.CAP_ANY, parameters)
         if capture.isOpened():
+            if self._matrix is not None:
+                capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
             return capture
         if isinstance(self._source, int):
             raise InputError(f"{self._name} cannot be opened: is it connected, free, and allowed to be used?")
@@ -161,45 +269,6 @@ class OpenCVDecoder:
         )
 
 
-def _to_rgb(image: np.ndarray) -> np.ndarray:
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-
-
 def _fourcc(capture: cv2.VideoCapture) -> str:
     code = int(capture.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF
     return re.sub(r"[^\w.-]", "", code.to_bytes(4, "little").decode("latin-1")) or "unknown"
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Without OpenCV's warnings: an error says the same."""
-    level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
-    try:
-        yield
-    finally:
-        cv2.utils.logging.setLogLevel(level)
-
-
-@contextlib.contextmanager
-def _captured_stderr() -> Iterator[Callable[[], str]]:
-    """What libraries print to standard error in the block: OpenCV hands out errors in no other way.
-
-    Gives a function that returns what has been printed so far; nothing of it reaches the terminal.
-    """
-    sys.stderr.flush()
-    kept = os.dup(2)
-    try:
-        with tempfile.TemporaryFile() as file:
-            os.dup2(file.fileno(), 2)
-            try:
-
-                def printed() -> str:
-                    file.seek(0)
-                    return file.read().decode(errors="replace")
-
-                yield printed
-            finally:
-                os.dup2(kept, 2)
-    finally:
-        os.close(kept)

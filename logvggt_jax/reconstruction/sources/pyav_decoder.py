@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import heapq
 import itertools
 import math
-from collections import deque
 from collections.abc import Iterator
-from fractions import Fraction
 from functools import partial
 
 import av
@@ -19,15 +16,18 @@ import numpy as np
 from logvggt_jax.errors import InputError
 from logvggt_jax.reconstruction.sources.decoding import Damage, Picture, VideoHeader
 from logvggt_jax.reconstruction.sources.deinterlacing import Deinterlacer, is_interlaced
-from logvggt_jax.reconstruction.sources.orientation import display_matrix, shown_size, turn
+from logvggt_jax.reconstruction.sources.missing_frames import MissingFrames
+from logvggt_jax.reconstruction.sources.orientation import shown_size, turn
 from logvggt_jax.reconstruction.sources.pyav_header import (
     average_rate,
+    display_matrix,
     duration,
-    likely_frames,
     moving_streams,
     notes_on,
     unknown_codec,
 )
+from logvggt_jax.reconstruction.sources.sampling import likely_frames
+from logvggt_jax.reconstruction.sources.video_notes import begins_late
 
 # From release 19 on, tags that are not UTF-8 are always read so.
 _TAGS = {"metadata_errors": "replace"} if av.__version__.startswith("18.") else {}
@@ -41,8 +41,6 @@ _MOST_READ_ERRORS = 16
 _LONGEST_LEAD = 300
 # Pixels above which frames are decoded side by side.
 _LARGE = 1920 * 1088
-# Packets whose frame has not come out; no codec holds back so many.
-_MOST_WAITING = 512
 # Codecs of which every packet shows a frame of its own, but for those of interlaced material and for empty ones, which
 # stand for no change. A decoder may drop a damaged packet of theirs without an error.
 _FRAME_A_PACKET = ("mpeg4", "h264", "hevc", "mjpeg")
@@ -80,9 +78,9 @@ class PyAVDecoder:
             if stated is not None and stated > container.size:
                 # A recorder that was cut off, or wrote to a pipe, never came to fill in its header.
                 seconds = stated = None
-            frames = likely_frames(stated, seconds, rate)
+            frames = likely_frames(stated, seconds, float(rate) if rate else None)
             return VideoHeader(
-                size=shown_size(frame, display_matrix(frame, stream)),
+                size=shown_size((frame.height, frame.width), display_matrix(frame, stream)),
                 rate=float(rate) if rate else None,
                 frames=frames,
                 # The first part of a file in fragments states its own frames only.
@@ -115,7 +113,7 @@ class PyAVDecoder:
         whole.colorspace, whole.color_range = decoded.colorspace, decoded.color_range
         return Picture(
             seconds=None if decoded.pts is None else float(decoded.pts * stream.time_base),
-            size=shown_size(decoded, matrix),
+            size=shown_size((decoded.height, decoded.width), matrix),
             convert=partial(self._convert, whole, matrix),
             damaged=decoded.is_corrupt,
             lasts=float(decoded.duration * stream.time_base) if decoded.duration else None,
@@ -184,14 +182,13 @@ class PyAVDecoder:
         self, container: av.container.InputContainer, stream: av.video.stream.VideoStream
     ) -> Iterator[tuple[Damage | None, av.VideoFrame | None]]:
         """Frames in the order in which they are shown, with what is missing between them."""
-        waiting: list[int] = []
-        failures: deque[str] = deque()
+        missing = MissingFrames(stream.time_base)
         self._lead = 0
         started, key = False, None  # the time stamp of the first key frame; what is shown before refers to lost frames
         joined, last = False, -math.inf  # whether time goes back, as where recordings are joined
         for packet in self._packets(container, stream):
             if isinstance(packet, str):
-                failures.append(packet)
+                missing.fail(packet)
                 continue
             # Frames before the first key frame refer to some that are not there: decoders show them grey.
             started = started or packet.is_keyframe or self._lead == _LONGEST_LEAD or not packet.size
@@ -203,9 +200,7 @@ class PyAVDecoder:
             key = packet.pts if key is None else key
             holds_frame = packet.size > (0 if self._numbered_as_stored else _EMPTY_PACKET)
             if holds_frame and packet.pts is not None and not packet.is_discard:
-                heapq.heappush(waiting, packet.pts)
-                if len(waiting) > _MOST_WAITING:
-                    heapq.heappop(waiting)
+                missing.expect(packet.pts)
             try:
                 frames = packet.decode()
             except av.error.EOFError:
@@ -215,27 +210,23 @@ class PyAVDecoder:
                 if packet.size and packet.pts is None:
                     yield Damage(None, str(error.strerror)), None
                 else:
-                    failures.append(str(error.strerror))
+                    missing.fail(str(error.strerror))
             for frame in frames:
                 if self._numbered_as_stored:
-                    for reason in failures:
-                        yield Damage(_seconds(waiting, stream.time_base), reason), None
-                    failures.clear()
-                    frame.pts = heapq.heappop(waiting) if waiting else None
+                    yield from ((damage, None) for damage in missing.failures())
+                    frame.pts = missing.take_next()
                 elif frame.pts is not None:
                     each = stream.codec_context.name in _FRAME_A_PACKET and not is_interlaced(frame, stream)
                     since = None if joined or not each else key
-                    missing = _missing(waiting, failures, frame.pts, stream.time_base, since)
-                    yield from ((damage, None) for damage in missing)
+                    yield from ((damage, None) for damage in missing.before(frame.pts, since))
                 yield None, frame
         if stream.width * stream.height > _LARGE:
-            failures.extend("cannot be decoded" for _ in waiting[len(failures) :])
-        for reason in failures:
-            yield Damage(_seconds(waiting, stream.time_base), reason), None
+            missing.fail_all("cannot be decoded")
+        yield from ((damage, None) for damage in missing.failures())
 
     def _begins_late(self) -> Iterator[str]:
         if self._lead:
-            yield f"{self._name} begins in the middle: {self._lead} frames before its first key frame are left out"
+            yield begins_late(self._name, self._lead)
 
     def _is_numbered_as_stored(self) -> bool:
         """Whether the packets' time stamps only grow, and the frames' do not."""
@@ -279,19 +270,3 @@ class PyAVDecoder:
         empty = av.Packet()
         empty.stream = stream
         yield empty
-
-
-def _missing(
-    waiting: list[int], failures: deque[str], shown: int, time_base: Fraction, since: int | None
-) -> Iterator[Damage]:
-    """The frames before the one with time stamp `shown` that failed, or every one from `since` on that has not come
-    out; takes all up to it from `waiting`."""
-    while waiting and waiting[0] <= shown:
-        stamp = heapq.heappop(waiting)
-        if stamp < shown and (failures or (since is not None and stamp >= since)):
-            yield Damage(float(stamp * time_base), failures.popleft() if failures else "gives no picture")
-
-
-def _seconds(waiting: list[int], time_base: Fraction) -> float | None:
-    """When the first of the frames that wait is shown; takes it from `waiting`."""
-    return float(heapq.heappop(waiting) * time_base) if waiting else None

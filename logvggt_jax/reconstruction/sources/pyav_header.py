@@ -9,8 +9,16 @@ from fractions import Fraction
 import av
 import av.format
 import av.logging
+import numpy as np
 
 from logvggt_jax.reconstruction.sources.deinterlacing import is_interlaced
+from logvggt_jax.reconstruction.sources.video_notes import (
+    all_around,
+    high_dynamic_range,
+    no_times,
+    oblong_pixels,
+    several_videos,
+)
 
 # FFmpeg's numbers of what a lens or its stitching program projects onto.
 _PROJECTIONS = {0: "equirectangular", 1: "a cube map", 2: "equirectangular", 3: "half equirectangular", 5: "fisheye"}
@@ -23,37 +31,31 @@ def notes_on(
     """What the user should know of a video, as far as it shows in the header and the first frame."""
     streams = moving_streams(container)
     if len(streams) > 1:
-        sizes = ", ".join(f"{each.width} x {each.height} (0:{each.index})" for each in streams)
-        other = next(each.index for each in streams if each.index != stream.index)
-        yield (
-            f"{name} holds {len(streams)} videos, {sizes}, of which 0:{stream.index} is read; for another, "
-            f"ffmpeg -i INPUT -map 0:{other} -c copy OUTPUT.mkv"
-        )
+        sizes = [(each.height, each.width) for each in streams]
+        yield several_videos(name, sizes, [each.index for each in streams], stream.index)
     if has_no_times(container):
-        rate = float(average_rate(container, stream) or 1)
-        yield (
-            f"{name} states no times: {rate:.4g} frames a second are assumed; if that is wrong, make a video "
-            "that states them with ffmpeg -r RATE -i INPUT OUTPUT.mp4"
-        )
+        yield no_times(name, float(average_rate(container, stream) or 1))
     if is_interlaced(frame, stream):
         yield f"{name} is interlaced: its frames are deinterlaced (bwdif), and finest lines lose some detail"
     spherical = frame.side_data.get("SPHERICAL")
     if spherical and (projection := _PROJECTIONS.get(int.from_bytes(bytes(spherical)[:4], "little"))):
-        yield (
-            f"{name} looks all around ({projection}), where a pinhole camera is assumed: cut views out of it "
-            "beforehand, with ffmpeg -i INPUT -vf v360=e:flat:h_fov=90:v_fov=60 OUTPUT.mp4 from equirectangular"
-        )
+        yield all_around(name, projection)
     if transfer := _HDR_TRANSFERS.get(frame.color_trc):
-        yield (
-            f"{name} is HDR ({transfer}): its frames are reduced to 8 bits without tone mapping, which makes "
-            "them look pale; tone-map it beforehand if the result suffers"
-        )
+        yield high_dynamic_range(name, transfer, "reduced to 8 bits without tone mapping, which makes them look pale")
     ratio = stream.sample_aspect_ratio
     if ratio and ratio != 1:
-        yield (
-            f"{name}: its pixels are not square ({ratio.numerator}:{ratio.denominator}) and are used as they "
-            "are stored; stretch it beforehand with ffmpeg -i INPUT -vf scale=iw*sar:ih,setsar=1 OUTPUT"
-        )
+        yield oblong_pixels(name, ratio.numerator, ratio.denominator)
+
+
+def display_matrix(frame: av.VideoFrame, stream: av.video.stream.VideoStream) -> np.ndarray | None:
+    """See `orientation`; None where nothing is turned."""
+    if data := frame.side_data.get("DISPLAYMATRIX"):
+        return np.frombuffer(bytes(data), np.int32)[:9].reshape(3, 3)[:2, :2].astype(np.float64)
+    tags = {name.lower(): value for name, value in stream.metadata.items()}
+    if tags.get("rotate", "").lstrip("-").isdecimal():
+        # Clockwise, as older programs wrote it into any file.
+        return np.linalg.matrix_power(np.array([[0, 1], [-1, 0]]), round(int(tags["rotate"]) / 90) % 4)
+    return None
 
 
 def moving_streams(container: av.container.InputContainer) -> list[av.video.stream.VideoStream]:
@@ -74,15 +76,6 @@ def average_rate(container: av.container.InputContainer, stream: av.video.stream
         return stream.codec_context.framerate or stream.guessed_rate or stream.average_rate
     # Of some formats the library takes the unit of time for the distance of two frames.
     return min((rate for rate in (stream.average_rate, stream.guessed_rate) if rate), default=None)
-
-
-def likely_frames(stated: int | None, seconds: float | None, rate: Fraction | None) -> int | None:
-    """Number of frames that are shown; an edited file states those as well that it does not show, a file in fragments
-    those of the first alone."""
-    by_time = max(1, round(seconds * rate)) if seconds and rate else None
-    if stated is None or by_time is None:
-        return stated or by_time
-    return stated if abs(by_time - stated) <= 0.01 * max(by_time, stated) + 2 else by_time
 
 
 def duration(container: av.container.InputContainer, stream: av.video.stream.VideoStream) -> float | None:

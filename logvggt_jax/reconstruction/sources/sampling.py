@@ -111,3 +111,12 @@ def expected_frames(options: SourceOptions, frames: int | None, rate: float | No
     if options.fps is not None and taken:
         taken = min(taken, math.floor(((taken - 1) * options.stride / rate + _ROUNDING) * options.fps) + 1)
     return taken if options.max_frames is None else min(taken, options.max_frames)
+
+
+def likely_frames(stated: int | None, seconds: float | None, rate: float | None) -> int | None:
+    """Number of frames that are shown; an edited file states those as well that it does not show, a file in fragments
+    those of the first alone."""
+    by_time = max(1, round(seconds * rate)) if seconds and rate else None
+    if stated is None or by_time is None:
+        return stated or by_time
+    return stated if abs(by_time - stated) <= 0.01 * max(by_time, stated) + 2 else by_time

@@ -128,18 +128,18 @@ def test_every_epoch_visits_every_sequence_once_with_new_clips_in_a_new_order():
 
 
 def test_a_seed_gives_the_clips_that_it_always_gave():
-    """Results of runs depend on it: these are the clips of the first version."""
+    """Results of runs depend on it. Who changes these clips changes `order` in the state of the data as well."""
     with batches() as iterator:
         drawn = clips(iterator, 2)
     assert drawn == [
-        (7, 2, 5, 8),
-        (3, 0, 2, 4),
-        (5, 2, 3, 4),
-        (6, 1, 4, 7),
+        (6, 2, 5, 8),
+        (4, 0, 2, 4),
+        (3, 2, 3, 4),
+        (5, 1, 4, 7),
         (0, 2, 4, 6),
         (2, 8, 6, 4),
         (1, 5, 6, 7),
-        (4, 2, 4, 6),
+        (7, 2, 4, 6),
     ]
 
 
@@ -356,7 +356,6 @@ class WithoutUpright(Shaped):
 @pytest.mark.parametrize("workers", [0, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_shape_of_which_all_is_broken_is_replaced_by_the_other_shapes_of_its_set(workers):
     options = {"sizes": [(14, 28), (28, 14)], "max_broken": 0.9}
-    # Many sequences: Grain shuffles a few of them at a hundredth of the speed.
     with batches({"shaped": Shaped(90)}, **options) as iterator:
         shapes = [next(iterator)["images"].shape[2:4] for _ in range(12)]
     datasets = {"shaped": WithoutUpright(90)}

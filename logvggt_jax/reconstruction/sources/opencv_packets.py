@@ -1,0 +1,130 @@
+"""The packets of a video as OpenCV reads them undecoded."""
+
+from __future__ import annotations
+
+import io
+import re
+import struct
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+from PIL import Image
+
+from logvggt_jax.reconstruction.sources.opencv_messages import captured_stderr
+
+# Where the parameters of a stream begin, by which FFmpeg recognises it, and within how many bytes they say the size.
+_H264 = re.compile(rb"\x00\x00\x01[\x07\x27\x47\x67]"), 48
+_HEVC = re.compile(rb"\x00\x00\x01\x40"), 96
+_MPEG = re.compile(rb"\x00\x00\x01\xb3"), 12
+_PARAMETERS = {
+    b"h264": _H264,
+    b"avc1": _H264,
+    b"hevc": _HEVC,
+    b"hvc1": _HEVC,
+    b"hev1": _HEVC,
+    b"mpg1": _MPEG,
+    b"mpg2": _MPEG,
+    b"vp80": (re.compile(rb"...\x9d\x01\x2a....", re.DOTALL), 10),
+    b"vp90": (re.compile(rb""), 12),
+    b"av01": (re.compile(rb""), 32),
+    b"mjpg": (re.compile(rb"\xff\xd8"), 1 << 16),
+    b"mpng": (re.compile(rb"\x89PNG"), 24),
+}
+_PICTURES = (b"mjpg", b"mpng")
+# Codecs that FFmpeg recognises in the container IVF only.
+_IN_IVF = (b"vp90", b"av01")
+# Codecs of which every packet shows a frame of its own, but for empty ones, which stand for no change.
+_FRAME_A_PACKET = (b"h264", b"avc1", b"hevc", b"hvc1", b"hev1", b"mjpg", b"fmp4", b"mp4v", b"xvid", b"divx", b"dx50")
+_EMPTY_PACKET = 8
+# Errors in a row after which nothing more is to be read.
+_MOST_ERRORS = 64
+
+
+class Packet(NamedTuple):
+    """One packet of the video stream.
+
+    Attributes:
+      stamp: presentation time in microseconds from the stream's start; before it, where the file is edited, negative.
+      holds_frame: it is not empty.
+      key: decoding can begin with it.
+      size: (H, W) before rotation, as the key frames so far state it; None where none does.
+    """
+
+    stamp: int
+    holds_frame: bool
+    key: bool
+    size: tuple[int, int] | None
+
+
+class PacketReader:
+    """The packets of a file in the order in which they are stored.
+
+    Attributes:
+      frame_each: each is known to show one frame. AVI states no presentation times.
+
+    Args:
+      source: the file's absolute path.
+    """
+
+    def __init__(self, source: str) -> None:
+        self._capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
+        self._codec = (int(self._capture.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF).to_bytes(4, "little").lower()
+        with Path(source).open("rb") as file:
+            self.frame_each = self._codec in _FRAME_A_PACKET and file.read(4) != b"RIFF"
+
+    def __iter__(self) -> Iterator[Packet]:
+        size, head, errors = None, b"", 0
+        while self._capture.isOpened() and errors < _MOST_ERRORS:
+            read, content = self._capture.retrieve() if self._capture.grab() else (False, None)
+            if not read or content is None:
+                errors += 1
+                continue
+            errors = 0
+            stamp = round(1000 * self._capture.get(cv2.CAP_PROP_POS_MSEC))
+            key = bool(self._capture.get(cv2.CAP_PROP_LRF_HAS_KEY_FRAME))
+            if key:
+                parameters, length = _parameters(content.tobytes(), self._codec)
+                if parameters[:length] != head:
+                    head, size = parameters[:length], _stated_size(parameters, self._codec) or size
+            yield Packet(stamp, content.size > _EMPTY_PACKET, key, size)
+
+    def close(self) -> None:
+        """Closes the file."""
+        self._capture.release()
+
+
+def _parameters(packet: bytes, codec: bytes) -> tuple[bytes, int]:
+    """A key frame from where it states the size, and within how many bytes; empty where that is not known."""
+    begins, length = _PARAMETERS.get(codec, (None, 0))
+    found = begins.search(packet) if begins else None
+    return (packet[found.start() :], length) if found else (b"", 0)
+
+
+def _stated_size(parameters: bytes, codec: bytes) -> tuple[int, int] | None:
+    """(H, W) by what `_parameters` gave; None where it cannot be told."""
+    if not parameters:
+        return None
+    if codec in _PICTURES:
+        try:
+            with Image.open(io.BytesIO(parameters)) as picture:
+                return picture.height, picture.width
+        except (OSError, ValueError):
+            return None
+    if codec == b"vp80":
+        # Two bits of each number tell how to enlarge it.
+        width, height = (each & 0x3FFF for each in struct.unpack_from("<HH", parameters, 6))
+        return height, width
+    if codec in _IN_IVF:
+        head = b"DKIF" + struct.pack("<HH4sHHIIII", 0, 32, codec.upper(), 16, 16, 25, 1, 1, 0)
+        parameters = head + struct.pack("<IQ", len(parameters), 0) + parameters
+    # From memory OpenCV reads as well, but has been seen to end the process.
+    with tempfile.TemporaryDirectory() as folder, captured_stderr():
+        path = Path(folder) / "packet"
+        path.write_bytes(parameters)
+        alone = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+        size = (round(alone.get(cv2.CAP_PROP_FRAME_HEIGHT)), round(alone.get(cv2.CAP_PROP_FRAME_WIDTH)))
+        alone.release()
+    return size if min(size) > 0 else None

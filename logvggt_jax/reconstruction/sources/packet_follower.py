@@ -1,0 +1,178 @@
+"""What the packets of a video tell beside its pictures: which frames are missing, and where the size changes."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections import deque
+from collections.abc import Iterator
+from fractions import Fraction
+from typing import NamedTuple
+
+from logvggt_jax.reconstruction.sources.decoding import Damage
+from logvggt_jax.reconstruction.sources.missing_frames import MissingFrames
+from logvggt_jax.reconstruction.sources.opencv_packets import Packet, PacketReader
+
+_MICROSECOND = Fraction(1, 1_000_000)
+# Packets that are read before a frame is looked at: none is stored so far from the place where it is shown.
+_AHEAD = 48
+
+
+class TimeStamps(NamedTuple):
+    """What time stamps of packets and frames say together.
+
+    Attributes:
+      exist: the file states some; a bare stream of a codec states none.
+      as_stored: those of the packets only grow, and those of the frames do not. The k-th frame is then shown at the
+        k-th time, though frames are shown in another order than stored.
+    """
+
+    exist: bool
+    as_stored: bool
+
+
+def look_at_times(source: str, shown: list[int]) -> TimeStamps:
+    """Compares the first packets with the time stamps of the first frames that come out of the decoder."""
+    reader = PacketReader(source)
+    stamps = [packet.stamp for packet in itertools.islice(reader, _AHEAD)]
+    reader.close()
+    return TimeStamps(any(stamps) or any(shown), stamps == sorted(set(stamps)) and shown != sorted(shown))
+
+
+class PacketFollower:
+    """Reads the packets of a file along with the pictures that a decoder makes of them.
+
+    Recordings that were joined, where time begins anew, are told apart.
+
+    Attributes:
+      size: (H, W) before rotation, as stated for the picture at hand; None where nothing states it.
+      lead: frames before the first key frame, which refer to some that are not there.
+
+    Args:
+      source: the file's absolute path.
+      rate: frames a second on average; 0 where it is not known.
+      timed: there are time stamps.
+      edited: packets are stored that are not to be shown, and times count from the first that is.
+    """
+
+    def __init__(self, source: str, rate: float, *, timed: bool, edited: bool) -> None:
+        self._reader = PacketReader(source)
+        self._packets = iter(self._reader)
+        self._missing = MissingFrames(_MICROSECOND)
+        self._step = round(1e6 / rate) if math.isfinite(rate) and rate > 0 else None
+        # Whether all time stamps of frames so far were those of packets.
+        self._timed, self._trusted = timed, timed and not edited
+        self._sizes: deque[tuple[int, tuple[int, int] | None]] = deque()
+        self._stored = self._shown = 0
+        self._joint: Packet | None = None
+        self.size: tuple[int, int] | None = None
+        self.lead = 0
+        self._begin()
+        self._fill(_AHEAD)
+
+    def precedes_key_frame(self, stamp: int) -> bool:
+        """Whether a frame that is shown at this time comes before the first key frame."""
+        return self._joint is None and bool(self.lead) and self._key is not None and stamp < self._key
+
+    def fail(self, reason: str) -> None:
+        """A frame could not be decoded."""
+        self._missing.fail(reason)
+
+    def before(self, stamp: int) -> Iterator[Damage]:
+        """What is missing before the frame that is shown at this time; it is then the picture at hand."""
+        if self._joint is not None and stamp < self._last:
+            yield from self._part_ends()
+        self._fill(_AHEAD)
+        self._trusted = self._trusted and self._missing.waits_for(stamp)
+        yield from self._count(self._missing.before(stamp, self._since()))
+        yield from self._count(self._in_gap(stamp))
+        self._show(stamp)
+
+    def failures(self) -> Iterator[Damage]:
+        """What failed before the next frame, where the frames' own time stamps tell nothing."""
+        self._fill(_AHEAD)
+        yield from self._count(self._missing.failures())
+
+    def next_in_order(self) -> float | None:
+        """Seconds at which the next frame is shown, by the order of storage; it is then the picture at hand."""
+        stamp = self._missing.take_next()
+        self._show(self._last if stamp is None else stamp)
+        return None if stamp is None or not self._timed else float(stamp * _MICROSECOND)
+
+    def rest(self) -> Iterator[Damage]:
+        """What is missing up to the end of the file."""
+        self._fill(None)
+        while self._joint is not None:
+            yield from self._part_ends()
+            self._fill(None)
+        yield from self._all_missing()
+
+    def close(self) -> None:
+        """Closes the file."""
+        self._reader.close()
+
+    def _begin(self) -> None:
+        """A part whose time stamps have nothing to do with those before."""
+        self._key: int | None = None
+        self._last = self._highest = -1
+
+    def _part_ends(self) -> Iterator[Damage]:
+        yield from self._all_missing()
+        first, self._joint = self._joint, None
+        self._begin()
+        if first is not None:
+            self._take(first)
+
+    def _all_missing(self) -> Iterator[Damage]:
+        if self._since() is not None:
+            self._missing.fail_all("gives no picture")
+        yield from self._count(self._missing.failures())
+        while self._missing.take_next() is not None:
+            pass
+
+    def _in_gap(self, stamp: int) -> Iterator[Damage]:
+        """Failures that no packet explains, as it could not be read either: they are known by the gaps they leave."""
+        while self._step is not None and self._last >= 0 and 2 * (stamp - self._last) > 3 * self._step:
+            failure = self._missing.take_failure()
+            if failure is None:
+                return
+            self._last += self._step
+            yield Damage(float(self._last * _MICROSECOND), failure)
+
+    def _since(self) -> int | None:
+        return self._key if self._trusted and self._reader.frame_each else None
+
+    def _count(self, damages: Iterator[Damage]) -> Iterator[Damage]:
+        for damage in damages:
+            self._shown += 1
+            yield damage if self._timed else damage._replace(seconds=None)
+
+    def _show(self, stamp: int) -> None:
+        self._last = stamp
+        while self._sizes and self._sizes[0][0] <= self._shown:
+            self.size = self._sizes.popleft()[1]
+        self._shown += 1
+
+    def _fill(self, ahead: int | None) -> None:
+        """Reads packets until so many more are in than frames were shown, all for None, but none beyond a joint."""
+        while self._joint is None and (ahead is None or self._stored < self._shown + ahead):
+            packet = next(self._packets, None)
+            if packet is None:
+                return
+            if packet.key and packet.stamp < self._highest:
+                self._joint = packet
+            else:
+                self._take(packet)
+
+    def _take(self, packet: Packet) -> None:
+        self._highest = max(self._highest, packet.stamp)
+        if packet.key and self._key is None:
+            self._key = packet.stamp
+        if self._key is None:
+            self.lead += 1
+            return
+        if not self._sizes or self._sizes[-1][1] != packet.size:
+            self._sizes.append((self._stored, packet.size))
+        if packet.holds_frame and packet.stamp >= 0:
+            self._missing.expect(packet.stamp)
+            self._stored += 1
