@@ -49,9 +49,10 @@ if not flags.FLAGS.is_parsed():
 
 # Files of more than about fifteen seconds of processor time, the dearest first: none is left to one process at the end.
 DEAREST = (
+    # Waits for a process of its own while another worker compiles what the next files initialise parameters with.
+    "training/test_train_script.py",
     "model/test_logvggt.py",
     "streaming/test_frame_methods.py",
-    "training/test_train_script.py",
     "training/test_loop.py",
     "weights/test_checkpoints.py",
     "data/feeding/test_pipeline.py",

@@ -5,8 +5,11 @@ from __future__ import annotations
 import dataclasses
 import functools
 import re
-from typing import Any
+from collections.abc import Container, Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
@@ -21,6 +24,15 @@ from logvggt_jax.model.windows import Windows, WindowState
 from logvggt_jax.types import Predictions, WindowOutput
 
 __all__ = ["LogVGGT", "Variables", "predictions_of", "shallow", "variable_shapes"]
+
+
+class ModuleCall(NamedTuple):
+    """A module with what it is called with: abstract arrays, and what is static."""
+
+    module: nn.Module
+    inputs: tuple[Any, ...]
+    static: Mapping[str, Any] = MappingProxyType({})
+
 
 # Names of layers after the first.
 _LATER = r"block_[1-9]\d*$"
@@ -52,18 +64,28 @@ class LogVGGT:
         """Refining globally: from compact tokens to poses."""
         return Refinement(self.config)
 
-    def init(self, key: jax.Array, images: jax.Array) -> Variables:
+    def init(self, key: jax.Array, images: jax.Array, *, only: Container[str] | None = None) -> Variables:
         """Random parameters {"params": …}, float32; `images` [B, T, H, W, 3] are checked, not read.
 
         The modules see abstract inputs: eager generators for the parameters compile once a shape, where a
-        jitted program would inline one for each parameter.
+        jitted program would inline one for each parameter. `only` names the modules that are drawn; None for all.
         """
+        check_images(images, self.config.encoder.patch_size)
+        calls = self.calls((images.shape[2], images.shape[3]))
+        keys = jax.random.split(key, 6)
+        return {
+            "params": {
+                name: call.module.lazy_init(key, *call.inputs, **call.static)["params"]
+                for key, (name, call) in zip(keys, calls.items(), strict=False)
+                if only is None or name in only
+            }
+        }
+
+    def calls(self, image_size: tuple[int, int]) -> dict[str, ModuleCall]:
+        """Each module by the name of its parameters, with abstract inputs for one frame of `image_size` (H, W)."""
         config, windows, refinement = self.config, self.windows, self.refinement
-        check_images(images, config.encoder.patch_size)
-        image_size = images.shape[2], images.shape[3]
         grid = windows.grid(image_size)
         width, patches, registers = config.encoder.embed_dim, grid[0] * grid[1], config.aggregator.num_registers
-        keys = iter(jax.random.split(key, 6))
 
         def floats(*shape: int) -> jax.ShapeDtypeStruct:
             return jax.ShapeDtypeStruct(shape, jnp.float32)
@@ -72,19 +94,19 @@ class LogVGGT:
         cached = floats(1, len(config.aggregator.key_layers), 1, patches + 1 + registers, width)
         memory = CrossWindowMemory(cached, lengths, config.aggregator.key_layers)  # type: ignore[arg-type]
         camera, levels = floats(1, 1, 2 * width), [floats(1, patches, 2 * width)] * 4
-        dense: Any = {"grid": grid, "image_size": image_size}
-        modules = {
-            "encoder": windows.encoder.lazy_init(next(keys), floats(1, *image_size, 3)),
-            "aggregator": windows.aggregator.lazy_init(
-                next(keys), floats(1, 1, patches, width), lengths, first, memory, grid=grid
+        dense: dict[str, Any] = {"grid": grid, "image_size": image_size}
+        calls = {
+            "encoder": ModuleCall(windows.encoder, (floats(1, *image_size, 3),)),
+            "aggregator": ModuleCall(
+                windows.aggregator, (floats(1, 1, patches, width), lengths, first, memory), {"grid": grid}
             ),
-            "camera_head": refinement.camera_head.lazy_init(next(keys), camera, lengths),
-            "depth_head": windows.depth_head.lazy_init(next(keys), levels, **dense),
-            "gccr": refinement.gccr.lazy_init(next(keys), camera, floats(1, 1, registers, 2 * width), lengths),
+            "camera_head": ModuleCall(refinement.camera_head, (camera, lengths)),
+            "depth_head": ModuleCall(windows.depth_head, (levels,), dense),
+            "gccr": ModuleCall(refinement.gccr, (camera, floats(1, 1, registers, 2 * width), lengths)),
         }
         if config.point_head is not None:
-            modules["point_head"] = windows.point_head.lazy_init(next(keys), levels, **dense)
-        return {"params": {name: variables["params"] for name, variables in modules.items()}}
+            calls["point_head"] = ModuleCall(windows.point_head, (levels,), dense)
+        return calls
 
     @splits_as_its_batch
     def apply(
@@ -209,8 +231,11 @@ def variable_shapes(config: ModelConfig) -> Variables:
     """{"params": …} of a model as `jax.ShapeDtypeStruct`s; traced once for each configuration, nothing is allocated."""
     # Shapes do not depend on the form of attention, and tracing cuDNN's asks for a GPU.
     model, patch = LogVGGT(dataclasses.replace(shallow(config), attention="xla")), config.encoder.patch_size
-    images = jax.ShapeDtypeStruct((1, 1, patch, patch, 3), jnp.uint8)
-    params = jax.eval_shape(model.init, jax.random.key(0), images)["params"]
+    key = jax.random.key(0)
+    params = {
+        name: jax.eval_shape(functools.partial(call.module.init, **call.static), key, *call.inputs)["params"]
+        for name, call in model.calls((patch, patch)).items()
+    }
 
     def stacked(layers: Any) -> Any:
         """One layer of each family in place of the stack."""
