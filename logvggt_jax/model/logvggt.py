@@ -34,6 +34,23 @@ class ModuleCall(NamedTuple):
     static: Mapping[str, Any] = MappingProxyType({})
 
 
+def _drawn(call: ModuleCall, key: jax.Array) -> Any:
+    """Random parameters of a module.
+
+    It is traced, while generators run as they are met (`ShapeCheck.param`): they compile once a shape, where a jitted
+    program would inline one for each parameter. Linen's `lazy_init` would compile an empty program for each operation.
+    """
+    if isinstance(key, jax.core.Tracer):
+        return call.module.lazy_init(key, *call.inputs, **call.static)["params"]
+    drawn = []
+
+    def trace(*inputs: Any) -> None:
+        drawn.append(call.module.init(key, *inputs, **call.static)["params"])
+
+    jax.eval_shape(trace, *call.inputs)
+    return jax.tree.map(jnp.asarray, drawn[0])
+
+
 # Names of layers after the first.
 _LATER = r"block_[1-9]\d*$"
 
@@ -67,15 +84,14 @@ class LogVGGT:
     def init(self, key: jax.Array, images: jax.Array, *, only: Container[str] | None = None) -> Variables:
         """Random parameters {"params": …}, float32; `images` [B, T, H, W, 3] are checked, not read.
 
-        The modules see abstract inputs: eager generators for the parameters compile once a shape, where a
-        jitted program would inline one for each parameter. `only` names the modules that are drawn; None for all.
+        `only` names the modules that are drawn; None for all.
         """
         check_images(images, self.config.encoder.patch_size)
         calls = self.calls((images.shape[2], images.shape[3]))
         keys = jax.random.split(key, 6)
         return {
             "params": {
-                name: call.module.lazy_init(key, *call.inputs, **call.static)["params"]
+                name: _drawn(call, key)
                 for key, (name, call) in zip(keys, calls.items(), strict=False)
                 if only is None or name in only
             }

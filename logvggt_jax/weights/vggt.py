@@ -398,19 +398,10 @@ def _initial(config: ModelConfig, params: dict[str, Any]) -> dict[ParamPath, jax
     """Initial values of the model's parameters that `params` lacks, which are none of a layer's."""
     known = frozenset(_path(path) for path, _ in jax.tree_util.tree_leaves_with_path(params))
     every = (_path(path) for path, _ in jax.tree_util.tree_leaves_with_path(variable_shapes(config)["params"]))
-    modules = frozenset(path[0] for path in every if path not in known)
-    drawn = _drawn(jax.random.key(0), shallow(config), modules, known)
-    return {tuple(name.split("/")): leaf for name, leaf in drawn.items()}
-
-
-# Under jit the initial values that nobody asks for are never computed.
-@functools.partial(jax.jit, static_argnums=(1, 2, 3))
-def _drawn(
-    key: jax.Array, config: ModelConfig, modules: frozenset[str], known: frozenset[ParamPath]
-) -> dict[str, jax.Array]:
-    drawn = LogVGGT(config).init(key, _smallest_images(config), only=modules)["params"]
+    modules = {path[0] for path in every if path not in known}
+    drawn = LogVGGT(shallow(config)).init(jax.random.key(0), _smallest_images(config), only=modules)["params"]
     leaves = {_path(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(drawn)}
-    return {"/".join(path): leaf for path, leaf in leaves.items() if path not in known}
+    return {path: leaf for path, leaf in leaves.items() if path not in known}
 
 
 def _smallest_images(config: ModelConfig) -> jax.Array:
