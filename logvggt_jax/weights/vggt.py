@@ -259,7 +259,7 @@ def params_from_vggt(
             raise InputError(f"{rule.name} has {wrong}; the checkpoint is of a training that failed, or damaged")
         for path, layout in rule.targets:
             # A copy, because a view would keep the caller's array alive and follow its changes.
-            _insert(params, path, jnp.array(layout(tensor)))
+            _insert(params, path, jax.device_put(np.array(layout(tensor))))
         report.used.append(rule.name)
         report.targets[rule.name] = tuple("/".join(path) for path, _ in rule.targets)
     for path, value in _initial(config, params).items():

@@ -120,7 +120,7 @@ def test_a_failed_save_leaves_the_older_model_and_nothing_else(folder, small_con
     def fail(*args, **kwargs):
         raise OSError("no space left on device")
 
-    monkeypatch.setattr(ocp.StandardCheckpointer, "save", fail)
+    monkeypatch.setattr(ocp.AsyncCheckpointer, "save", fail)
     for path in (folder, folder.parent / "fresh"):
         with pytest.raises(OSError, match="no space left"):
             save_model(path, small_config, small_variables["params"])
@@ -133,7 +133,7 @@ def test_a_full_disk_is_one_line_with_the_path(tmp_path, small_config, small_var
     def fail(*args, **kwargs):  # as Orbax does it
         raise ValueError("RESOURCE_EXHAUSTED: Error writing: No space left on device [os_error_code='28']")
 
-    monkeypatch.setattr(ocp.StandardCheckpointer, "save", fail)
+    monkeypatch.setattr(ocp.AsyncCheckpointer, "save", fail)
     with pytest.raises(DiskError, match=r"/model: No space left on device$"):
         save_model(tmp_path / "model", small_config, small_variables["params"])
     assert list(tmp_path.iterdir()) == []
