@@ -24,8 +24,11 @@ from logvggt_jax.reconstruction.sources import (
     SourceFrame,
     SourceOptions,
     VideoSource,
+    media_info,
     open_source,
     opencv_decoder,
+    opencv_messages,
+    opencv_packets,
     pyav_decoder,
     video,
 )
@@ -719,6 +722,36 @@ def test_an_edited_video_is_whole(tmp_path: Path, library: str) -> None:
     assert abs(frames[0].image.mean() - 40 - 8 * 10) < 10
 
 
+@pytest.mark.parametrize("frames", [3, 12])
+def test_a_beginning_that_an_edit_list_leaves_out_is_not_missing(tmp_path: Path, library: str, frames: int) -> None:
+    path = write(tmp_path / "cut.mp4", [grey(i) for i in range(24)], options={"g": "24", "bf": "0"})
+    content = bytearray(path.read_bytes())
+    place = content.index(b"elst") + 12
+    with av.open(str(path)) as container:
+        begin = round(frames / 10 / container.streams.video[0].time_base)
+    content[place : place + 8] = (2400 - 100 * frames).to_bytes(4, "big") + begin.to_bytes(4, "big")
+    path.write_bytes(content)
+    source = open_source(path, strict=True)
+    shown = list(source)
+    assert len(shown) == 24 - frames and not source.skipped
+    assert abs(shown[0].image.mean() - 40 - 8 * frames) < 6
+
+
+def test_recordings_that_were_joined_may_each_begin_in_the_middle(tmp_path: Path, library: str) -> None:
+    part = write(tmp_path / "part.ts", [busy(i) for i in range(24)], codec="mpeg2video", options={"g": "12", "bf": "0"})
+    content = part.read_bytes()
+    # What describes the stream, then the video from its third frame on.
+    cut = content[: 3 * 188] + content[packets(part)[3][0] // 188 * 188 :]
+    path = tmp_path / "joined.ts"
+    path.write_bytes(cut + cut)
+    source = open_source(path, most_broken=1.0)
+    frames = list(source)
+    assert any("begins in the middle" in note for note in source.notes)
+    assert [*names(frames), *(int(each.name[6:]) for each in source.skipped)] == list(range(len(frames)))
+    # All but what precedes the first key frame; FFmpeg's decoder may lose a frame at the joint.
+    assert len(frames) >= 12 + 20
+
+
 def test_a_damaged_index_of_a_short_video_is_told(tmp_path: Path, library: str) -> None:
     path = write(tmp_path / "walk.mp4", [busy(i) for i in range(6)], codec="mpeg4")
     content = bytearray(path.read_bytes())
@@ -802,10 +835,11 @@ def test_of_several_videos_in_a_file_the_one_that_is_read_is_named(tmp_path: Pat
                 container.mux(stream.encode(image))
     source = open_source(path)
     assert next(iter(source)).image.mean() < 60
-    assert source.notes == [
-        f"{path} holds 2 videos, 64 x 48 (0:0), 64 x 48 (0:1), of which 0:0 is read; for another, ffmpeg -i INPUT "
-        "-map 0:1 -c copy OUTPUT.mkv"
-    ]
+    first, other = ("0:0", "0:1") if library == "pyav" else ("0:v:0", "0:v:1")
+    assert source.notes[0] == (
+        f"{path} holds 2 videos, 64 x 48 ({first}), 64 x 48 ({other}), of which {first} is read; for another, "
+        f"ffmpeg -i INPUT -map {other} -c copy OUTPUT.mkv"
+    )
 
 
 def test_a_recording_that_begins_in_the_middle(tmp_path: Path, library: str) -> None:
@@ -1018,6 +1052,73 @@ def silent_stream(stamps: Sequence[float], asked: list[int]) -> Any:
             pass
 
     return Stream()
+
+
+def test_reads_that_fail_are_no_frames_of_a_camera(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As while it warms up, or where a cable is loose."""
+
+    class Camera:
+        def __init__(self, *_: object) -> None:
+            self.asked = 0
+
+        def isOpened(self) -> bool:
+            return True
+
+        def grab(self) -> bool:
+            self.asked += 1
+            return self.asked > 5 and self.asked not in range(20, 24)
+
+        def retrieve(self) -> tuple[bool, np.ndarray]:
+            return True, grey(self.asked % 20)
+
+        def get(self, name: int) -> float:
+            return 0.0
+
+        def release(self) -> None:
+            pass
+
+    monkeypatch.setattr(cv2, "VideoCapture", Camera)
+    source = open_source("0", max_frames=30)
+    assert names(list(source)) == list(range(30))
+    assert not source.skipped
+
+
+def test_mediainfo_that_takes_too_long_is_not_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, opencv_only: None
+) -> None:
+    monkeypatch.setattr(media_info, "_PATIENCE", 0.05)
+    monkeypatch.setattr(media_info.MediaInfo, "parse", lambda _: time.sleep(0.5))
+    assert len(list(open_source(write(tmp_path / "clip.mp4", [grey(i) for i in range(4)])))) == 4
+
+
+def test_parameters_are_read_once_where_they_stay_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, opencv_only: None
+) -> None:
+    path = write(tmp_path / "intra.mp4", [busy(i) for i in range(12)], options={"g": "1"})
+    asked: list[bytes] = []
+    stated = opencv_packets._stated_size
+    monkeypatch.setattr(
+        opencv_packets, "_stated_size", lambda content, codec: asked.append(content) or stated(content, codec)
+    )
+    packets_read = [packet for packet in opencv_packets.PacketReader(str(path)) if packet is not None]
+    assert [packet.key for packet in packets_read] == [True] * 12 and len(asked) == 1
+    assert {packet.size for packet in packets_read} == {(HEIGHT, WIDTH)}
+
+
+def test_what_threads_print_comes_back_to_the_terminal(capfd: pytest.CaptureFixture[str]) -> None:
+    def capture() -> None:
+        for _ in range(20):
+            with opencv_messages.captured_stderr() as messages:
+                os.write(2, b"hidden")
+                assert messages() == "hidden"
+
+    threads = [threading.Thread(target=capture) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    os.write(2, b"shown")
+    assert capfd.readouterr().err == "shown"
 
 
 def test_digits_name_a_camera_unless_they_are_a_path(

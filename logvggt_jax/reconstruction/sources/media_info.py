@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import queue
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,8 @@ from pymediainfo import MediaInfo
 # Formats whose header states how long each frame is shown.
 _STATE_EACH_DURATION = ("MPEG-4", "QuickTime", "AVI")
 _HDR_TRANSFERS = ("PQ", "HLG")
+# Seconds; what is whole takes hundredths of one.
+_PATIENCE = 5.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,29 +23,38 @@ class MediaHeader:
 
     Attributes:
       sizes: (H, W) of each as it is stored, cover pictures left out.
-      numbers: of each among all streams of the file.
       seconds: duration of the first; None where the last frame may be shown for most of it, which only its packet
         tells, unless the file is cut off.
       quarter_turns: by which the first is turned clockwise before it is shown, as a tag of the file says.
       interlaced: the header says of every frame that its lines show two moments in alternation.
       transfer: PQ or HLG, as HDR is coded; None for neither.
+      bare: the file is a stream of a codec and nothing else, which states no times.
     """
 
     sizes: list[tuple[int, int]]
-    numbers: list[int]
     seconds: float | None
     quarter_turns: int
     interlaced: bool
     transfer: str | None
+    bare: bool
+
+
+def media_info_is_there() -> bool:
+    """Whether there is a library of MediaInfo for this system."""
+    return bool(MediaInfo.can_parse())
 
 
 def read_media_header(path: Path) -> MediaHeader | None:
-    """None where MediaInfo's library is not there for this system, or knows nothing of the file's videos."""
-    if not MediaInfo.can_parse():
+    """None where there is no library, or it knows nothing of the file's videos, or takes more than seconds to say."""
+    if not media_info_is_there():
         return None
+    answer: queue.SimpleQueue[MediaInfo | None] = queue.SimpleQueue()
+    threading.Thread(target=_parse, args=(path, answer), daemon=True, name="mediainfo").start()
     try:
-        information = MediaInfo.parse(str(path))
-    except (OSError, RuntimeError):
+        information = answer.get(timeout=_PATIENCE)
+    except queue.Empty:  # some damaged files are searched for minutes
+        return None
+    if information is None:
         return None
     videos = information.video_tracks
     if not videos:
@@ -51,12 +64,19 @@ def read_media_header(path: Path) -> MediaHeader | None:
     duration = _number(first.duration) if known else None
     return MediaHeader(
         sizes=[(round(_number(each.height) or 0), round(_number(each.width) or 0)) for each in videos],
-        numbers=[round(_number(each.stream_identifier) or 0) for each in videos],
         seconds=duration and duration / 1000,
         quarter_turns=round((_number(first.rotate) or 0) / 90) % 4,
         interlaced=first.scan_type == "Interlaced",
         transfer=next((each for each in _HDR_TRANSFERS if first.transfer_characteristics == each), None),
+        bare=file.format == first.format,
     )
+
+
+def _parse(path: Path, answer: queue.SimpleQueue[MediaInfo | None]) -> None:
+    try:
+        answer.put(MediaInfo.parse(str(path)))
+    except (OSError, RuntimeError, ValueError, SyntaxError):  # of XML that is none, too
+        answer.put(None)
 
 
 def _number(value: Any) -> float | None:

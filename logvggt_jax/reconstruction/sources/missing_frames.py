@@ -70,3 +70,7 @@ class MissingFrames:
     def waits_for(self, stamp: int) -> bool:
         """Whether a frame that is to be shown at this time went in and has not come out."""
         return stamp in self._waiting
+
+    def anything_waits(self) -> bool:
+        """Whether a frame went in that has not come out."""
+        return bool(self._waiting)

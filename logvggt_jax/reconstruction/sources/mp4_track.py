@@ -17,8 +17,6 @@ from logvggt_jax.reconstruction.sources.media_boxes import boxes
 _LARGEST_INDEX = 1 << 28
 # Where the matrix stands in a track's header, by the header's version.
 _MATRIX_AT = {0: 40, 1: 52}
-# Seconds by which frames that are stored in another order than shown begin later.
-_REORDERING = 0.5
 # Boxes of spherical videos, version 2, and what version 1 writes into its XML.
 _PROJECTIONS = {b"equi": "equirectangular", b"cbmp": "a cube map", b"mshp": "a mesh"}
 
@@ -29,12 +27,14 @@ class Mp4View(NamedTuple):
     Attributes:
       matrix: see `orientation`; None where nothing is turned.
       projection: of a view all around; None for that of a pinhole camera.
-      edit: seconds that are shown of a track of which not all is shown; None where all is.
+      seconds: that are shown; None where the track does not say.
+      edited: not all of the track is shown.
     """
 
     matrix: np.ndarray | None = None
     projection: str | None = None
-    edit: float | None = None
+    seconds: float | None = None
+    edited: bool = False
 
 
 def read_mp4_view(path: Path) -> Mp4View:
@@ -43,7 +43,8 @@ def read_mp4_view(path: Path) -> Mp4View:
     movie = next((content for kind, content in inside if kind == b"mvhd"), b"")
     for kind, content in inside:
         if kind == b"trak" and (view := _view(content, movie)):
-            return view
+            # Of a file in fragments the index knows the first alone.
+            return view._replace(seconds=None) if any(kind == b"mvex" for kind, _ in inside) else view
     return Mp4View()
 
 
@@ -77,7 +78,8 @@ def _view(track: bytes, movie: bytes) -> Mp4View | None:
     media = dict(_children(inside.get(b"mdia", b"")))
     if media.get(b"hdlr", b"")[8:12] != b"vide":
         return None
-    return Mp4View(_matrix(inside.get(b"tkhd", b"")), _projection(track), _edit(inside.get(b"edts", b""), media, movie))
+    timing = _shown(inside.get(b"edts", b""), media, movie)
+    return Mp4View(_matrix(inside.get(b"tkhd", b"")), _projection(track), *timing)
 
 
 def _matrix(header: bytes) -> np.ndarray | None:
@@ -97,20 +99,29 @@ def _projection(track: bytes) -> str | None:
     return projection and _PROJECTIONS[projection[1]]
 
 
-def _edit(edits: bytes, media: dict[bytes, bytes], movie: bytes) -> float | None:
-    """Seconds that the edit list shows, where that is not the whole of the track."""
-    shown = dict(_children(edits)).get(b"elst", b"")
+def _shown(edits: bytes, media: dict[bytes, bytes], movie: bytes) -> tuple[float | None, bool]:
+    """Seconds that are shown, and whether the edit list leaves something out."""
     (whole, unit), (_, movie_unit) = _duration(media.get(b"mdhd", b"")), _duration(movie)
-    if not shown or not unit or not movie_unit:
-        return None
+    seconds = whole / unit if whole and unit else None
+    shown = dict(_children(edits)).get(b"elst", b"")
+    if not shown or seconds is None or not movie_unit:
+        return seconds, False
     layout = struct.Struct(">Qqi" if shown[0] else ">Iii")
     entries = [each[:2] for each in layout.iter_unpack(shown[8 : 8 + (len(shown) - 8) // layout.size * layout.size])]
     # An entry that begins at -1 is a pause.
-    seconds = sum(length for length, begin in entries if begin >= 0) / movie_unit
-    # Of a stream with references in both directions the first frame is shown a little after time zero.
-    begins = [begin / unit for _, begin in entries if begin >= 0]
-    is_whole = len(begins) == 1 and seconds + begins[0] >= 0.99 * whole / unit and begins[0] <= _REORDERING
-    return None if is_whole or not seconds else seconds
+    parts = [(length / movie_unit, begin) for length, begin in entries if begin >= 0]
+    if not parts or not sum(length for length, _ in parts):  # of a file in fragments, what is shown stands in none
+        return seconds, False
+    end, begin = parts[0][0] + parts[0][1] / unit, parts[0][1]
+    if len(parts) == 1 and end >= seconds - 2 / movie_unit and begin <= _first_offset(media):
+        return seconds, False
+    return sum(length for length, _ in parts), True
+
+
+def _first_offset(media: dict[bytes, bytes]) -> int:
+    """How much later than it is decoded the first frame is shown: of a stream with references in both directions."""
+    table = dict(_children(dict(_children(media.get(b"minf", b""))).get(b"stbl", b""))).get(b"ctts", b"")
+    return int.from_bytes(table[12:16], "big", signed=table[:1] == b"\1")
 
 
 def _duration(header: bytes) -> tuple[int, int]:

@@ -16,7 +16,7 @@ import numpy as np
 
 from logvggt_jax.errors import InputError, install_line
 from logvggt_jax.reconstruction.sources.decoding import Damage, Picture, VideoHeader
-from logvggt_jax.reconstruction.sources.media_info import MediaHeader, read_media_header
+from logvggt_jax.reconstruction.sources.media_info import MediaHeader, media_info_is_there, read_media_header
 from logvggt_jax.reconstruction.sources.mp4_track import Mp4View, read_mp4_view
 from logvggt_jax.reconstruction.sources.opencv_messages import captured_stderr, quiet
 from logvggt_jax.reconstruction.sources.orientation import shown_size, turn
@@ -53,6 +53,7 @@ class OpenCVDecoder:
     def __init__(self, source: str | int, name: str, timeout: float | None = None) -> None:
         self._source, self._name, self._timeout = source, name, timeout
         self._file = None if isinstance(source, int) or timeout is not None else str(source)
+        self._looked = False
         self._view = Mp4View()
         self._media: MediaHeader | None = None
         self._matrix: np.ndarray | None = None
@@ -85,7 +86,7 @@ class OpenCVDecoder:
             self._refuse_interlaced()
         notes = tuple(self._notes(capture, image.shape[:2], rate))
         capture.release()
-        seconds = self._view.edit or (self._media.seconds if self._media else None)
+        seconds = self._view.seconds or (self._media.seconds if self._media else None)
         return VideoHeader(
             size=shown_size(image.shape[:2], self._matrix),
             rate=rate,
@@ -109,6 +110,8 @@ class OpenCVDecoder:
 
     def _follow(self, capture: cv2.VideoCapture, follower: PacketFollower | None) -> Iterator[Picture | Damage]:
         failures = 0
+        rate = capture.get(cv2.CAP_PROP_FPS)
+        step = 1.0 / rate if math.isfinite(rate) and rate > 0 else math.inf
         last: float | None = None
         before: np.ndarray | None = None
         first_size: tuple[int, int] | None = None
@@ -122,21 +125,24 @@ class OpenCVDecoder:
                 if self._timeout is not None and time.monotonic() - asked >= self._timeout:
                     break
                 continue
-            seconds = self._stamp(capture, last)
+            seconds = self._stamp(capture, last, follower)
             if follower is None:
-                yield from [Damage(None, _UNDECODED)] * failures
+                while failures and last is not None and seconds is not None and seconds - last > 1.5 * step:
+                    failures, last = failures - 1, last + step
+                    yield Damage(last, _UNDECODED)
             else:
                 for _ in range(failures):
                     follower.fail(_UNDECODED)
-            failures = 0
-            if follower is not None:
                 if seconds is None or self._times.as_stored:
                     yield from follower.failures()
-                    seconds = follower.next_in_order()
+                    ordered = follower.next_in_order()
+                    seconds = ordered if self._times.as_stored else None
                 elif follower.precedes_key_frame(stamp := round(1e6 * seconds)):
+                    failures = 0
                     continue
                 else:
                     yield from follower.before(stamp)
+            failures = 0
             if before is not None and np.array_equal(image, before):
                 # Either nothing moves, or the picture was not converted and the buffer holds the one before.
                 with captured_stderr() as messages:
@@ -165,15 +171,16 @@ class OpenCVDecoder:
         if self._file is None:
             return
         media = self._media
-        if media is None:
+        if media is None and not media_info_is_there():
             yield (
                 f"{self._name} is decoded by OpenCV, which without MediaInfo, whose library is not there for this "
                 f"system, does not notice HDR, or interlacing that only the header tells: {_PYAV}"
             )
-        elif len(media.sizes) > 1:
+        if media is not None and len(media.sizes) > 1:
+            names = [f"v:{number}" for number in range(len(media.sizes))]
             read = media.sizes.index(size) if size in media.sizes else 0
-            yield several_videos(self._name, media.sizes, media.numbers, media.numbers[read])
-        if not self._times.exist:
+            yield several_videos(self._name, media.sizes, names, names[read])
+        if not self._times.exist or (media is not None and media.bare):
             yield no_times(self._name, rate or 1.0)
         if self._view.projection is not None:
             yield all_around(self._name, self._view.projection)
@@ -188,12 +195,15 @@ class OpenCVDecoder:
         if follower is not None:
             if follower.lead:
                 yield begins_late(self._name, follower.lead)
+            if not follower.states_size:
+                yield f"{self._name}: OpenCV does not notice where pictures of its codec change their size; {_PYAV}"
             follower.close()
 
     def _look_at_file(self) -> None:
         """Learns what OpenCV does not tell: how pictures are turned, what their header says, and which times hold."""
-        if self._file is None or self._media is not None:
+        if self._file is None or self._looked:
             return
+        self._looked = True
         capture = self._open()
         shown: list[int] = []
         while len(shown) < _FIRST_FRAMES and capture.grab():
@@ -209,7 +219,7 @@ class OpenCVDecoder:
     def _follower(self, rate: float) -> PacketFollower | None:
         if self._file is None:
             return None
-        return PacketFollower(self._file, rate, timed=self._times.exist, edited=self._view.edit is not None)
+        return PacketFollower(self._file, rate, timed=self._times.exist, edited=self._view.edited)
 
     def _check_converted(self, said: str) -> None:
         """Raises InputError if OpenCV handed out a buffer into which it could not convert the picture."""
@@ -234,14 +244,15 @@ class OpenCVDecoder:
             head = file.read(8)
         return head[4:] == b"ftyp" or head[:4] == b"RIFF"
 
-    def _stamp(self, capture: cv2.VideoCapture, last: float | None) -> float | None:
+    def _stamp(self, capture: cv2.VideoCapture, last: float | None, follower: PacketFollower | None) -> float | None:
         if isinstance(self._source, int):
             return time.monotonic()
+        if not self._times.exist:
+            return None
         seconds = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
-        if self._file is not None:
-            return seconds if self._times.exist else None
-        # Without time stamps OpenCV says 0 every time.
-        return None if last is not None and seconds == 0 else seconds
+        # Without a time stamp OpenCV says 0.
+        known = seconds != 0 or last is None or (follower is not None and follower.begins_part())
+        return seconds if known else None
 
     def _open(self) -> cv2.VideoCapture:
         parameters = []

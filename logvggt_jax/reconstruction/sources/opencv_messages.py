@@ -4,9 +4,12 @@ import contextlib
 import os
 import sys
 import tempfile
+import threading
 from collections.abc import Callable, Iterator
 
 import cv2
+
+_STDERR = threading.RLock()
 
 
 @contextlib.contextmanager
@@ -26,19 +29,21 @@ def captured_stderr() -> Iterator[Callable[[], str]]:
 
     Gives a function that returns what has been printed so far; nothing of it reaches the terminal.
     """
-    sys.stderr.flush()
-    kept = os.dup(2)
-    try:
-        with tempfile.TemporaryFile() as file:
-            os.dup2(file.fileno(), 2)
-            try:
+    # The descriptor is the whole process's: two threads would restore it out of turn.
+    with _STDERR:
+        sys.stderr.flush()
+        kept = os.dup(2)
+        try:
+            with tempfile.TemporaryFile() as file:
+                os.dup2(file.fileno(), 2)
+                try:
 
-                def printed() -> str:
-                    file.seek(0)
-                    return file.read().decode(errors="replace")
+                    def printed() -> str:
+                        file.seek(0)
+                        return file.read().decode(errors="replace")
 
-                yield printed
-            finally:
-                os.dup2(kept, 2)
-    finally:
-        os.close(kept)
+                    yield printed
+                finally:
+                    os.dup2(kept, 2)
+        finally:
+            os.close(kept)

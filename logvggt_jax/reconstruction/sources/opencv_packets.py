@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import re
 import struct
 import tempfile
@@ -13,13 +14,15 @@ from typing import NamedTuple
 import cv2
 from PIL import Image
 
-from logvggt_jax.reconstruction.sources.opencv_messages import captured_stderr
+from logvggt_jax.reconstruction.sources.opencv_messages import quiet
 
-# Where the parameters of a stream begin, by which FFmpeg recognises it, and within how many bytes they say the size.
-_H264 = re.compile(rb"\x00\x00\x01[\x07\x27\x47\x67]"), 48
-_HEVC = re.compile(rb"\x00\x00\x01\x40"), 96
+# Where the parameters of a stream begin, by which FFmpeg recognises it, and how many bytes of them state the size; for
+# None, those up to the next start code.
+_START_CODE = b"\x00\x00\x01"
+_H264 = re.compile(rb"\x00\x00\x01[\x07\x27\x47\x67]"), None
+_HEVC = re.compile(rb"\x00\x00\x01\x40.*?\x00\x00\x01\x42", re.DOTALL), None
 _MPEG = re.compile(rb"\x00\x00\x01\xb3"), 12
-_PARAMETERS = {
+_PARAMETERS: dict[bytes, tuple[re.Pattern[bytes], int | None]] = {
     b"h264": _H264,
     b"avc1": _H264,
     b"hevc": _HEVC,
@@ -47,7 +50,7 @@ class Packet(NamedTuple):
     """One packet of the video stream.
 
     Attributes:
-      stamp: presentation time in microseconds from the stream's start; before it, where the file is edited, negative.
+      stamp: presentation time in microseconds from the stream's start.
       holds_frame: it is not empty.
       key: decoding can begin with it.
       size: (H, W) before rotation, as the key frames so far state it; None where none does.
@@ -75,13 +78,16 @@ class PacketReader:
         with Path(source).open("rb") as file:
             self.frame_each = self._codec in _FRAME_A_PACKET and file.read(4) != b"RIFF"
 
-    def __iter__(self) -> Iterator[Packet]:
+    def __iter__(self) -> Iterator[Packet | None]:
+        """None stands for one that cannot be read."""
         size, head, errors = None, b"", 0
         while self._capture.isOpened() and errors < _MOST_ERRORS:
             read, content = self._capture.retrieve() if self._capture.grab() else (False, None)
             if not read or content is None:
                 errors += 1
                 continue
+            # At the end there are only errors.
+            yield from itertools.repeat(None, errors)
             errors = 0
             stamp = round(1000 * self._capture.get(cv2.CAP_PROP_POS_MSEC))
             key = bool(self._capture.get(cv2.CAP_PROP_LRF_HAS_KEY_FRAME))
@@ -98,9 +104,14 @@ class PacketReader:
 
 def _parameters(packet: bytes, codec: bytes) -> tuple[bytes, int]:
     """A key frame from where it states the size, and within how many bytes; empty where that is not known."""
-    begins, length = _PARAMETERS.get(codec, (None, 0))
+    begins, length = _PARAMETERS.get(codec, (None, None))
     found = begins.search(packet) if begins else None
-    return (packet[found.start() :], length) if found else (b"", 0)
+    if found is None:
+        return b"", 0
+    if length is None:
+        end = packet.find(_START_CODE, found.end())
+        length = (end if end >= 0 else len(packet)) - found.start()
+    return packet[found.start() :], length
 
 
 def _stated_size(parameters: bytes, codec: bytes) -> tuple[int, int] | None:
@@ -120,11 +131,14 @@ def _stated_size(parameters: bytes, codec: bytes) -> tuple[int, int] | None:
     if codec in _IN_IVF:
         head = b"DKIF" + struct.pack("<HH4sHHIIII", 0, 32, codec.upper(), 16, 16, 25, 1, 1, 0)
         parameters = head + struct.pack("<IQ", len(parameters), 0) + parameters
-    # From memory OpenCV reads as well, but has been seen to end the process.
-    with tempfile.TemporaryDirectory() as folder, captured_stderr():
-        path = Path(folder) / "packet"
-        path.write_bytes(parameters)
-        alone = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-        size = (round(alone.get(cv2.CAP_PROP_FRAME_HEIGHT)), round(alone.get(cv2.CAP_PROP_FRAME_WIDTH)))
-        alone.release()
+    try:
+        # From memory OpenCV reads as well, but has been seen to end the process.
+        with tempfile.TemporaryDirectory() as folder, quiet():
+            path = Path(folder) / "packet"
+            path.write_bytes(parameters)
+            alone = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+            size = (round(alone.get(cv2.CAP_PROP_FRAME_HEIGHT)), round(alone.get(cv2.CAP_PROP_FRAME_WIDTH)))
+            alone.release()
+    except OSError:  # no place for a temporary file
+        return None
     return size if min(size) > 0 else None

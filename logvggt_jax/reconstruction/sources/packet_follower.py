@@ -16,6 +16,8 @@ from logvggt_jax.reconstruction.sources.opencv_packets import Packet, PacketRead
 _MICROSECOND = Fraction(1, 1_000_000)
 # Packets that are read before a frame is looked at: none is stored so far from the place where it is shown.
 _AHEAD = 48
+# Some formats mark no key frames: after so many packets the first begins the video.
+_LONGEST_LEAD = 300
 
 
 class TimeStamps(NamedTuple):
@@ -34,9 +36,11 @@ class TimeStamps(NamedTuple):
 def look_at_times(source: str, shown: list[int]) -> TimeStamps:
     """Compares the first packets with the time stamps of the first frames that come out of the decoder."""
     reader = PacketReader(source)
-    stamps = [packet.stamp for packet in itertools.islice(reader, _AHEAD)]
+    stamps = [packet.stamp for packet in itertools.islice(reader, _AHEAD) if packet is not None]
     reader.close()
-    return TimeStamps(any(stamps) or any(shown), stamps == sorted(set(stamps)) and shown != sorted(shown))
+    # The only frame of a file is shown at its beginning.
+    exist = any(stamps) or any(shown) or len(shown) < 2
+    return TimeStamps(exist, stamps == sorted(set(stamps)) and shown != sorted(shown))
 
 
 class PacketFollower:
@@ -47,6 +51,7 @@ class PacketFollower:
     Attributes:
       size: (H, W) before rotation, as stated for the picture at hand; None where nothing states it.
       lead: frames before the first key frame, which refer to some that are not there.
+      states_size: whether a packet so far states a size.
 
     Args:
       source: the file's absolute path.
@@ -61,18 +66,25 @@ class PacketFollower:
         self._missing = MissingFrames(_MICROSECOND)
         self._step = round(1e6 / rate) if math.isfinite(rate) and rate > 0 else None
         # Whether all time stamps of frames so far were those of packets.
-        self._timed, self._trusted = timed, timed and not edited
+        self._timed, self._edited, self._trusted = timed, edited, timed and not edited
         self._sizes: deque[tuple[int, tuple[int, int] | None]] = deque()
-        self._stored = self._shown = 0
+        self._stored = self._shown = self._unreadable = 0
+        self._is_first_part = True
         self._joint: Packet | None = None
         self.size: tuple[int, int] | None = None
         self.lead = 0
+        self.states_size = False
         self._begin()
         self._fill(_AHEAD)
 
     def precedes_key_frame(self, stamp: int) -> bool:
         """Whether a frame that is shown at this time comes before the first key frame."""
-        return self._joint is None and bool(self.lead) and self._key is not None and stamp < self._key
+        begins = not self._shown and not self._edited and bool(self.lead)
+        return begins and self._key is not None and stamp < self._key
+
+    def begins_part(self) -> bool:
+        """Whether the next frame can be the first of a part, whose time begins anew."""
+        return self._joint is not None and not self._missing.anything_waits()
 
     def fail(self, reason: str) -> None:
         """A frame could not be decoded."""
@@ -115,10 +127,12 @@ class PacketFollower:
         """A part whose time stamps have nothing to do with those before."""
         self._key: int | None = None
         self._last = self._highest = -1
+        self._in_part = 0
 
     def _part_ends(self) -> Iterator[Damage]:
         yield from self._all_missing()
         first, self._joint = self._joint, None
+        self._is_first_part = False
         self._begin()
         if first is not None:
             self._take(first)
@@ -134,10 +148,11 @@ class PacketFollower:
         """Failures that no packet explains, as it could not be read either: they are known by the gaps they leave."""
         while self._step is not None and self._last >= 0 and 2 * (stamp - self._last) > 3 * self._step:
             failure = self._missing.take_failure()
-            if failure is None:
+            if failure is None and not self._unreadable:
                 return
+            self._unreadable = max(0, self._unreadable - 1)
             self._last += self._step
-            yield Damage(float(self._last * _MICROSECOND), failure)
+            yield Damage(float(self._last * _MICROSECOND), failure or "cannot be read")
 
     def _since(self) -> int | None:
         return self._key if self._trusted and self._reader.frame_each else None
@@ -156,23 +171,34 @@ class PacketFollower:
     def _fill(self, ahead: int | None) -> None:
         """Reads packets until so many more are in than frames were shown, all for None, but none beyond a joint."""
         while self._joint is None and (ahead is None or self._stored < self._shown + ahead):
-            packet = next(self._packets, None)
-            if packet is None:
+            try:
+                packet = next(self._packets)
+            except StopIteration:
                 return
-            if packet.key and packet.stamp < self._highest:
+            if packet is None:
+                self._unreadable += 1
+            elif self._is_joint(packet):
                 self._joint = packet
             else:
                 self._take(packet)
 
+    def _is_joint(self, packet: Packet) -> bool:
+        """Whether time begins anew: at a key frame, or earlier than where the part began."""
+        earlier = self._key is not None and self._in_part > _AHEAD and packet.stamp < self._key
+        return packet.stamp < self._highest and (packet.key or earlier)
+
     def _take(self, packet: Packet) -> None:
         self._highest = max(self._highest, packet.stamp)
-        if packet.key and self._key is None:
+        self._in_part += 1
+        # What a later part begins with is decoded by what is known from the one before.
+        if self._key is None and (packet.key or not self._is_first_part or self.lead == _LONGEST_LEAD):
             self._key = packet.stamp
         if self._key is None:
             self.lead += 1
             return
+        self.states_size = self.states_size or packet.size is not None
         if not self._sizes or self._sizes[-1][1] != packet.size:
             self._sizes.append((self._stored, packet.size))
-        if packet.holds_frame and packet.stamp >= 0:
+        if packet.holds_frame:
             self._missing.expect(packet.stamp)
             self._stored += 1

@@ -32,7 +32,7 @@ def notes_on(
     streams = moving_streams(container)
     if len(streams) > 1:
         sizes = [(each.height, each.width) for each in streams]
-        yield several_videos(name, sizes, [each.index for each in streams], stream.index)
+        yield several_videos(name, sizes, [str(each.index) for each in streams], str(stream.index))
     if has_no_times(container):
         yield no_times(name, float(average_rate(container, stream) or 1))
     if is_interlaced(frame, stream):

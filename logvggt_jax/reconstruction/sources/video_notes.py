@@ -1,10 +1,10 @@
 """What the user should know of a video before it is used, one line each."""
 
 
-def several_videos(name: str, sizes: list[tuple[int, int]], numbers: list[int], read: int) -> str:
-    """Of videos of these sizes (H, W), which bear these numbers in the file, the one that is read."""
-    listed = ", ".join(f"{w} x {h} (0:{number})" for (h, w), number in zip(sizes, numbers, strict=True))
-    other = next(number for number in numbers if number != read)
+def several_videos(name: str, sizes: list[tuple[int, int]], names: list[str], read: str) -> str:
+    """Of videos of these sizes (H, W), which FFmpeg calls by these names, the one that is read."""
+    listed = ", ".join(f"{w} x {h} (0:{each})" for (h, w), each in zip(sizes, names, strict=True))
+    other = next(each for each in names if each != read)
     return (
         f"{name} holds {len(sizes)} videos, {listed}, of which 0:{read} is read; for another, "
         f"ffmpeg -i INPUT -map 0:{other} -c copy OUTPUT.mkv"
