@@ -11,6 +11,7 @@ import functools
 import importlib
 import json
 import shutil
+import sys
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -91,6 +92,18 @@ def _write_video(root: Path) -> None:
     for picture in _pictures():
         writer.write(picture)
     writer.release()
+
+
+def _read_video_by_opencv(root: Path, output: Path) -> None:
+    """As where PyAV is not installed."""
+    known = sys.modules.pop("av", None)
+    sys.modules["av"] = None  # type: ignore[assignment]
+    try:
+        _read_source("walk.mp4", root, output)
+    finally:
+        del sys.modules["av"]
+        if known is not None:
+            sys.modules["av"] = known
 
 
 def _read_source(name: str, root: Path, output: Path) -> None:
@@ -293,6 +306,7 @@ KINDS = (
     Kind("packed", _write_packed, _read_packed),
     Kind("images", _write_images, functools.partial(_read_source, "")),
     Kind("video", _write_video, functools.partial(_read_source, "walk.mp4")),
+    Kind("video by opencv", _write_video, _read_video_by_opencv),
     Kind("safetensors", _write_safetensors, functools.partial(_read_checkpoint, "model.safetensors")),
     Kind("torch", _write_torch_zip, functools.partial(_read_checkpoint, "model.pt")),
     Kind("model", functools.partial(_write_model, False), functools.partial(_read_model, False)),
