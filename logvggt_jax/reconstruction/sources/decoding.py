@@ -61,7 +61,7 @@ class VideoDecoder(Protocol):
     """A video file, camera or stream that can be decoded from its beginning, again and again."""
 
     def header(self) -> VideoHeader:
-        """What is known of the video; decodes no more than its first frame.
+        """What is known of the video; decodes no more than its first frames.
 
         Raises:
           InputError: it cannot be opened, holds no video, or nothing of it can be decoded.
