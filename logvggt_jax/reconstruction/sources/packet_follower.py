@@ -65,8 +65,9 @@ class PacketFollower:
         self._packets = iter(self._reader)
         self._missing = MissingFrames(_MICROSECOND)
         self._step = round(1e6 / rate) if math.isfinite(rate) and rate > 0 else None
+        self._timed, self._edited = timed, edited
         # Whether all time stamps of frames so far were those of packets.
-        self._timed, self._edited, self._trusted = timed, edited, timed and not edited
+        self._trusted = timed and not edited
         self._sizes: deque[tuple[int, tuple[int, int] | None]] = deque()
         self._stored = self._shown = self._unreadable = 0
         self._is_first_part = True
