@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from logvggt_jax.geometry import compose, decode_poses, invert, rotation_angle
 from logvggt_jax.training.losses.mean import Mean
 from logvggt_jax.training.losses.normalization import Targets
+from logvggt_jax.training.losses.order_statistics import order_statistic
 from logvggt_jax.types import Predictions
 
 SMALLEST_DEPTH = 1e-5
@@ -70,9 +71,8 @@ def depth_errors(depth: jax.Array, target: jax.Array, valid: jax.Array) -> dict[
 
 def _lower_median(values: jax.Array, valid: jax.Array) -> jax.Array:
     """The lower of the two middle values of the valid ones of [B, N]."""
-    ordered = jnp.sort(jnp.where(valid, values, jnp.inf), axis=-1)
     middle = jnp.maximum(valid.sum(-1) - 1, 0) // 2
-    return jnp.take_along_axis(ordered, middle[:, None], axis=-1)[:, 0]
+    return order_statistic(jnp.where(valid, values, jnp.inf), middle)
 
 
 def _relative(extrinsics: jax.Array) -> jax.Array:

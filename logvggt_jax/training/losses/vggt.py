@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from logvggt_jax.training.losses.mean import Mean
+from logvggt_jax.training.losses.order_statistics import order_statistic
 
 LIMIT = 100.0
 MIN_PIXELS = 100
@@ -87,13 +88,13 @@ def _mean_below_quantile(values: jax.Array, valid: jax.Array, quantile: float | 
     if quantile is None:
         return jnp.where(valid, values, 0.0).sum() / jnp.maximum(count, 1)
     limited = jnp.minimum(values, LIMIT)
-    ordered = jnp.sort(jnp.where(valid, jax.lax.stop_gradient(limited), jnp.inf))
     # Integers in hundredths, rounded half to even: float32 cannot hold the ranks of a large batch.
     hundredths = round(quantile * 100) * (jnp.maximum(count, 1) - 1)
     rank = hundredths // 100
     rest = hundredths % 100
     rank += (rest > 50) | ((rest == 50) & (rank % 2 == 1))
-    threshold = jnp.minimum(ordered[rank], LIMIT)
+    ranked = jnp.where(valid, jax.lax.stop_gradient(limited), jnp.inf)
+    threshold = jnp.minimum(order_statistic(ranked[None], rank[None])[0], LIMIT)
     kept = valid & (limited < threshold)
     kept = jnp.where(kept.sum() > MIN_FILTERED, kept, valid)
     long = count > MIN_FILTERED
