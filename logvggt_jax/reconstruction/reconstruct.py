@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import json
 import time
 import warnings
 from pathlib import Path
@@ -39,7 +37,7 @@ from logvggt_jax.reconstruction.sources import Source, open_source
 from logvggt_jax.reconstruction.watching import Watcher
 from logvggt_jax.reconstruction.work_folder import WorkFolder
 from logvggt_jax.streaming import open_predictor
-from logvggt_jax.weights.digests import digests
+from logvggt_jax.weights.digests import digests, json_digest
 
 
 def reconstruct(
@@ -107,7 +105,7 @@ def reconstruct(
     check_masks(source, method)
     request = {
         **what_decides(source, model.config, method, settings, longer_edge, point_filter, calibration),
-        "weights": hashlib.blake2b(json.dumps(digests(variables)).encode(), digest_size=16).hexdigest(),
+        "weights": json_digest(digests(variables)),
         **({} if (precision := precision_of(variables)) is None else {"precision": precision}),
     }
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Rate(), TimeRemainingColumn())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,7 +16,7 @@ from logvggt_jax.files import atomic_file, to_disk
 from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.streaming.predictor import METHODS, Predictor, open_predictor
 from logvggt_jax.streaming.results import FrameResult
-from logvggt_jax.weights.digests import bytes_of, json_digest, named_leaves
+from logvggt_jax.weights.digests import digests, json_digest, named_leaves
 
 
 class State(NamedTuple):
@@ -122,8 +121,4 @@ def _glimpse(leaf: Any) -> tuple[list[int], str, str]:
 
 
 def _digest(facts: str, arrays: Mapping[str, np.ndarray]) -> str:
-    digest = hashlib.blake2b(facts.encode(), digest_size=16)
-    for name in sorted(arrays):
-        digest.update(f"{name} {arrays[name].dtype.name} {arrays[name].shape}".encode())
-        digest.update(bytes_of(arrays[name]))
-    return digest.hexdigest()
+    return json_digest({"facts": facts, "arrays": digests(arrays)})

@@ -1,6 +1,7 @@
 """Model folders: what is saved comes back, and what is damaged is named."""
 
 import dataclasses
+import hashlib
 import json
 import shutil
 
@@ -234,6 +235,15 @@ def test_digests_tell_value_shape_and_type_apart():
             verify_digests({**tree, **other}, same, "somewhere")
     with pytest.raises(ValueError, match="leaf a is not in the checkpoint"):
         verify_digests({"key": tree["key"], "step": tree["step"]}, same, "somewhere")
+
+
+def test_digests_of_earlier_versions_are_compared_as_they_were_made():
+    tree = {"a": np.zeros((2, 3), np.float32), "b": np.ones(4, np.int32)}
+    earlier = hashlib.blake2b(b"float32(2, 3)" + tree["a"].tobytes(), digest_size=16).hexdigest()
+    mixed = {**digests(tree), "a": earlier}
+    verify_digests(tree, mixed, "somewhere")
+    with pytest.raises(ValueError, match="somewhere: leaf a differs"):
+        verify_digests({**tree, "a": tree["a"] + 1}, mixed, "somewhere")
 
 
 def test_a_converted_vggt_equals_the_one_converted_in_memory(tmp_path, vggt_file, vggt_config, vggt_state_dict, capsys):
