@@ -91,9 +91,14 @@ def named_leaves(tree: Any) -> Iterator[tuple[str, Any]]:
 
 def whole_array(leaf: Any) -> np.ndarray:
     """A leaf on this process's host, perhaps without a copy; where several processes hold parts, all have to ask."""
-    if isinstance(leaf, jax.Array) and not (leaf.is_fully_addressable or leaf.is_fully_replicated):
+    if is_divided(leaf):
         return np.asarray(multihost_utils.process_allgather(leaf, tiled=True))
     return np.asarray(leaf)
+
+
+def is_divided(leaf: Any) -> bool:
+    """Whether several processes hold parts of a leaf and none the whole."""
+    return isinstance(leaf, jax.Array) and not (leaf.is_fully_addressable or leaf.is_fully_replicated)
 
 
 def _on_the_host(leaf: Any) -> np.ndarray:

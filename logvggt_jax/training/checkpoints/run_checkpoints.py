@@ -26,7 +26,7 @@ from logvggt_jax.training.checkpoints.work_folder import remove_scratch
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.parallel.agreement import any_process
 from logvggt_jax.training.step.state import TrainState
-from logvggt_jax.weights.digests import whole_array
+from logvggt_jax.weights.digests import is_divided, whole_array
 
 _BEGIN_ANEW = "start a new --workdir"
 
@@ -164,11 +164,19 @@ class RunCheckpoints:
     @staticmethod
     def _copied(tree: Any) -> Any:
         """Arrays on the host of process 0, nothing on the others; all have to call this at the same point."""
+        writes = jax.process_index() == 0
+        for leaf in jax.tree.leaves(tree):
+            if writes and _is_fetched(leaf) and not is_divided(leaf):
+                leaf.copy_to_host_async()  # all transfers at once
 
         def copied(leaf: Any) -> np.ndarray | None:
+            if not (writes or is_divided(leaf)):
+                return None
             whole = whole_array(leaf)
-            # Always a copy: on a CPU it could be the very memory that the next step writes to.
-            return np.array(whole) if jax.process_index() == 0 else None
+            if not writes:
+                return None
+            # On a CPU it could be the very memory that the next step writes to.
+            return whole if _is_fetched(leaf) else np.array(whole)
 
         return jax.tree.map(copied, tree)
 
@@ -217,6 +225,11 @@ class RunCheckpoints:
         except (OSError, ValueError, KeyError, TypeError, RecursionError):
             return None
         return found
+
+
+def _is_fetched(leaf: Any) -> bool:
+    """Whether a leaf lies on devices with memory of their own, so that its numbers on the host are a copy."""
+    return isinstance(leaf, jax.Array) and all(device.platform != "cpu" for device in leaf.devices())
 
 
 def _check_room(path: Path, tree: Any) -> None:

@@ -221,6 +221,21 @@ def _same(a: Any, b: Any) -> None:
     jax.tree.map(np.testing.assert_array_equal, jax.device_get(a), jax.device_get(b))
 
 
+def test_what_lies_on_other_devices_is_fetched_and_not_copied_again(
+    run_config: TrainConfig, state: TrainState, tmp_path: Path, alone: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("logvggt_jax.training.checkpoints.run_checkpoints._is_fetched", lambda leaf: True)
+    copies = RunCheckpoints._copied(state)
+    _same(copies, state)
+    shared = [
+        np.shares_memory(copy, np.asarray(leaf))
+        for copy, leaf in zip(jax.tree.leaves(copies), jax.tree.leaves(state), strict=True)
+    ]
+    assert all(shared)
+    _save(tmp_path / "run", run_config, state)
+    _same(_restore(tmp_path / "run", run_config, state)[0], state)
+
+
 @pytest.mark.usefixtures("abandoned_reads")
 @pytest.mark.parametrize("damage", ["values", "description", "nothing left"])
 def test_a_damaged_newest_checkpoint_is_named_and_the_one_before_is_taken(
