@@ -17,13 +17,14 @@ from collections.abc import Sequence
 from logvggt_jax.interruption import one_line_at_ctrl_c
 
 with one_line_at_ctrl_c("eval.py"):
-    from absl import app, flags, logging
+    from absl import app, flags
     from ml_collections import config_flags
 
     from logvggt_jax.compile import check_devices, enable_compilation_cache
     from logvggt_jax.errors import InputError, one_line, printable
     from logvggt_jax.evaluation.report.report import print_report
     from logvggt_jax.evaluation.run import run_evaluation
+    from logvggt_jax.program_flags import flags_parser
     from logvggt_jax.terminal import forgiving_streams, one_log_handler
 
 _CONFIG = config_flags.DEFINE_config_file("config", None, "what to evaluate: a file of configs/eval", lock_config=True)
@@ -67,26 +68,8 @@ def main(arguments: Sequence[str]) -> None:
     print(f"\nTables, JSON and figures are in {printable(_OUTPUT.value)}/; report.html has all of it on one page")
 
 
-def parse_flags(arguments: list[str]) -> list[str]:
-    """Flags as absl reads them, with an unknown configuration field as one line."""
-    try:
-        rest = app.parse_flags_with_usage(arguments)
-        _CONFIG.value.to_dict()  # a file that cannot be loaded says so only now
-    except (AttributeError, KeyError) as error:
-        # The library wraps one error in the other, with quotes around quotes.
-        reason = error.args[0] if error.args else error
-        reason = reason.args[0] if isinstance(reason, KeyError) else reason
-        sys.exit(f"eval.py: --config has no such field: {' '.join(str(reason).split())}")
-    except OSError as error:
-        sys.exit(f"eval.py: {one_line(error)}")
-    if flags.FLAGS["verbosity"].using_default_value:
-        # Orbax reports every file at the level that absl's app would choose.
-        flags.FLAGS.verbosity = logging.WARNING
-    return rest
-
-
 if __name__ == "__main__":
     flags.mark_flags_as_required(["config", "checkpoint", "output"])
     one_log_handler()
     with forgiving_streams(), one_line_at_ctrl_c("eval.py"):
-        app.run(main, flags_parser=parse_flags)
+        app.run(main, flags_parser=flags_parser("eval.py"))

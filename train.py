@@ -18,17 +18,18 @@ import sys
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 from logvggt_jax.interruption import INTERRUPTED, one_line_at_ctrl_c
 
 with one_line_at_ctrl_c("train.py"):
     import jax
-    from absl import app, flags, logging
+    from absl import app, flags
     from ml_collections import config_flags
 
     from logvggt_jax.compile import check_devices, check_nccl, enable_compilation_cache
     from logvggt_jax.errors import InputError, one_line
+    from logvggt_jax.program_flags import flags_parser
     from logvggt_jax.terminal import forgiving_streams, one_log_handler
     from logvggt_jax.training.config import TrainConfig
     from logvggt_jax.training.dry_run import described_mesh, dry_run
@@ -82,7 +83,7 @@ def main(arguments: Sequence[str]) -> None:
     enable_compilation_cache(_CACHE.value)
     watched: Lifeline | None = None
     try:
-        config = TrainConfig.from_dict(with_sources(_settings(), _SOURCES.value, _VALIDATION_SOURCE.value))
+        config = TrainConfig.from_dict(with_sources(_CONFIG.value.to_dict(), _SOURCES.value, _VALIDATION_SOURCE.value))
         profile = ProfiledSteps.parse(_PROFILE.value) if _PROFILE.value else None
         use_cpu_cores(config, num_processes=_NUM_PROCESSES.value or 1)
         check_nccl()
@@ -142,32 +143,6 @@ def _fail(error: BaseException, watched: Lifeline | None) -> NoReturn:
     sys.exit(message)
 
 
-def _settings() -> dict[str, Any]:
-    """The configuration file's mapping, with what the command line changed."""
-    try:
-        settings: dict[str, Any] = _CONFIG.value.to_dict()
-    except OSError as error:  # The library reads the file here.
-        raise InputError(str(error)) from error
-    return settings
-
-
-def parse_flags(arguments: list[str]) -> list[str]:
-    """Flags as absl reads them, with mistakes as one line."""
-    try:
-        rest = flags.FLAGS(arguments)
-    except (AttributeError, KeyError) as error:
-        # The library wraps one error in the other, with quotes around quotes.
-        reason = error.args[0] if error.args else error
-        reason = reason.args[0] if isinstance(reason, KeyError) else reason
-        sys.exit(f"train.py: the configuration has no such field: {' '.join(str(reason).split())}")
-    except (flags.Error, OSError) as error:
-        sys.exit(f"train.py: {one_line(error)}")
-    if flags.FLAGS["verbosity"].using_default_value:
-        # Orbax reports every file at the level that absl's app would choose.
-        flags.FLAGS.verbosity = logging.WARNING
-    return rest
-
-
 if __name__ == "__main__":
     flags.mark_flag_as_required("config")
     flags.register_multi_flags_validator(
@@ -177,4 +152,4 @@ if __name__ == "__main__":
     )
     one_log_handler()
     with forgiving_streams(), one_line_at_ctrl_c("train.py"):
-        app.run(main, flags_parser=parse_flags)
+        app.run(main, flags_parser=flags_parser("train.py"))

@@ -32,11 +32,11 @@ from rich.table import Table
 from subject import add_options, subject
 
 from logvggt_jax import LogVGGT
+from logvggt_jax.compile import most_device_bytes
 from logvggt_jax.evaluation.costs.parts import (
     PARTS,
     PartTime,
     flops_by_part,
-    peak_device_bytes,
     peak_host_bytes,
     sequence_parts,
     spread,
@@ -47,7 +47,7 @@ from logvggt_jax.evaluation.environment import describe_device
 from logvggt_jax.evaluation.methods.variants import VARIANTS
 from logvggt_jax.evaluation.report.figures import efficiency_plot
 from logvggt_jax.operations import matmul_flops_per_second
-from logvggt_jax.streaming import StreamSession
+from logvggt_jax.streaming import open_predictor
 
 MIB = 2**20
 
@@ -59,8 +59,8 @@ def speed(
     rows = []
     for length in sorted(lengths):
         for mode, model in models.items():
-            warm = time_stream(StreamSession(model, variables), pictures, length, watch=True)
-            runs = [time_stream(StreamSession(model, variables), pictures, length) for _ in range(rounds)]
+            warm = time_stream(open_predictor("windows", model, variables), pictures, length, watch=True)
+            runs = [time_stream(open_predictor("windows", model, variables), pictures, length) for _ in range(rounds)]
             rows.append(
                 {
                     "mode": mode,
@@ -71,7 +71,7 @@ def speed(
                     "step_seconds_95": float(np.percentile([step for run in runs for step in run.steps], 95)),
                     "compilation_seconds": warm.seconds - statistics.median(run.seconds for run in runs),
                     "live_device_bytes": warm.live_bytes,
-                    "peak_device_bytes": peak_device_bytes(),
+                    "peak_device_bytes": most_device_bytes(jax.devices()[:1]),
                     "peak_host_bytes": peak_host_bytes(),
                 }
             )
@@ -84,7 +84,8 @@ def ratios(models: dict[str, LogVGGT], variables: Any, pictures: np.ndarray, pai
     found: dict[str, list[float]] = {mode: [] for mode in models}
     for mode, model in models.items():
         for _ in range(pairs):
-            rates = [n / time_stream(StreamSession(model, variables), pictures, n).seconds for n in (short, long)]
+            streams = ((n, open_predictor("windows", model, variables)) for n in (short, long))
+            rates = [n / time_stream(stream, pictures, n).seconds for n, stream in streams]
             found[mode].append(rates[1] / rates[0])
     return {"short": short, "long": long, "ratios": found}
 

@@ -19,11 +19,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import jax
 import numpy as np
 
 from logvggt_jax import LogVGGT, from_pretrained
-from logvggt_jax.streaming import StreamSession
+from logvggt_jax.compile import Compilations, counted_compilations
+from logvggt_jax.evaluation.protocols.images import PrincipalPointCrop
+from logvggt_jax.streaming import Predictor, open_predictor
 from logvggt_jax.weights.checkpoints import read_provenance
 
 PART = 1000
@@ -40,18 +41,6 @@ class Part(NamedTuple):
     programs: int
 
 
-class Compilations:
-    """Counts the programs that JAX compiles, and when it last did."""
-
-    def __init__(self) -> None:
-        self.count, self.last = 0, 0.0
-        jax.monitoring.register_event_duration_secs_listener(self._heard)
-
-    def _heard(self, name: str, seconds: float, **_: object) -> None:
-        if name.endswith("backend_compile_duration"):
-            self.count, self.last = self.count + 1, time.monotonic()
-
-
 class Clock:
     """Seconds by the clock and of processor time since it was last read."""
 
@@ -65,14 +54,17 @@ class Clock:
         return np.subtract((self._clock, self._processor), before)
 
 
-def run(open_stream: Callable[[], StreamSession], image_size: tuple[int, int], num_frames: int) -> list[Part]:
+def run(
+    open_stream: Callable[[], Predictor], image_size: tuple[int, int], num_frames: int, compilations: Compilations
+) -> list[Part]:
     """Streams frames of noise, and prints and returns what each thousand took; the last one is timed in turns with the
     second thousand of another stream."""
-    compilations, parts, session = Compilations(), [], open_stream()
+    parts: list[Part] = []
+    session = open_stream()
     started, clock = time.monotonic(), Clock()
     noise = np.random.default_rng(0).integers(0, 256, (16, *image_size, 3), np.uint8)
 
-    def push(stream: StreamSession, count: int) -> np.ndarray:
+    def push(stream: Predictor, count: int) -> np.ndarray:
         clock.read()
         for index in range(count):
             stream.push(noise[index % len(noise)])
@@ -131,8 +123,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
             max_registers=options.max_registers or None,
         )
     chosen = LogVGGT(dataclasses.replace(model.config, refinement=refinement))
-    size = edge * 3 // 4 // 14 * 14, edge
-    parts = run(lambda: StreamSession(chosen, variables), size, max(options.frames // PART, 3) * PART)
+    size = PrincipalPointCrop(edge).size((3, 4))
+    frames = max(options.frames // PART, 3) * PART
+    with counted_compilations() as compilations:
+        parts = run(lambda: open_predictor("windows", chosen, variables), size, frames, compilations)
     second, half, last = parts[1], parts[len(parts) // 2], parts[-1]
     grown = (last.memory - half.memory) / (PART * (len(parts) - 1 - len(parts) // 2))
     print(

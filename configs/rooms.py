@@ -2,8 +2,9 @@
 
     python train.py --config=configs/rooms.py --workdir=runs/rooms
 
-The same command goes on with the run until all steps are done; on one core that takes about an hour and a half. To
-train the weights that ship further, on clips of 12 and of 32 frames (scripts/train_small.sh does it):
+The same command goes on with the run until all steps are done; on one core that takes about an hour and a half. What
+ships was trained further, as `logvggt info rooms` says. To go on from there, on clips of 12 and of 32 frames
+(scripts/train_small.sh does it):
 
     python train.py --config=configs/rooms.py:rooms --workdir=runs/rooms-more
 

@@ -6,8 +6,9 @@ import importlib.metadata
 import os
 import re
 import shutil
+import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -101,21 +102,28 @@ def _accepted(device: jax.Device, name: str, value: bool) -> bool:
     return True
 
 
+class Compilations:
+    """How many programs XLA has made for this process, and when the last of them, by `time.monotonic`."""
+
+    def __init__(self) -> None:
+        self.count, self.last = 0, time.monotonic()
+
+    def heard(self, event: str, duration_secs: float, **_: Any) -> None:
+        """Takes what JAX tells of its work."""
+        if event == _COMPILATION:
+            self.count, self.last = self.count + 1, time.monotonic()
+
+
 @contextlib.contextmanager
-def counted_compilations() -> Iterator[Callable[[], int]]:
-    """Gives a function that says how many programs XLA has made for this process since, small ones of single operations
-    among them, compiled or taken from the cache."""
-    count = 0
-
-    def listen(event: str, duration_secs: float, **_: Any) -> None:
-        nonlocal count
-        count += event == _COMPILATION
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
+def counted_compilations() -> Iterator[Compilations]:
+    """Counts the programs that XLA makes for this process from here on, small ones of single operations among them,
+    compiled or taken from the cache."""
+    compilations = Compilations()
+    jax.monitoring.register_event_duration_secs_listener(compilations.heard)
     try:
-        yield lambda: count
+        yield compilations
     finally:
-        jax.monitoring.unregister_event_duration_listener(listen)
+        jax.monitoring.unregister_event_duration_listener(compilations.heard)
 
 
 def out_of_device_memory(error: jax.errors.JaxRuntimeError) -> bool:

@@ -369,8 +369,9 @@ class RefinementConfig:
 
 @dataclasses.dataclass(frozen=True)
 class ModelConfig:
-    """The whole model. `dtype` is the compute type; parameters and the residual stream are float32 always.
+    """The whole model.
 
+    `dtype` is the compute type; parameters as they are stored and drawn, and the residual stream, are float32.
     `attention` picks the back end: `auto` takes cuDNN flash attention on GPUs (bfloat16), the Pallas flash
     kernel on TPUs, and blockwise XLA elsewhere.
     """

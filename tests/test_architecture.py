@@ -20,6 +20,7 @@ GROUND_FLOOR = {
     "interruption",
     "terminal",
     "page",
+    "program_flags",
 }
 # What each part may import besides itself and the ground floor.
 ALLOWED: dict[str, set[str]] = {

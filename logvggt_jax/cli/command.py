@@ -1,9 +1,14 @@
 """How a command is added to the command line, and the options that several commands share."""
 
+from __future__ import annotations
+
 import argparse
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from logvggt_jax.model.logvggt import LogVGGT, Variables
 
 
 def add_command(
@@ -81,6 +86,21 @@ def execution_options(parser: argparse.ArgumentParser) -> None:
         help="where compiled programs are kept between runs, 'none' for nowhere (default: $JAX_COMPILATION_CACHE_DIR "
         "or the user's cache folder)",
     )
+
+
+def loaded_model(checkpoint: str | Path, options: argparse.Namespace) -> tuple[LogVGGT, Variables]:
+    """The model of a checkpoint, its parameters as `--dtype` and `--precision` of `execution_options` ask for them.
+
+    They are cast here rather than in the stream alone, so that nothing keeps the float32 parameters on the device.
+    """
+    from logvggt_jax.model.low_precision import in_low_precision
+    from logvggt_jax.model.parameters import in_compute_type
+    from logvggt_jax.weights.checkpoints import from_pretrained
+
+    model, variables = from_pretrained(checkpoint, dtype=options.dtype)
+    if options.precision:
+        variables = in_low_precision(variables, options.precision)
+    return model, in_compute_type(variables, model.config)
 
 
 class _Formatter(argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescriptionHelpFormatter):

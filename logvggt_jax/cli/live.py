@@ -9,7 +9,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-from logvggt_jax.cli.command import add_command, execution_options, longer_edge_option, overwrite_option
+from logvggt_jax.cli.command import add_command, execution_options, loaded_model, longer_edge_option, overwrite_option
 from logvggt_jax.cli.exit_codes import BAD_INPUT
 from logvggt_jax.cli.viewing import stay_open, watch_options, watched
 from logvggt_jax.errors import InputError, one_line
@@ -17,8 +17,7 @@ from logvggt_jax.errors import InputError, one_line
 
 def _live(options: argparse.Namespace) -> int:
     from logvggt_jax.compile import check_devices, enable_compilation_cache
-    from logvggt_jax.model.low_precision import check_precision, in_low_precision
-    from logvggt_jax.model.parameters import in_compute_type
+    from logvggt_jax.model.low_precision import check_precision
     from logvggt_jax.reconstruction.live import LiveSession, OnlineSettings, Recording, online_stream
     from logvggt_jax.reconstruction.live.follow import check_answers, follow
     from logvggt_jax.reconstruction.reconstruct import LONGER_EDGE
@@ -26,7 +25,7 @@ def _live(options: argparse.Namespace) -> int:
     from logvggt_jax.reconstruction.sources import open_source
     from logvggt_jax.streaming import expectation
     from logvggt_jax.weights import resolve
-    from logvggt_jax.weights.checkpoints import from_pretrained, read_provenance
+    from logvggt_jax.weights.checkpoints import read_provenance
 
     thinned = {name: getattr(options, name) for name in ("stride", "fps")}
     source = open_source(options.camera, most_broken=1.0, **thinned)
@@ -48,10 +47,7 @@ def _live(options: argparse.Namespace) -> int:
         check_answers(source)
     enable_compilation_cache(options.compilation_cache)
     with watched(options) as window:
-        model, variables = from_pretrained(checkpoint, dtype=options.dtype)
-        if options.precision:
-            variables = in_low_precision(variables, options.precision)
-        variables = in_compute_type(variables, model.config)
+        model, variables = loaded_model(checkpoint, options)
         session = LiveSession(
             lambda: online_stream(model, variables, online, provisional=window is not None),
             longer_edge=options.longer_edge or provenance.longer_edge or LONGER_EDGE,

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from logvggt_jax.cli.choices import FORMATS, METHOD_NAMES
-from logvggt_jax.cli.command import add_command, execution_options, longer_edge_option, output_option
+from logvggt_jax.cli.command import add_command, execution_options, loaded_model, longer_edge_option, output_option
 from logvggt_jax.cli.exit_codes import BAD_INPUT
 from logvggt_jax.cli.viewing import stay_open, watch_options, watched
 from logvggt_jax.errors import InputError, one_line, printable
@@ -24,8 +24,7 @@ SOURCE_OPTIONS = ("stride", "max_frames", "fps", "start", "end", "pattern", "siz
 
 def _reconstruct(options: argparse.Namespace) -> int:
     from logvggt_jax.compile import check_devices, enable_compilation_cache
-    from logvggt_jax.model.low_precision import check_precision, in_low_precision
-    from logvggt_jax.model.parameters import in_compute_type
+    from logvggt_jax.model.low_precision import check_precision
     from logvggt_jax.reconstruction.calibration import Calibration
     from logvggt_jax.reconstruction.exporters import check_formats
     from logvggt_jax.reconstruction.method import choose_method
@@ -35,7 +34,7 @@ def _reconstruct(options: argparse.Namespace) -> int:
     from logvggt_jax.reconstruction.sources import open_source
     from logvggt_jax.reconstruction.work_folder import check_leftovers
     from logvggt_jax.weights import resolve
-    from logvggt_jax.weights.checkpoints import from_pretrained, read_config, read_provenance
+    from logvggt_jax.weights.checkpoints import read_config, read_provenance
 
     # Before the model: a misspelt path should not have to wait for gigabytes of weights.
     taken = {name: getattr(options, name) for name in SOURCE_OPTIONS}
@@ -82,11 +81,7 @@ def _reconstruct(options: argparse.Namespace) -> int:
     if options.dry_run:
         return 0
     with watched(options) as window:
-        model, variables = from_pretrained(checkpoint, dtype=options.dtype)
-        if options.precision:
-            variables = in_low_precision(variables, options.precision)
-        # Here rather than in the stream alone, so that nothing keeps the float32 parameters on the device.
-        variables = in_compute_type(variables, model.config)
+        model, variables = loaded_model(checkpoint, options)
         result = reconstruct(
             source,
             options.output,

@@ -13,13 +13,12 @@ import numpy as np
 
 from logvggt_jax.doctor.finding import Finding
 from logvggt_jax.doctor.subject import Subject, random_variables
+from logvggt_jax.evaluation.costs.streams import random_pictures, time_stream
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.model.parameters import in_compute_type
 from logvggt_jax.streaming import (
+    METHODS,
     CausalSettings,
-    ChunkPlan,
-    MergedSettings,
-    OfflineSettings,
     PredictionError,
     RollingSettings,
     open_predictor,
@@ -46,8 +45,6 @@ ORIGINALS = {
     "rolling": Original("InfiniteVGGT", {0: 9.0, STREAMED - 1: 5.8}),
     "offline": Original("VGGT", {100: 25.5, 200: 14.9}),
 }
-# Methods whose results come at the end, or in chunks.
-_WHOLE = ("offline", "merged", "chunks")
 # Frames over which a stream's early and late rates are taken.
 _SPAN = 8
 
@@ -56,8 +53,8 @@ def examine(method: str, subject: Subject) -> Iterator[Finding]:
     """Frames a second of one method; a first stream compiles. Originals are compared on an accelerator alone."""
     subject = dataclasses.replace(subject, model=_with_a_view(subject.model))
     variables = jax.device_put(in_compute_type(random_variables(subject.model), subject.model.config))
-    pictures = np.random.default_rng(1).integers(0, 256, (4, *subject.image_size, 3), np.uint8)
-    measured = _whole if method in _WHOLE else _streamed
+    pictures = random_pictures(subject.image_size)
+    measured = _in_batches if METHODS[method].in_batches else _streamed
     try:
         yield from measured(method, subject, variables, pictures)
     except PredictionError as error:
@@ -98,22 +95,16 @@ def _streamed(method: str, subject: Subject, variables: Any, pictures: np.ndarra
     yield _rate(method, f"frames/s, frames {frames - _SPAN} to {frames - 1}", late, STREAMED - 1, subject)
 
 
-def _whole(method: str, subject: Subject, variables: Any, pictures: np.ndarray) -> Iterator[Finding]:
+def _in_batches(method: str, subject: Subject, variables: Any, pictures: np.ndarray) -> Iterator[Finding]:
     lengths = (6,) if subject.tiny else (100,) if subject.quick else (100, 200)
-    settings: dict[str, Any] = {
-        "offline": OfflineSettings(max_frames=None),
-        "merged": MergedSettings(max_frames=None),
-        "chunks": ChunkPlan(4, 2) if subject.tiny else ChunkPlan(),
-    }
+    settings = METHODS[method].settings()
+    if getattr(settings, "max_frames", None) is not None:
+        settings = dataclasses.replace(settings, max_frames=None)
     for count in lengths:
 
         def run(count: int = count) -> float:
-            predictor = open_predictor(method, subject.model, variables, settings[method])
-            started = time.perf_counter()
-            for index in range(count):
-                predictor.push(pictures[index % len(pictures)])
-            predictor.close()
-            return time.perf_counter() - started
+            predictor = open_predictor(method, subject.model, variables, settings)
+            return time_stream(predictor, pictures, count).seconds
 
         first = run()
         seconds = statistics.median(run() for _ in range(1 if subject.tiny else 3))

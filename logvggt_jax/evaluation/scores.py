@@ -32,6 +32,8 @@ ACCURACY_KEYS = ("rra@5", "rra@30", "rta@30", "auc@30")
 POSE_KEYS = (*ACCURACY_KEYS, "rotation_error", "identity_rotation_error")
 TRAJECTORY_KEYS = ("ate", "ate_ratio", "rpe_translation", "rpe_rotation")
 # Errors against a second set of true poses carry this before their names.
+# `scale` (one scale a clip) is what the paper's tables are compared with.
+_ALIGNMENTS = ("scale", "median")
 SFM = "sfm/"
 
 
@@ -223,7 +225,7 @@ def _depth(prediction: ClipPrediction, clip: ClipData, measure: DepthMeasure) ->
     if not pixels[0].size:
         raise NotMeasurable("no frame of the clip has a valid depth")
     result: dict[str, float] = {}
-    for alignment in measure.alignments:
+    for alignment in _ALIGNMENTS:
         errors = pixel_errors(*pixels, alignment=alignment, clip=measure.clip)
         result |= {f"{alignment}/{key}": errors[key] for key in DEPTH_KEYS}
         result["valid_pixels"] = errors["valid_pixels"]
@@ -281,7 +283,7 @@ def _depth_means(metrics: Sequence[Mapping[str, float]], measure: DepthMeasure) 
     """Means over the clips that have depth errors, weighted by valid pixels."""
     measured = [m for m in metrics if "valid_pixels" in m]
     result: dict[str, float] = {"clips_depth": len(measured)}
-    for alignment in measure.alignments:
+    for alignment in _ALIGNMENTS:
         clips = [
             {key: m[f"{alignment}/{key}"] for key in DEPTH_KEYS} | {"valid_pixels": m["valid_pixels"]} for m in measured
         ]

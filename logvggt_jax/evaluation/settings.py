@@ -77,6 +77,7 @@ class PaperRun(Run):
         if not self.benchmarks:
             raise InputError("PaperRun.benchmarks must name at least one, for example ('*',) or ('seven_scenes-*',)")
         require_counts(self, "max_sequences")
+        require_counts(self, "figures", least=0)
 
 
 def read_run(values: Mapping[str, Any]) -> ClipRun | PaperRun:

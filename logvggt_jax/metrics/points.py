@@ -9,6 +9,7 @@ import importlib
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from logvggt_jax.errors import MissingPackage, install_line
 from logvggt_jax.metrics.errors import NotMeasurable
@@ -42,7 +43,7 @@ def point_cloud_metrics(
     Raises:
       NotMeasurable: an empty cloud, points that are not finite.
       ValueError: wrong shapes.
-      MissingPackage: Open3D (ICP, normals) or SciPy is not installed.
+      MissingPackage: Open3D (ICP, normals) is not installed.
     """
     prediction, target = _cloud(prediction, "prediction"), _cloud(target, "target")
     if prediction_normals is not None:
@@ -108,10 +109,6 @@ def sample_indices(count: int, max_points: int | None, seed: int) -> np.ndarray:
 
 def _nearest(points: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distance [N] of each of `points` [N, 3] to the nearest of `others` [M, 3], and its index [N]."""
-    try:
-        from scipy.spatial import cKDTree
-    except ImportError as error:
-        raise MissingPackage(f"nearest neighbours need SciPy ({error}): {install_line('eval')}") from error
     return cKDTree(others).query(points)
 
 

@@ -1,4 +1,4 @@
-"""A stream that takes one frame a call through caches: what `causal`, `anchored-window` and `rolling` share."""
+"""A stream that takes one frame a call through caches: what the frame-by-frame methods share."""
 
 from __future__ import annotations
 
@@ -29,6 +29,7 @@ from logvggt_jax.streaming.results import (
     device_memory,
     refuse_masks,
 )
+from logvggt_jax.streaming.rows import Rows
 from logvggt_jax.types import WindowOutput
 
 Memories = TypeVar("Memories")
@@ -107,7 +108,7 @@ class FrameSession:
         self._newest: np.ndarray | None = None
         self._image_size = (1, 1)  # (H, W), known with the first frame
         self._received = 0
-        self._encodings = np.zeros((0, 9), np.float32)
+        self._encodings = Rows(np.zeros((0, 9), np.float32))
         self._closed = False
 
     @property
@@ -159,13 +160,13 @@ class FrameSession:
             return results, {}
         leaves = jax.tree.leaves(self._memory)
         arrays = {f"memory/{i}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
-        return results, {**arrays, "newest": self._newest, "encodings": self._encodings}
+        return results, {**arrays, "newest": self._newest, "encodings": self._encodings.array}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """See `Predictor.restore`."""
         if not arrays:
             return
-        self._newest, self._encodings = arrays["newest"], arrays["encodings"]
+        self._newest, self._encodings = arrays["newest"], Rows(arrays["encodings"])
         self._image_size = (self._newest.shape[0], self._newest.shape[1])
         self._received = len(self._encodings)
         tokens = tokens_a_frame(self._model.config, self._image_size)
@@ -178,7 +179,7 @@ class FrameSession:
 
     def cameras(self, *, provisional: bool = False) -> Cameras:
         """Cameras of the frames handed out so far; all are final."""
-        return decoded_cameras(self._encodings, self._image_size, final=len(self._encodings))
+        return decoded_cameras(self._encodings.array, self._image_size, final=len(self._encodings))
 
     def signals(self) -> Signals:
         """See `Predictor.signals`: none."""
@@ -217,7 +218,7 @@ class FrameSession:
         results: list[FrameResult] = []
         while len(self._flights) > ahead:
             output, encodings = self._flights.popleft()
-            self._encodings = np.concatenate([self._encodings, np.asarray(encodings)])
+            self._encodings.append(np.asarray(encodings))
             depth, confidence, points, points_confidence = (
                 None if x is None else np.asarray(x)[0, 0]
                 for x in (output.depth, output.depth_confidence, output.points, output.points_confidence)
@@ -228,7 +229,7 @@ class FrameSession:
                     index=len(self._encodings) - 1,
                     depth=depth,
                     confidence=confidence,
-                    pose_encoding=self._encodings[-1],
+                    pose_encoding=self._encodings.array[-1],
                     pose_is_final=True,
                     points=points,
                     points_confidence=points_confidence,

@@ -115,11 +115,6 @@ class PoseStream:
         return self._store.count
 
     @property
-    def capacity(self) -> int:
-        """Frames that fit on the device without growing."""
-        return self._store.capacity
-
-    @property
     def filled_bytes(self) -> int:
         """Bytes of the tokens that are kept, without empty places."""
         return self._store.filled_bytes

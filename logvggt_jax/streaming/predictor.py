@@ -105,6 +105,8 @@ class Method(NamedTuple):
       program: model, (H, W) of the images, settings and number of frames (None: not known) to the program in which the
         method spends its time.
       takes_masks: whether `push` takes masks of pixels that are not to be seen.
+      in_batches: whether many frames are predicted together, when all are there or a chunk is, so that the time of a
+        single `push` tells nothing.
     """
 
     title: str
@@ -114,6 +116,7 @@ class Method(NamedTuple):
     summary: str
     program: Callable[[LogVGGT, tuple[int, int], Any, int | None], Program]
     takes_masks: bool = False
+    in_batches: bool = False
 
 
 def _frame_by_frame(title: str, settings: type, keeping: Callable[[Any, int], Keeping], summary: str) -> Method:
@@ -153,6 +156,7 @@ METHODS: dict[str, Method] = {
         "all frames in one window of full global attention",
         offline_program,
         takes_masks=True,
+        in_batches=True,
     ),
     "chunks": Method(
         "VGGT on chunks",
@@ -162,6 +166,7 @@ METHODS: dict[str, Method] = {
         "overlapping chunks without memory, chained by robust similarities",
         chunk_program,
         takes_masks=True,
+        in_batches=True,
     ),
     "merged": Method(
         "FastVGGT",
@@ -170,6 +175,7 @@ METHODS: dict[str, Method] = {
         "vggt",
         "all frames at once, merged tokens in the global attention",
         merged_program,
+        in_batches=True,
     ),
     "causal": _frame_by_frame(
         "StreamVGGT",

@@ -264,12 +264,12 @@ def test_nothing_compiles_per_frame_and_the_state_does_not_grow(
     def state_bytes() -> int:
         return sum(leaf.nbytes for leaf in jax.tree.leaves(session._state))
 
-    before, size, capacity = compiled(), state_bytes(), session._poses.capacity
+    before, size, capacity = compiled(), state_bytes(), session._poses._store.capacity
     for _ in range(40):
         session.push(frame)
     assert compiled() == before
     assert state_bytes() == size
-    assert session._poses.capacity == capacity == 64
+    assert session._poses._store.capacity == capacity == 64
     assert len(session._pending) < 2
 
 
@@ -283,7 +283,7 @@ def test_programs_grow_with_the_logarithm_of_a_stream_that_reads_everything(
         session.push(frame)
     session.close()
     assert len(session.cameras().is_final) == 120
-    assert session._poses.capacity == 128
+    assert session._poses._store.capacity == 128
     assert pose_stream._fire._cache_size() - before <= 6
 
 

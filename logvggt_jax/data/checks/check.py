@@ -20,6 +20,7 @@ from logvggt_jax.data.errors import MissingFiles
 from logvggt_jax.data.readers.folder_dataset import FolderDataset
 from logvggt_jax.data.registry import READERS, open_dataset
 from logvggt_jax.errors import InputError, one_line
+from logvggt_jax.frames import evenly_spaced
 
 INCONSISTENT = 0.1
 """Relative difference above which depth, intrinsics and poses are said not to belong together.
@@ -78,7 +79,8 @@ def check_copy(
         )
     chosen = dataset.sequences
     if max_sequences is not None and max_sequences < len(chosen):
-        chosen = tuple(chosen[i] for i in _spread(len(chosen), max_sequences))
+        places = evenly_spaced(len(chosen), max_sequences) if max_sequences > 1 else [len(chosen) // 2]
+        chosen = tuple(chosen[i] for i in places)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with (
         Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True), disable=not progress) as bars,
@@ -100,7 +102,7 @@ def check_copy(
     if picture is not None:
         drawable = [sequence for sequence in reports if sequence.examples]
         if drawable:
-            write_check_picture(picture, dataset, [drawable[i] for i in _spread(len(drawable), _DRAWN)])
+            write_check_picture(picture, dataset, [drawable[i] for i in evenly_spaced(len(drawable), _DRAWN)])
         else:
             warnings.warn(f"{picture} is not written: no frame could be decoded", stacklevel=2)
     return report
@@ -158,7 +160,7 @@ def _check_sequence(
         return SequenceReport(sequence, problems=problems.all())
     count = len(extrinsics)
     has_poses = bool(np.isfinite(extrinsics).all())
-    wanted = range(count) if all_images else _spread(count, _SAMPLE)
+    wanted = range(count) if all_images else evenly_spaced(count, _SAMPLE)
     frames = _decode(dataset, sequence, wanted, pool, problems)
     figure, compared = None, None
     if has_poses:
@@ -251,7 +253,7 @@ def _consistency(
     see the same."""
     compared = []
     # Neither the first nor the last frame: those have neighbours on one side only.
-    for index in sorted(set(_spread(len(extrinsics), _PAIRS + 2)[1:-1] or [0])):
+    for index in sorted(set(evenly_spaced(len(extrinsics), _PAIRS + 2)[1:-1] or [0])):
         try:
             candidates = [frame for frame in dataset.neighbours(sequence, index) if frame not in broken]
             if index in broken or not candidates:
@@ -269,10 +271,3 @@ def _consistency(
         return None, None
     difference, share = np.median(compared, axis=0)
     return float(difference), float(share)
-
-
-def _spread(count: int, number: int) -> list[int]:
-    """Up to `number` different indices of `count`, evenly spread, the first and the last among them."""
-    if number == 1:
-        return [count // 2]
-    return sorted({round(i * (count - 1) / (number - 1)) for i in range(number)})

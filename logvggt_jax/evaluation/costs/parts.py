@@ -153,12 +153,6 @@ def time_part(part: Part, variables: Any, *, rounds: int = 3, least_seconds: flo
     )
 
 
-def peak_device_bytes() -> int | None:
-    """Most bytes in use on the default device so far; None where the back end does not say (CPU)."""
-    statistics_ = jax.devices()[0].memory_stats() or {}
-    return statistics_.get("peak_bytes_in_use")
-
-
 def live_device_bytes() -> int:
     """Bytes of all arrays alive now, temporaries of running programs aside."""
     return sum(array.nbytes for array in jax.live_arrays())

@@ -96,7 +96,7 @@ def cost_of_length(row: Method, pictures: np.ndarray, length: int, rounds: int) 
         first = time_stream(row.start(), pictures, length, watch=True)
         with counted_compilations() as compilations:
             runs = [time_stream(row.start(), pictures, length) for _ in range(rounds)]
-            made = compilations()
+            made = compilations.count
     except PredictionError as error:
         return {"reason": str(error)}
     rates = [length / run.seconds for run in runs]

@@ -8,10 +8,9 @@ from logvggt_jax.evaluation.costs.parts import PARTS, sequence_parts, time_part
 from logvggt_jax.evaluation.costs.streams import TimingConfig, measured_once
 from logvggt_jax.evaluation.methods.method import Checkpoint, Method
 from logvggt_jax.evaluation.methods.variants import VARIANTS, variant_methods
+from logvggt_jax.evaluation.protocols.images import PrincipalPointCrop
 from logvggt_jax.model.logvggt import LogVGGT
 
-# Cameras of the paper's benchmarks are 4 : 3.
-_ASPECT = 3 / 4
 # Variants with GCCR once at the end and after every window, each with both trunks: the modes of the paper's tables.
 _MODES = ("full", "gccr_online")
 
@@ -51,7 +50,7 @@ def measured_timings(
       references: other rows, by their predictors. A length that one of them cannot take has the reason in place of
         its rates.
       config, output, fresh: see `measured_once`.
-      longer_edge: pixels; pictures are 4 : 3.
+      longer_edge: pixels; pictures are 4 : 3, as the cameras of the paper's benchmarks are.
 
     Returns:
       What `measured_once` gives, with `dtype`, `image_size`, `windows`, `frames_per_second` (by row and length a list
@@ -59,7 +58,7 @@ def measured_timings(
       end.
     """
     base = checkpoint.model.config
-    image_size = (max(round(longer_edge * _ASPECT / 14), 1) * 14, longer_edge)
+    image_size = PrincipalPointCrop(longer_edge).size((3, 4))
     windows = [base.windows.size, base.windows.stride]
 
     def with_parts(costs: dict[str, dict[str, Any]]) -> dict[str, Any]:

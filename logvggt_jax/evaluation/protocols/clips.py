@@ -35,6 +35,7 @@ class ClipSettings:
                 f"ClipSettings.clip_lengths must be at least one number of 2 or more frames, got {self.clip_lengths}"
             )
         require_counts(self, "stride", "clips_per_sequence", "sets", "max_sequences", "max_points")
+        require_counts(self, "seed", "figures", least=0)
         require_within(self, "(0, inf)", "icp_threshold")
 
 

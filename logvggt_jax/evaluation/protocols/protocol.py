@@ -16,8 +16,6 @@ class DepthMeasure:
 
     max_depth: float | None = None  # metres; true depth from here on is not valid. None for no bound.
     clip: float | None = None  # metres; bound put on the aligned prediction. None for none.
-    # All are computed; `scale` (one scale a clip) is what the paper's tables are compared with.
-    alignments: tuple[str, ...] = ("scale", "median")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,6 +96,7 @@ class ProtocolSettings:
     def __post_init__(self) -> None:
         check_longer_edge(self.longer_edge, "ProtocolSettings.longer_edge", least=28)
         require_counts(self, "max_points")
+        require_counts(self, "seed", least=0)
         require_within(self, "(0, inf)", "icp_threshold")
 
     @property

@@ -7,7 +7,7 @@ import numpy as np
 from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.data.registry import READERS
 from logvggt_jax.errors import InputError
-from logvggt_jax.frames import Frames
+from logvggt_jax.frames import Frames, evenly_spaced
 from logvggt_jax.training.config import SourceConfig, TrainConfig
 
 # Frames of a source that are looked at until one has depth: the first one nearly always.
@@ -61,10 +61,10 @@ def _check_source(source: SourceConfig, dataset: Dataset) -> None:
 
 def _some_frames(dataset: Dataset) -> Iterator[Frames]:
     """Single frames, evenly spaced over the sequences and in each of them."""
-    sequences = _spread(len(dataset.sequences), _MOST_FRAMES)
+    sequences = evenly_spaced(len(dataset.sequences), _MOST_FRAMES)
     for sequence in (dataset.sequences[i] for i in sequences):
         try:
-            places = _spread(dataset.num_frames(sequence), _MOST_FRAMES // len(sequences))
+            places = evenly_spaced(dataset.num_frames(sequence), _MOST_FRAMES // len(sequences))
         except Exception:  # of whatever kind a damaged listing raises
             continue
         for place in places:
@@ -73,8 +73,3 @@ def _some_frames(dataset: Dataset) -> Iterator[Frames]:
             except Exception:  # of whatever kind a decoder raises
                 continue
             yield frames
-
-
-def _spread(count: int, most: int) -> list[int]:
-    """At `most` so many of `count` places, evenly spaced, from the first to the last."""
-    return [int(i) for i in np.linspace(0, count - 1, min(count, most))]

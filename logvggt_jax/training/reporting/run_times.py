@@ -12,14 +12,12 @@ class Speed(NamedTuple):
     """Of the steps of one interval between two log lines.
 
     Attributes:
-      seconds: that the steps took together, without compilations, validations and saves.
       frames_per_second: frames trained on.
       data_share: part of the time in which the host waited for clips.
       utilisation: operations a second (forward and gradient, nothing computed twice) over those of the fastest large
         matrix product on all devices; None where that is not known.
     """
 
-    seconds: float
     frames_per_second: float
     data_share: float
     utilisation: float | None
@@ -76,7 +74,6 @@ class RunTimes:
         if frames:
             self._seconds_a_frame = seconds / frames
         speed = Speed(
-            seconds=seconds,
             frames_per_second=frames / seconds,
             data_share=min(self._waited / seconds, 1.0),
             utilisation=self._operations / seconds / self._peak if self._peak and self._operations else None,

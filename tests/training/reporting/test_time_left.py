@@ -49,7 +49,7 @@ def test_the_time_left_counts_validations_saves_and_compilations(config: TrainCo
         times.count()
         clock.now += 3.0
     speed = times.read(config.stages[0])
-    assert speed == Speed(seconds=80.0, frames_per_second=1.0, data_share=0.25, utilisation=None)
+    assert speed == Speed(frames_per_second=1.0, data_share=0.25, utilisation=None)
     assert times.productive == 60.0
     # 80 steps; saves at 30, 60, 90 and 100; one validation at 70; another size to compile.
     assert times.remaining_seconds(20, 100, compilations=1) == 80 * 4 + 4 * 7 + 20 + 50
@@ -86,7 +86,7 @@ def test_goodput_is_not_known_where_the_clock_was_set_back() -> None:
 def test_a_line_says_what_a_person_looks_for() -> None:
     values = {"loss/total": 1.5, "loss/camera": 0.5, "loss/depth": 1.0, "learning_rate": 3e-4}
     values |= {"train/abs_rel": 0.1, "train/rotation_over_identity": 0.9, "train/translation_direction": 50.0}
-    speed = Speed(seconds=1.0, frames_per_second=19.0, data_share=0.02, utilisation=0.29)
+    speed = Speed(frames_per_second=19.0, data_share=0.02, utilisation=0.29)
     line = progress_line(50, 100, "one", values, speed, memory=3 * 2**30, stage_seconds=61, run_seconds=3600)
     assert line == (
         "step 50/100 one: loss 1.5000 (camera 0.5, depth 1), abs_rel 0.100, rotation 0.90 of identity's, "
