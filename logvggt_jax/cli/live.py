@@ -31,6 +31,10 @@ def _live(options: argparse.Namespace) -> int:
     source = open_source(options.camera, most_broken=1.0, **thinned)
     if source.address is not None and not options.realtime:
         raise InputError(f"{source.name} is no camera: add --realtime to play it as one, or use `logvggt reconstruct`")
+    if source.address is not None and options.reconnect is not None:
+        raise InputError(f"{source.name} ends where it ends, and there is nothing to wait for: leave --reconnect out")
+    if options.queue is not None and options.queue < 1:
+        raise InputError(f"--queue must be at least 1 frame, got {options.queue}")
     recording = None
     if options.output is not None:
         check_request(source, options.output, longer_edge=options.longer_edge, overwrite=options.overwrite)

@@ -17,11 +17,10 @@ if TYPE_CHECKING:
 
 def _export(options: argparse.Namespace) -> None:
     from logvggt_jax.reconstruction.exporters import export
-    from logvggt_jax.reconstruction.points.point_filter import PointFilter
     from logvggt_jax.reconstruction.result import Reconstruction
 
-    points = None if options.max_points is None else PointFilter(max_points=options.max_points or None)
     result = Reconstruction.open(options.result)
+    points = None if options.max_points is None else result.filtered(options.max_points or None)
     written = export(result, options.format, options.output, point_filter=points, overwrite=options.overwrite)
     for name, path in zip(dict.fromkeys(options.format), written, strict=True):
         print(f"{name}: {printable(str(path))}")
@@ -117,7 +116,8 @@ def add_to(commands: Any) -> None:
         type=int,
         default=None,
         metavar="N",
-        help="thin the cloud to N points; 0 keeps all (default: 2,000,000 for ply, 500,000 for glb, else 100,000)",
+        help="thin the cloud to N points; 0 keeps all (default: as the result was made for ply, 500,000 for glb and "
+        "splats, else 100,000); pixels are those that the result's filter takes",
     )
     sub.add_argument("--overwrite", action="store_true", help="replace earlier exports of these formats")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,9 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from logvggt_jax.config import from_mapping
 from logvggt_jax.errors import InputError, MissingInput
 from logvggt_jax.files import open_regular, write_text
 from logvggt_jax.geometry import is_rotation
+from logvggt_jax.reconstruction.points.point_filter import PointFilter
 from logvggt_jax.reconstruction.sources.record import SourceRecord
 
 CAMERAS_FILE = "cameras.json"
@@ -39,6 +42,7 @@ def write_cameras(
     depth_scale: np.ndarray | None = None,
     loops: np.ndarray | None = None,
     masked: Sequence[float] | None = None,
+    point_filter: PointFilter | None = None,
 ) -> None:
     """Writes all cameras as one JSON file.
 
@@ -59,6 +63,7 @@ def write_cameras(
       depth_scale: [N], by which the depth files' depth has to be multiplied to fit the cameras; None where it fits.
       loops: int [L, 2], the frames at which the sequence came back to a place; None where nobody looked for them.
       masked: [N], the share of the depth maps' pixels that a mask drops; None where there were no masks.
+      point_filter: which pixels became points; None for `PointFilter`'s defaults.
     """
     frames: list[dict[str, Any]] = [
         {
@@ -86,6 +91,7 @@ def write_cameras(
         "noted_focal_length": noted_focal_length,
         "source": None if source is None else source._asdict(),
         **({} if loops is None else {"loops": loops.tolist()}),
+        "points": dataclasses.asdict(point_filter or PointFilter()),
         "skipped": [{"name": name, "reason": reason} for name, reason in skipped],
         "frames": frames,
     }
@@ -101,7 +107,8 @@ def is_complete(path: Path) -> bool:
 
 
 def read_cameras(path: str | Path) -> dict[str, Any]:
-    """Inverse of `write_cameras`: the document, with the frames' matrices as float64 arrays and the source's record.
+    """Inverse of `write_cameras`: the document, with the frames' matrices as float64 arrays, the source's
+    record and the point filter.
 
     What is returned can be relied on: sizes are positive; names differ, are names of files and lead out of no folder;
     numbers are finite, also in float32; rotations are rotations; focal lengths are not zero.
@@ -142,6 +149,7 @@ def _checked(document: Any) -> dict[str, Any]:
     complete, skipped = document.setdefault("complete", True), document.setdefault("skipped", [])
     noted, metric = document.setdefault("noted_focal_length", None), document.setdefault("metric", False)
     document["source"] = _source(document.get("source"))
+    document["points"] = _point_filter(document.get("points", {}))
     _require(noted is None or bool(_numbers(noted, (), "noted_focal_length") > 0), "noted_focal_length must be above 0")
     for key, value in (("complete", complete), ("metric", metric)):
         _require(type(value) is bool, f"{key} must be true or false, got {shown(value)}")
@@ -185,6 +193,13 @@ def _source(value: Any) -> SourceRecord | None:
     valid = isinstance(value, dict) and all(type(value.get(key)) is kind for key, kind in kinds.items())
     _require(value is None or valid, f"source must be null or say where frames came from, got {shown(value)}")
     return None if value is None else SourceRecord(**{key: value[key] for key in kinds})
+
+
+def _point_filter(value: Any) -> PointFilter:
+    try:
+        return from_mapping(PointFilter, value, "points")
+    except InputError as error:
+        raise _Fault(str(error)) from error
 
 
 def _require(condition: bool, complaint: str) -> None:

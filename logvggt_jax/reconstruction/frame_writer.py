@@ -148,6 +148,7 @@ class FrameWriter:
             depth_scale=cameras.depth_scale,
             loops=cameras.loops,
             masked=self.masked or None,
+            point_filter=self._selection.point_filter,
         )
 
     def write_health(self, result: Reconstruction, predictor: Predictor) -> None:

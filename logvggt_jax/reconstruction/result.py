@@ -12,6 +12,7 @@ from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE, read_cameras
 from logvggt_jax.reconstruction.depth_files import read_depth, read_picture
 from logvggt_jax.reconstruction.health.report import HEALTH_FILE, HEALTH_PAGE, Health, read_health
 from logvggt_jax.reconstruction.points.cloud_file import Cloud, count_points, read_cloud, read_points
+from logvggt_jax.reconstruction.points.point_filter import PointFilter
 from logvggt_jax.reconstruction.sources.record import SourceRecord
 from logvggt_jax.reconstruction.work_folder import is_unfinished
 
@@ -47,6 +48,7 @@ class Reconstruction:
       loops: pairs of frames at which the sequence came back to a place; None where nobody looked for them.
       masked: [N] float64, the share of the depth maps' pixels that a mask has dropped, which have depth and confidence
         0; zeros where there were no masks.
+      point_filter: which pixels became points.
       seconds: from the first frame to the last depth map, compilation included; None for a folder opened later.
     """
 
@@ -66,6 +68,7 @@ class Reconstruction:
     noted_focal_length: float | None = None
     source: SourceRecord | None = None
     masked: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
+    point_filter: PointFilter = PointFilter()
     seconds: float | None = None
 
     @classmethod
@@ -115,7 +118,12 @@ class Reconstruction:
             skipped=tuple(frame["name"] for frame in document["skipped"]),
             source=document["source"],
             masked=np.array([frame["masked"] for frame in frames], np.float64),
+            point_filter=document["points"],
         )
+
+    def filtered(self, max_points: int | None) -> PointFilter:
+        """The result's point filter, for another number of points."""
+        return dataclasses.replace(self.point_filter, max_points=max_points)
 
     @property
     def num_frames(self) -> int:

@@ -21,9 +21,12 @@ from logvggt_jax.data import open_dataset
 from logvggt_jax.errors import InputError, MissingPackage, OutputExists
 from logvggt_jax.geometry import camera_centres, invert, project, unproject_pixels
 from logvggt_jax.reconstruction import EXPORTERS, PointFilter, Reconstruction, export
+from logvggt_jax.reconstruction.depth_files import write_depth
 from logvggt_jax.reconstruction.exporters.frame_names import file_stems
+from logvggt_jax.reconstruction.exporters.glb import _times
 from logvggt_jax.reconstruction.exporters.original_depth import depth_at
 from logvggt_jax.reconstruction.points.cloud_file import read_cloud, read_points
+from logvggt_jax.reconstruction.result import depth_file
 
 COUNT = 6
 FEW_POINTS = PointFilter(max_points=600)
@@ -382,7 +385,75 @@ def test_rosbags_reads_pictures_depth_cameras_and_poses(result: Reconstruction, 
     np.testing.assert_allclose(axes[:, 0], [right[2], -right[0], -right[1]], atol=1e-6)
 
 
+def test_no_depth_is_nan_for_ros(tmp_path: Path) -> None:
+    pytest.importorskip("rosbags", reason="extra `formats` is not installed")
+    from rosbags.highlevel import AnyReader
+
+    result = masked_result(tmp_path)
+    (folder,) = export(result, ["rosbag2"], progress=False)
+    with AnyReader([folder]) as reader:
+        wanted = [connection for connection in reader.connections if connection.topic == "/camera/depth/image_raw"]
+        for index, (connection, _, content) in enumerate(reader.messages(wanted)):
+            depth = reader.deserialize(content, connection.msgtype).data.view(np.float32).reshape(result.image_size)
+            there = depth_at(result.depth(index), result.image_size) > 0
+            assert not there.all() and (depth[there] > 0).all() and np.isnan(depth[~there]).all()
+
+
+def test_masks_go_with_the_pictures_of_nerfstudio(tmp_path: Path) -> None:
+    result = masked_result(tmp_path)
+    (folder,) = export(result, ["nerfstudio"], point_filter=FEW_POINTS, progress=False)
+    for index, frame in enumerate(json.loads((folder / "transforms.json").read_text())["frames"]):
+        with Image.open(folder / frame["mask_path"]) as mask:
+            assert mask.mode == "L" and mask.size == (frame["w"], frame["h"])
+            np.testing.assert_array_equal(
+                np.asarray(mask) > 0, depth_at(result.confidence(index), result.image_size) > 0
+            )
+
+
+@pytest.mark.parametrize(
+    ("timestamps", "times"),
+    [([0, 3, 6], [0, 0.1, 0.2]), ([2, 3, 5], [0, 0.1, 0.2]), ([1.5, 1.75, 2.5], [0, 0.25, 1]), ([4], [0])],
+)
+def test_frames_that_have_positions_for_times_are_a_tenth_of_a_second_apart(
+    timestamps: list[float], times: list[float]
+) -> None:
+    np.testing.assert_allclose(_times(np.array(timestamps, np.float64)), times)
+
+
+def masked_result(folder: Path) -> Reconstruction:
+    """Two frames of which a mask drops the left third."""
+    result = write_room_result(folder, count=2)
+    document = json.loads((result.folder / "cameras.json").read_text())
+    for index, frame in enumerate(document["frames"]):
+        frame["masked"] = 0.33
+        depth, confidence = result.depth_and_confidence(index)
+        left = np.arange(depth.shape[1]) < depth.shape[1] // 3
+        write_depth(depth_file(result.folder, frame["name"]), np.where(left, 0, depth), np.where(left, 0, confidence))
+    (result.folder / "cameras.json").write_text(json.dumps(document))
+    return Reconstruction.open(result.folder)
+
+
 # What is said and refused
+
+
+def test_the_results_own_files_are_never_replaced(tmp_path: Path) -> None:
+    result = write_room_result(tmp_path, count=2)
+    before = contents(result.folder)
+    with pytest.raises(InputError, match="is the result itself, whose files exports would replace"):
+        export(result, ["ply"], result.folder, point_filter=FEW_POINTS, overwrite=True, progress=False)
+    assert contents(result.folder) == before
+
+
+def test_another_decoders_name_does_not_make_a_source_another(tmp_path: Path) -> None:
+    result = write_room_result(tmp_path, count=2)
+    document = json.loads((result.folder / "cameras.json").read_text())
+    document["source"]["fingerprint"] += " OtherDecoder"
+    (result.folder / "cameras.json").write_text(json.dumps(document))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        (folder,) = export(Reconstruction.open(result.folder), ["nerfstudio"], point_filter=FEW_POINTS, progress=False)
+    frame = json.loads((folder / "transforms.json").read_text())["frames"][0]
+    assert (frame["h"], frame["w"]) == result.image_size
 
 
 def test_without_its_source_a_result_gives_its_own_pictures_and_says_so(tmp_path: Path) -> None:

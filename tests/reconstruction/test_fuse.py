@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -21,7 +22,7 @@ from logvggt_jax.geometry import (
 )
 from logvggt_jax.reconstruction import PointFilter, Reconstruction, export, fuse, write_trajectory
 from logvggt_jax.reconstruction.fusion.matching import match_poses
-from logvggt_jax.reconstruction.fusion.pose_files import read_poses
+from logvggt_jax.reconstruction.fusion.pose_files import ExternalPose, read_poses
 
 COUNT, SIZE = 10, (84, 112)
 # From the room's metres to the disordered result's world.
@@ -208,9 +209,28 @@ def test_names_that_match_no_frame_are_shown(truth: Reconstruction, disordered: 
     poses = with_nerfstudio(truth, tmp_path)
     poses.write_text(poses.read_text().replace("view_", "photo"))
     with pytest.raises(
-        InputError, match=r"none of its 10 pictures \('photo0', …\) has the name of one of the 10 frames"
+        InputError, match=r"none of its 10 pictures \('images/photo0.jpg', …\) has the name of one of the 10 frames"
     ):
         fuse(disordered, tmp_path / "out", poses=poses, progress=False)
+
+
+@pytest.mark.parametrize(
+    ("frames", "pictures"),
+    [
+        # As 7-Scenes names colour, and as pictures of several folders are called.
+        (["frame-000000", "frame-000001"], ["frame-000000.color.png", "frame-000001.color.png"]),
+        (["a_0000.jpg", "b_0000.jpg"], ["a/0000.jpg", "b/0000.jpg"]),
+        (["0000.jpg", "0000.png"], ["images/0000.jpg", "images/0000.png"]),
+        (["0000", "0001"], ["left/0000.jpg", "left/0001.jpg"]),
+    ],
+)
+def test_a_picture_is_its_frame_whatever_made_the_frames_name(
+    truth: Reconstruction, frames: list[str], pictures: list[str]
+) -> None:
+    named = dataclasses.replace(truth, names=tuple(frames))
+    poses = [ExternalPose(name, None, np.eye(4)) for name in reversed(pictures)]
+    matched = match_poses(named, poses, "poses")
+    assert [matched[index].name for index in range(2)] == pictures
 
 
 def test_poses_of_several_cameras_under_one_name_are_refused(

@@ -365,6 +365,11 @@ def test_a_video_without_realtime_is_refused_before_a_model_is_looked_for(
     Image.fromarray(PICTURES[0]).save(tmp_path / "walk" / "0.png")
     assert main(["live", str(tmp_path / "walk"), "--checkpoint", "nowhere"]) == 2
     assert "is no camera: add --realtime" in capsys.readouterr().err
+    arguments = ["live", str(tmp_path / "walk"), "--checkpoint", "nowhere", "--realtime"]
+    assert main([*arguments, "--reconnect", "1"]) == 2
+    assert "walk ends where it ends, and there is nothing to wait for" in capsys.readouterr().err
+    assert main([*arguments, "--queue", "0"]) == 2
+    assert "--queue must be at least 1 frame, got 0" in capsys.readouterr().err
 
 
 def test_an_address_where_nobody_answers_is_told_before_the_weights_are_read(

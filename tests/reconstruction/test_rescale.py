@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,9 @@ from logvggt_jax.errors import InputError
 from logvggt_jax.geometry import camera_centres, unproject
 from logvggt_jax.reconstruction import Reconstruction, rescale, write_trajectory
 from logvggt_jax.reconstruction.depth_files import write_picture
+from logvggt_jax.reconstruction.exporters import export
+from logvggt_jax.reconstruction.points.cloud_file import count_points
+from logvggt_jax.reconstruction.points.point_filter import PointFilter
 
 COUNT, SCALE = 4, 0.25
 
@@ -56,6 +61,16 @@ def test_from_the_distance_of_two_pixels(truth: Reconstruction, result: Reconstr
     assert_true(made, truth)
 
 
+def test_a_pixels_point_is_on_its_own_ray(truth: Reconstruction, result: Reconstruction, tmp_path: Path) -> None:
+    """A depth map of 56 pixels a row has one for columns 41 and 42 of the picture's 128."""
+    rows, columns = truth.depth_size
+    places = {(int(50.5 * rows / 96), int((u + 0.5) * columns / 128)) for u in (41, 42)}
+    (place,) = places
+    apart = result.depth(1)[place] / result.intrinsics[1, 0, 0]
+    _, notes = rescale(result, tmp_path / "a", pixels=("1,41,50", "1,42,50"), distance=1.0, progress=False)
+    np.testing.assert_allclose(float(notes[-1].split()[-1]), 1 / apart, rtol=1e-4)
+
+
 def test_from_a_sensors_depth(truth: Reconstruction, result: Reconstruction, tmp_path: Path) -> None:
     (tmp_path / "depth").mkdir()
     for index in (0, 2):
@@ -66,6 +81,30 @@ def test_from_a_sensors_depth(truth: Reconstruction, result: Reconstruction, tmp
     made, notes = rescale(result, tmp_path / "a", depth=tmp_path / "depth", progress=False)
     assert_true(made, truth, 2e-3)
     assert "sensor depth of 2 of 4 frames" in notes[0] and "%" in notes[0]
+
+
+def test_depth_is_found_beside_colour(truth: Reconstruction, result: Reconstruction, tmp_path: Path) -> None:
+    for index in range(COUNT):
+        write_picture(tmp_path / f"view {index}.color.png", truth.image(index))
+        write_picture(tmp_path / f"view {index}.depth.png", np.rint(truth.depth(index) * 1000).astype(np.uint16))
+    made, notes = rescale(result, tmp_path / "a", depth=tmp_path, progress=False)
+    assert_true(made, truth, 2e-3)
+    assert "sensor depth of 4 of 4 frames" in notes[0]
+
+
+def test_the_points_are_chosen_as_before_and_health_stays(result: Reconstruction, tmp_path: Path) -> None:
+    chosen = {"confidence_percentile": 60.0, "edge_threshold": None, "pixel_stride": 2, "max_points": None}
+    few = tmp_path / "few"
+    shutil.copytree(result.folder, few)
+    document = json.loads((few / "cameras.json").read_text())
+    (few / "cameras.json").write_text(json.dumps({**document, "points": chosen}))
+    for name in ("health.json", "health.html"):
+        (few / name).write_text(name)
+    made, _ = rescale(Reconstruction.open(few), tmp_path / "a", frames=("0", "3"), distance=1.0, progress=False)
+    assert made.point_filter == PointFilter(**chosen)
+    (own,) = export(Reconstruction.open(few), ["ply"], tmp_path / "own", progress=False)
+    assert made.num_points == count_points(own) < result.num_points
+    assert (made.folder / "health.html").read_text() == "health.html"
 
 
 def test_from_poses_in_metres(truth: Reconstruction, result: Reconstruction, tmp_path: Path) -> None:
@@ -80,7 +119,7 @@ def test_from_poses_in_metres(truth: Reconstruction, result: Reconstruction, tmp
     [
         ({"frames": ("0", "1"), "distance": 0.0}, "a distance must be above 0 metres, got 0"),
         ({"frames": ("0", "1"), "distance": float("nan")}, "above 0"),
-        ({"frames": ("0", "1")}, "above 0 metres, got None"),
+        ({"frames": ("0", "1")}, "cameras of 0 and 1 are apart is not said: give the distance in metres"),
         ({"frames": ("2", "2"), "distance": 1.0}, "at one place in the result"),
         ({"poses": "poses.txt", "distance": 1.0}, "a distance is one between two frames or two pixels"),
         (
@@ -91,7 +130,7 @@ def test_from_poses_in_metres(truth: Reconstruction, result: Reconstruction, tmp
         ({"pixels": ("0,1,x", "0,2,3"), "distance": 1.0}, "expected a pixel as FRAME,U,V, got '0,1,x'"),
         ({"pixels": ("0,1,1", "0,2,900"), "distance": 1.0}, "outside of the image, which has 128 x 96 pixels"),
         ({"pixels": ("0,1,1", "0,1,1"), "distance": 1.0}, "at one place"),
-        ({"depth": "."}, "holds no PNG file whose name begins with that of a frame"),
+        ({"depth": "."}, "holds no 16-bit grey PNG file whose name begins with that of a frame"),
         ({"depth": "nowhere"}, "nowhere"),
         ({}, "give one of them"),
         ({"depth": ".", "poses": "x"}, "give one of them"),

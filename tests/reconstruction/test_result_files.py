@@ -18,6 +18,7 @@ from logvggt_jax.reconstruction.cameras_file import read_cameras, write_cameras
 from logvggt_jax.reconstruction.depth_files import read_depth, read_picture, write_depth, write_picture
 from logvggt_jax.reconstruction.exporters.tum import read_trajectory, write_trajectory
 from logvggt_jax.reconstruction.points.cloud_file import read_points
+from logvggt_jax.reconstruction.points.point_filter import PointFilter
 from logvggt_jax.reconstruction.room_sequence import read_room_sequence, write_room_sequence
 
 
@@ -66,8 +67,10 @@ def test_cameras_round_trip(tmp_path: Path) -> None:
         image_size=(480, 640),
         model_intrinsics=np.diag([0.5, 0.5, 1]) @ intrinsics,
         model_size=(240, 320),
+        point_filter=PointFilter(40.0, None, 2, 100),
     )
     cameras = read_cameras(tmp_path / "cameras.json")
+    assert cameras["points"] == PointFilter(40.0, None, 2, 100)
     assert cameras["image_size"] == [480, 640]
     assert [frame["name"] for frame in cameras["frames"]] == ["a", "b", "c", "d"]
     np.testing.assert_array_equal([frame["extrinsics"] for frame in cameras["frames"]], extrinsics)

@@ -32,6 +32,12 @@ _MODELS = (
     ("RADIAL_FISHEYE", 5),
     ("THIN_PRISM_FISHEYE", 12),
     ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+    ("SIMPLE_DIVISION", 4),
+    ("DIVISION", 5),
+    ("SIMPLE_FISHEYE", 3),
+    ("FISHEYE", 4),
+    ("EUCM", 6),
+    ("EQUIRECTANGULAR", 2),
 )
 _PARAMETERS = dict(_MODELS)
 # Pinholes where the parameters after focal lengths (one or two) and principal point are 0.
@@ -182,7 +188,7 @@ def _binary_cameras(binary: "_Binary") -> Iterator[tuple[int, ColmapCamera]]:
         number, model, width, height = binary.take("IiQQ")
         where = f"{binary.path}, camera {number}"
         if not 0 <= model < len(_MODELS):
-            raise InputError(f"{where}: COLMAP has no model {model}: export the model again")
+            raise InputError(f"{where}: COLMAP has no model {model}, as of 4.2: export the model again")
         name, parameters = _MODELS[model]
         yield number, _camera(name, (height, width), binary.take(f"{parameters}d"), where)
     binary.check_end()

@@ -1,8 +1,8 @@
 """Formats that a reconstruction can be written in: one file each, and its line in the registry.
 
 An exporter is called with the reconstruction, the path to write, and as keywords the `PointFilter` that says which
-pixels become points (None: the format's own choice), and whether to show progress; it uses what its format holds. It
-reads the reconstruction through its handle and nothing else.
+pixels become points (None: the result's filter, for the format's own number of points), and whether to show progress;
+it uses what its format holds. It reads the reconstruction through its handle and nothing else.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def export(
       result: the reconstruction.
       names: keys of `EXPORTERS`.
       output: folder, made if need be; None for `exports` of the result's own.
-      point_filter: which pixels become points; None leaves that to the formats.
+      point_filter: which pixels become points; None takes the result's filter, for each format's own number of points.
       overwrite: replace earlier exports.
       progress: show progress bars where standard error is a terminal.
 
@@ -111,13 +111,15 @@ def export(
       What was written, in the order of the names.
 
     Raises:
-      InputError: no such format, or a file of the result is damaged.
+      InputError: no such format, the output is the result's own folder, or a file of the result is damaged.
       MissingPackage: the library of a format is not installed.
       OutputExists: something is at a place where a format has to go.
     """
     check_formats(names)
     names = list(dict.fromkeys(names))
     folder = result.folder / EXPORT_FOLDER if output is None else Path(output).expanduser()
+    if folder.resolve() == result.folder.resolve():
+        raise InputError(f"{folder} is the result itself, whose files exports would replace: choose another output")
     targets = [_checked(folder / EXPORTERS[name].file, EXPORTERS[name], overwrite) for name in names]
     with disk_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)

@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 
 from logvggt_jax.data.feeding.transforms import ResizeTransform
-from logvggt_jax.reconstruction.depth_files import write_picture
 from logvggt_jax.reconstruction.exporters.frame_names import file_stems
 from logvggt_jax.reconstruction.exporters.libraries import library
+from logvggt_jax.reconstruction.exporters.picture_masks import write_masks
 from logvggt_jax.reconstruction.exporters.pictures import Pictures
 from logvggt_jax.reconstruction.exporters.tracks import Tracks, find_tracks
-from logvggt_jax.reconstruction.frame_pool import FramePool
 from logvggt_jax.reconstruction.points.point_filter import PointFilter
 from logvggt_jax.reconstruction.result import Reconstruction
 
@@ -55,7 +54,7 @@ def export_colmap(
     model.write_text(folder) if text else model.write_binary(folder)
     pictures.write(path / "images", file_stems(result.names), progress=progress)
     if result.masked.any():
-        _write_masks(result, path / "masks", files, pictures.size)
+        write_masks(result, path / "masks", [f"{file}.png" for file in files], pictures.size)
 
 
 export_colmap_text = partial(export_colmap, text=True)
@@ -68,20 +67,6 @@ def _of_several_frames(tracks: Tracks) -> Tracks:
     """
     kept = np.bincount(tracks.indices, minlength=len(tracks.points))[tracks.indices] > 1
     return tracks._replace(frames=tracks.frames[kept], indices=tracks.indices[kept], pixels=tracks.pixels[kept])
-
-
-def _write_masks(result: Reconstruction, folder: Path, files: list[str], size: tuple[int, int]) -> None:
-    """A mask for each picture of `size`; those of the result are enlarged by their nearest pixels."""
-    folder.mkdir()
-    transform = ResizeTransform(original_size=size, size=result.depth_size)
-
-    def write(index: int) -> None:
-        kept = transform.depth_to_original(result.confidence(index) != 0)
-        write_picture(folder / f"{files[index]}.png", np.where(kept, np.uint8(255), np.uint8(0)))
-
-    with FramePool() as pool:
-        for _ in pool.map(write, iter(range(len(files)))):
-            pass
 
 
 def build_model(

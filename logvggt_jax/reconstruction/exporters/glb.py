@@ -51,7 +51,7 @@ def export_glb(
       MissingPackage: trimesh is not installed.
     """
     trimesh = library("trimesh")
-    vertices = whole_cloud(result, point_filter or PointFilter(max_points=_NUM_POINTS), progress=progress)
+    vertices = whole_cloud(result, point_filter or result.filtered(_NUM_POINTS), progress=progress)
     turn = OPENGL_AXES.diagonal()[:3]
     points = np.stack([vertices[axis] for axis in "xyz"], axis=-1) * turn
     colours = _LINEAR[np.stack([vertices[channel] for channel in ("red", "green", "blue")], axis=-1)]
@@ -146,9 +146,8 @@ def _accessor(buffers: dict[str, bytes], tree: dict[str, Any], name: str, values
 def _times(timestamps: np.ndarray) -> np.ndarray:
     """Seconds [N] from the first frame on, increasing."""
     times = timestamps - timestamps[0]
-    steps = np.diff(times)
-    if (np.diff(times.astype(np.float32)) <= 0).any():
-        times = np.arange(len(times), dtype=np.float64)
-        steps = np.diff(times)
-    # Frames without a time of their own have their position for one.
-    return times / _FRAMES_PER_SECOND if timestamps[0] == 0 and (steps == 1).all() else times
+    # Frames without a time of their own have their position for one; a stride or a broken file leaves some out.
+    are_positions = (timestamps == np.round(timestamps)).all()
+    if are_positions or (np.diff(times.astype(np.float32)) <= 0).any():
+        return np.arange(len(times)) / _FRAMES_PER_SECOND
+    return times

@@ -12,6 +12,7 @@ from logvggt_jax.data.formats.nerfstudio_transforms import TRANSFORMS_FILE
 from logvggt_jax.files import write_text
 from logvggt_jax.geometry import invert
 from logvggt_jax.reconstruction.exporters.frame_names import file_stems
+from logvggt_jax.reconstruction.exporters.picture_masks import write_masks
 from logvggt_jax.reconstruction.exporters.pictures import Pictures
 from logvggt_jax.reconstruction.exporters.ply import export_ply
 from logvggt_jax.reconstruction.exporters.tracks import NUM_POINTS
@@ -24,18 +25,25 @@ _POINTS = "points.ply"
 def export_nerfstudio(
     result: Reconstruction, path: Path, *, point_filter: PointFilter | None = None, progress: bool = True
 ) -> None:
-    """Fills a folder with `transforms.json`, `images/` and `points.ply`.
+    """Fills a folder with `transforms.json`, `images/`, `points.ply`, and where the result has masks `masks/`, black
+    where nothing is to be seen.
 
     Cameras are camera-to-world with OpenGL axes, in the world of the points; the centre of the first pixel is at
     (0.5, 0.5). `point_filter` None gives 100,000 points.
     """
     pictures = Pictures.of(result)
     height, width = pictures.size
-    files = pictures.write(path / "images", file_stems(result.names), progress=progress)
+    stems = file_stems(result.names)
+    files = pictures.write(path / "images", stems, progress=progress)
+    masks: list[dict[str, str]] = [{}] * len(files)
+    if result.masked.any():
+        write_masks(result, path / "masks", [f"{stem}.png" for stem in stems], pictures.size)
+        masks = [{"mask_path": f"masks/{stem}.png"} for stem in stems]
     poses = np.asarray(invert(result.extrinsics)) @ OPENGL_AXES
     frames = [
         {
             "file_path": f"images/{file}",
+            **mask,
             "fl_x": matrix[0, 0],
             "fl_y": matrix[1, 1],
             "cx": matrix[0, 2] + 0.5,
@@ -44,10 +52,8 @@ def export_nerfstudio(
             "h": height,
             "transform_matrix": pose.tolist(),
         }
-        for file, matrix, pose in zip(files, pictures.intrinsics, poses, strict=True)
+        for file, mask, matrix, pose in zip(files, masks, pictures.intrinsics, poses, strict=True)
     ]
-    export_ply(
-        result, path / _POINTS, point_filter=point_filter or PointFilter(max_points=NUM_POINTS), progress=progress
-    )
+    export_ply(result, path / _POINTS, point_filter=point_filter or result.filtered(NUM_POINTS), progress=progress)
     document = {"camera_model": "OPENCV", "ply_file_path": _POINTS, "frames": frames}
     write_text(path / TRANSFORMS_FILE, json.dumps(document, indent=1) + "\n")

@@ -23,11 +23,11 @@ def export_ply(
     Args:
       result: the reconstruction.
       path: the PLY file to write.
-      point_filter: which pixels become points; None takes `PointFilter`'s defaults.
+      point_filter: which pixels become points; None takes the result's own filter.
       progress: show a progress bar where standard error is a terminal.
     """
     with FramePool() as pool:
-        selection = select_points(result, point_filter or PointFilter(), pool, progress=progress)
+        selection = select_points(result, point_filter or result.point_filter, pool, progress=progress)
         write_cloud(result, path, selection, pool)
 
 

@@ -39,7 +39,8 @@ def export_rosbag(
 ) -> None:
     """Fills a folder with a bag (SQLite, of the messages of Humble, which later releases read).
 
-    Topics: pictures as JPEG, depth as 32FC1 at the size of the original images (0: none), a camera_info of each with
+    Topics: pictures as JPEG, depth as 32FC1 at the size of the original images (NaN
+    where there is none, as REP 118 has it), a camera_info of each with
     pixel centres at integers, and the pose of `camera_optical_frame` in `map` (x forward, y left, z up) as PoseStamped,
     Odometry and TF. Stamps are the frames' own.
 
@@ -97,6 +98,7 @@ def _messages(types: Any, result: Reconstruction, pictures: Pictures, index: int
         )
 
     depth = original_depth(result, index)
+    depth = np.where(depth > 0, depth, np.float32(np.nan))
     height, width = depth.shape
     pose = MAP_FROM_WORLD @ np.asarray(invert(result.extrinsics[index]))
     position, quaternion = pose[:3, 3].tolist(), matrix_to_quaternion(pose[:3, :3]).tolist()

@@ -38,7 +38,7 @@ def export_splats(
       point_filter: which pixels become points; None for 500,000 points.
       progress: show a progress bar.
     """
-    vertices = whole_cloud(result, point_filter or PointFilter(max_points=_NUM_SPLATS), progress=progress)
+    vertices = whole_cloud(result, point_filter or result.filtered(_NUM_SPLATS), progress=progress)
     widths = _widths(result, vertices)
     splats = np.zeros(len(vertices), [(name, "<f4") for name in _PROPERTIES])
     for axis in "xyz":

@@ -47,7 +47,7 @@ def find_tracks(result: Reconstruction, point_filter: PointFilter | None, *, pro
     """
     count = result.num_frames
     with FramePool() as pool:
-        chosen = point_filter or PointFilter(max_points=NUM_POINTS)
+        chosen = point_filter or result.filtered(NUM_POINTS)
         selection = select_points(result, chosen, pool, progress=progress)
         clouds = pool.map(lambda index: frame_cloud(result, selection, index), iter(range(count)))
         vertices = np.concatenate(list(clouds))

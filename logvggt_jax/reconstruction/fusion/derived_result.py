@@ -16,6 +16,7 @@ from logvggt_jax.reconstruction.depth_files import write_depth
 from logvggt_jax.reconstruction.exporters.ply import export_ply
 from logvggt_jax.reconstruction.exporters.tum import export_tum
 from logvggt_jax.reconstruction.frame_pool import FramePool
+from logvggt_jax.reconstruction.health.report import HEALTH_FILE, HEALTH_PAGE
 from logvggt_jax.reconstruction.previews import write_previews
 from logvggt_jax.reconstruction.result import (
     DEPTH_FOLDER,
@@ -48,6 +49,7 @@ def write_derived(
     depth_scales: np.ndarray,
     intrinsics: np.ndarray,
     metric: bool,
+    keeps_health: bool = False,
     overwrite: bool = False,
     progress: bool = True,
 ) -> Reconstruction:
@@ -61,6 +63,7 @@ def write_derived(
       depth_scales: [n], by which the depth is multiplied.
       intrinsics: [n, 3, 3] in pixels of the original images.
       metric: whether lengths are metres.
+      keeps_health: whether its report on the result's health, of which no measure has a unit, holds as it is.
       overwrite: replace an earlier result.
       progress: show a progress bar.
 
@@ -97,11 +100,16 @@ def write_derived(
             source=result.source,
             metric=metric,
             masked=result.masked[list(frames)].tolist() if result.masked.any() else None,
+            point_filter=result.point_filter,
         )
         made = Reconstruction.with_cameras_of(folder)
         # Of the same frames: depths have changed, and so has what their scale says.
         before = [preview_file(result.folder, name) for name in names]
         write_previews(made, [place for place, file in enumerate(before) if file.is_file()], pool)
+        if keeps_health:
+            for name in (HEALTH_FILE, HEALTH_PAGE):
+                if (result.folder / name).is_file():
+                    shutil.copyfile(result.folder / name, folder / name)
         pool.finish()
         export_tum(made, folder / TRAJECTORY_FILE)
         export_ply(made, folder / POINTS_FILE, progress=progress)

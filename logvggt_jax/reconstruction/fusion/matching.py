@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Callable, Sequence
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
@@ -11,6 +11,15 @@ from logvggt_jax.errors import InputError
 from logvggt_jax.reconstruction.exporters.frame_names import file_stems
 from logvggt_jax.reconstruction.fusion.pose_files import ExternalPose
 from logvggt_jax.reconstruction.result import Reconstruction
+from logvggt_jax.reconstruction.sources.listing import stem
+
+# What a picture's path may have given to a frame's name, see `FolderSource`; the exports' names have a suffix more.
+_FORMS: tuple[Callable[[PurePosixPath], str], ...] = (
+    lambda path: "_".join(path.parts),
+    lambda path: path.name,
+    lambda path: path.stem,
+    lambda path: stem(path.name),
+)
 
 
 def match_poses(result: Reconstruction, poses: Sequence[ExternalPose], path: str | Path) -> dict[int, ExternalPose]:
@@ -23,25 +32,7 @@ def match_poses(result: Reconstruction, poses: Sequence[ExternalPose], path: str
       InputError: no pose belongs to any frame; `path` is where they are from.
     """
     if poses[0].name is not None:
-        by_name: dict[str | None, ExternalPose] = {}
-        twice = {pose.name for pose in poses if by_name.setdefault(pose.name, pose) is not pose}
-        stems = file_stems(result.names)
-        if of_two := sorted(name for name in (*result.names, *stems) if name in twice):
-            raise InputError(
-                f"{path}: several of its pictures are named {of_two[0]!r}, as those of several cameras are; keep the "
-                "poses of one camera in it"
-            )
-        found = {
-            index: by_name.get(name, by_name.get(stem))
-            for index, (name, stem) in enumerate(zip(result.names, stems, strict=True))
-        }
-        matched = {index: pose for index, pose in found.items() if pose is not None}
-        if not matched:
-            raise InputError(
-                f"{path}: none of its {len(poses)} pictures ({poses[0].name!r}, …) has the name of one of the "
-                f"{result.num_frames} frames ({result.names[0]!r}, …)"
-            )
-        return matched
+        return _match_names(result, poses, path)
     times, order = result.timestamps, np.argsort(result.timestamps)
     step = float(np.median(np.diff(times[order]))) if len(times) > 1 else 1.0
     given = np.array([pose.timestamp for pose in poses], np.float64)
@@ -58,3 +49,32 @@ def match_poses(result: Reconstruction, poses: Sequence[ExternalPose], path: str
             f"{times.max():g}, to half a step of {step:g}; are they seconds of the same clock?"
         )
     return dict(sorted(nearest.items()))
+
+
+def _match_names(result: Reconstruction, poses: Sequence[ExternalPose], path: str | Path) -> dict[int, ExternalPose]:
+    """By the names of pictures: in the first form in which one is a frame's, or what exports call the frame."""
+    stems = file_stems(result.names)
+    for form in _FORMS:
+        by_name: dict[str, ExternalPose] = {}
+        twice = set()
+        for pose in poses:
+            name = form(PurePosixPath(pose.name or ""))
+            if by_name.setdefault(name, pose) is not pose:
+                twice.add(name)
+        found = {
+            index: by_name.get(name, by_name.get(stem))
+            for index, (name, stem) in enumerate(zip(result.names, stems, strict=True))
+        }
+        matched = {index: pose for index, pose in found.items() if pose is not None}
+        if not matched:
+            continue
+        if of_two := sorted(name for name in (*result.names, *stems) if name in twice):
+            raise InputError(
+                f"{path}: several of its pictures are named {of_two[0]!r}, as those of several cameras are; keep the "
+                "poses of one camera in it"
+            )
+        return matched
+    raise InputError(
+        f"{path}: none of its {len(poses)} pictures ({poses[0].name!r}, …) has the name of one of the "
+        f"{result.num_frames} frames ({result.names[0]!r}, …)"
+    )

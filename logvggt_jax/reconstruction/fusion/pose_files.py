@@ -24,7 +24,7 @@ class ExternalPose(NamedTuple):
     """A camera that another program has found.
 
     Attributes:
-      name: of its picture, without folder and suffix; None where there is a time stamp instead.
+      name: of its picture, with folders and suffix as the file has them; None where there is a time stamp instead.
       timestamp: seconds; None where there is a name instead.
       extrinsics: [4, 4] float64 world-to-camera, OpenCV axes.
       intrinsics: [3, 3] float64 in pixels of its picture, centres at integers; None where they are unknown or the
@@ -86,9 +86,7 @@ def _colmap(folder: Path) -> list[ExternalPose]:
         if image.camera not in cameras:
             raise InputError(f"{file}: {image.name!r} has camera {image.camera}, which is not there: export it again")
         camera = cameras[image.camera]
-        poses.append(
-            ExternalPose(PurePosixPath(image.name).stem, None, image.extrinsics, camera.intrinsics(), camera.size)
-        )
+        poses.append(ExternalPose(image.name, None, image.extrinsics, camera.intrinsics(), camera.size))
     return poses
 
 
@@ -106,7 +104,7 @@ def _nerfstudio(path: Path) -> list[ExternalPose]:
 
 
 def _nerfstudio_frame(document: dict[str, Any], frame: dict[str, Any], path: Path) -> ExternalPose:
-    name = PurePosixPath(frame["file_path"]).stem
+    name = str(PurePosixPath(frame["file_path"]))
     pose = np.array(frame["transform_matrix"], np.float64)
     if pose.shape not in ((3, 4), (4, 4)) or not (np.abs(pose) < _LARGEST).all():
         raise InputError(f"{path}: transform_matrix of {name!r} must be [4, 4] finite numbers, got shape {pose.shape}")

@@ -10,7 +10,8 @@ import numpy as np
 
 from logvggt_jax.data.formats.image import read_depth as read_depth_picture
 from logvggt_jax.errors import InputError, disk_errors
-from logvggt_jax.geometry import camera_centres, unproject_pixels
+from logvggt_jax.files import open_regular
+from logvggt_jax.geometry import camera_centres, points_at
 from logvggt_jax.reconstruction.exporters.frame_names import file_stems
 from logvggt_jax.reconstruction.frame_pool import FramePool
 from logvggt_jax.reconstruction.fusion.derived_result import check_derived, write_derived
@@ -81,6 +82,7 @@ def rescale(
         depth_scales=np.full(result.num_frames, factor),
         intrinsics=result.intrinsics,
         metric=True,
+        keeps_health=True,
         overwrite=overwrite,
         progress=progress,
     )
@@ -100,7 +102,9 @@ def find_frame(result: Reconstruction, text: str) -> int:
 
 
 def _from_distance(ends: np.ndarray, distance: float | None, what: str, notes: list[str]) -> float:
-    if distance is None or not 0 < distance < np.inf:
+    if distance is None:
+        raise InputError(f"how far {what} are apart is not said: give the distance in metres (--distance)")
+    if not 0 < distance < np.inf:
         raise InputError(f"a distance must be above 0 metres, got {distance}")
     found = float(np.linalg.norm(ends[1] - ends[0]))
     if found <= 1e-9 * max(1e-9, float(np.abs(ends).max())):
@@ -125,8 +129,8 @@ def _point(result: Reconstruction, text: str) -> np.ndarray:
     depth = result.depth(index)
     if not (np.isfinite(depth[row, column]) and depth[row, column] > 0):
         raise InputError(f"pixel {text!r} has no depth in the result: choose another")
-    place = np.array([row * columns + column])
-    return unproject_pixels(depth[None], result.depth_intrinsics[[index]], result.extrinsics[[index]], place)[0]
+    here = np.array([[u, v]])
+    return points_at(here, depth[[row], [column]], result.intrinsics[index], result.extrinsics[index])[0]
 
 
 def _from_depth(result: Reconstruction, folder: Path, unit: float, notes: list[str]) -> float:
@@ -135,7 +139,8 @@ def _from_depth(result: Reconstruction, folder: Path, unit: float, notes: list[s
     files = _depth_files(result, folder)
     if not files:
         raise InputError(
-            f"{folder} holds no PNG file whose name begins with that of a frame, such as {result.names[0]}.png"
+            f"{folder} holds no 16-bit grey PNG file whose name begins with that of a frame, such as "
+            f"{result.names[0]}.png"
         )
     with FramePool() as pool:
         found = list(pool.map(lambda item: _ratios(result, *item, unit), iter(files.items())))
@@ -155,7 +160,7 @@ def _from_depth(result: Reconstruction, folder: Path, unit: float, notes: list[s
 
 def _depth_files(result: Reconstruction, folder: Path) -> dict[int, Path]:
     with disk_errors(folder):
-        pictures = sorted(path for path in folder.iterdir() if path.suffix.lower() == ".png")
+        pictures = [path for path in sorted(folder.iterdir()) if path.suffix.lower() == ".png" and _is_deep(path)]
     names: dict[str, int] = {}
     for choices in (file_stems(result.names), result.names):
         names |= {name: index for index, name in enumerate(choices)}
@@ -168,6 +173,13 @@ def _depth_files(result: Reconstruction, folder: Path) -> dict[int, Path]:
         if index is not None:
             found.setdefault(index, path)
     return found
+
+
+def _is_deep(path: Path) -> bool:
+    """Whether a PNG file has 16 bits of grey a pixel, by its header: colour may lie beside depth under one name."""
+    with disk_errors(path), open_regular(path) as stream:
+        header = stream.read(26)
+    return header[24:26] == b"\x10\x00"
 
 
 def _ratios(result: Reconstruction, index: int, path: Path, unit: float) -> float | None:

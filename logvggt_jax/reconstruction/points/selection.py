@@ -59,7 +59,7 @@ class PointSelection:
     """
 
     def __init__(self, point_filter: PointFilter, expected_frames: int | None) -> None:
-        self._filter = point_filter
+        self.point_filter = point_filter
         # Twice what a mean frame will hand out, since frames differ.
         wanted = 2 * (point_filter.max_points or 0) / (1 - point_filter.confidence_percentile / 100)
         self._kept = min(wanted, _MOST_SAMPLES)
@@ -77,7 +77,7 @@ class PointSelection:
           confidence: [H, W].
           image: [H, W, 3] uint8 RGB.
         """
-        candidates = self._filter.candidates(depth, confidence).reshape(-1)
+        candidates = self.point_filter.candidates(depth, confidence).reshape(-1)
         counts = np.bincount(
             stored_confidence(confidence, np.flatnonzero(candidates)).view(np.uint16), minlength=_NUM_BINS
         )
@@ -128,8 +128,8 @@ class PointSelection:
 
     def first(self, frames: int, *, most: int) -> PointSelection:
         """What is chosen of the first frames alone, `most` points at most; of their confidences all are weighed."""
-        limit = most if self._filter.max_points is None else min(most, self._filter.max_points)
-        other = PointSelection(dataclasses.replace(self._filter, max_points=max(limit, 1)), self._frames)
+        limit = most if self.point_filter.max_points is None else min(most, self.point_filter.max_points)
+        other = PointSelection(dataclasses.replace(self.point_filter, max_points=max(limit, 1)), self._frames)
         other._histogram = self._histogram.copy()
         other._samples = {frame: sample for frame, sample in self._samples.items() if frame < frames}
         return other
@@ -138,7 +138,7 @@ class PointSelection:
     def threshold_bin(self) -> int:
         """Points of lower bins are left out; the largest bin that leaves out at most the percentile."""
         below = np.concatenate([[0], np.cumsum(self._histogram)[:-1]])
-        allowed = self._histogram.sum() * self._filter.confidence_percentile / 100
+        allowed = self._histogram.sum() * self.point_filter.confidence_percentile / 100
         return int(np.flatnonzero(below <= allowed)[-1])
 
     @functools.cached_property
@@ -149,7 +149,7 @@ class PointSelection:
     @functools.cached_property
     def num_points(self) -> int:
         """The most points that `choose` hands out over all frames; a few less where frames are too poor for theirs."""
-        limit = self._filter.max_points
+        limit = self.point_filter.max_points
         return self.num_qualified if limit is None else min(self.num_qualified, limit)
 
     @functools.cached_property
@@ -173,7 +173,7 @@ class PointSelection:
             if len(places) == quota or len(sample.places) == sample.candidates:
                 return sample.points.at(places[np.argsort(sample.points.indices[places])])
         depth, confidence, image = read()
-        indices = np.flatnonzero(self._filter.candidates(depth, confidence))
+        indices = np.flatnonzero(self.point_filter.candidates(depth, confidence))
         indices = indices[stored_confidence(confidence, indices).view(np.uint16) >= self.threshold_bin]
         if self.num_points < self.num_qualified:
             qualified = np.zeros(depth.size, bool)

@@ -124,7 +124,8 @@ class Source(abc.ABC):
     @abc.abstractmethod
     def fingerprint(self, count: int) -> str:
         """Digest of what decides the first `count` loaders' frames: options, and names, sizes and times of change of
-        their files. More frames may follow than last time."""
+        their files, and after a blank the library that decodes, where there are several. More frames may follow than
+        last time."""
 
     @abc.abstractmethod
     def loaders(self, first: int = 0) -> Iterator[Callable[[], SourceFrame | None]]:
