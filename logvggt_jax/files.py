@@ -69,9 +69,9 @@ def atomic_file(path: str | Path) -> Iterator[Path]:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Writes a text file whole or not at all; errors as in `atomic_file`."""
+    """Writes a text file as UTF-8, whole or not at all; errors as in `atomic_file`."""
     with atomic_file(path) as temporary:
-        temporary.write_text(text)
+        temporary.write_text(text, "utf-8")
 
 
 @contextmanager

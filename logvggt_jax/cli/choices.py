@@ -6,7 +6,7 @@ from pathlib import Path
 
 def _keys(file: str, registry: str) -> tuple[str, ...]:
     """The keys of the dict `registry` that a file of this package assigns."""
-    for node in ast.parse((Path(__file__).parents[1] / file).read_text()).body:
+    for node in ast.parse((Path(__file__).parents[1] / file).read_text("utf-8")).body:
         if (
             isinstance(node, ast.AnnAssign)
             and isinstance(node.value, ast.Dict)

@@ -101,7 +101,7 @@ def write_cameras(
 def is_complete(path: Path) -> bool:
     """Whether a cameras file is there that does not say that its run was ended early."""
     try:
-        return json.loads(path.read_text()).get("complete", True) is True
+        return json.loads(path.read_text("utf-8")).get("complete", True) is True
     except (OSError, ValueError, AttributeError, RecursionError):
         return False
 

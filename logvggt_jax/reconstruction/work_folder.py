@@ -149,7 +149,7 @@ def _check_ours(path: Path) -> None:
 def _check_request(folder: Path, request: Mapping[str, str], unknown: Collection[str] = ()) -> None:
     file = folder / _PROGRESS / _REQUEST
     try:
-        stored = json.loads(file.read_text())
+        stored = json.loads(file.read_text("utf-8"))
         names = (stored.keys() | request.keys()).difference(unknown)
         others = sorted(name for name in names if stored.get(name) != request.get(name))
     except (ValueError, AttributeError, RecursionError) as error:

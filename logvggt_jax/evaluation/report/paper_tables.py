@@ -44,7 +44,7 @@ class PaperColumn(NamedTuple):
 def paper_results() -> dict[str, Any]:
     """The paper's numbers by table, as printed; None where it says OOM."""
     file = importlib.resources.files("logvggt_jax.evaluation") / "paper_results.json"
-    return json.loads(file.read_text())["tables"]
+    return json.loads(file.read_text("utf-8"))["tables"]
 
 
 def paper_tables(results: Mapping[str, Any]) -> list[Table]:

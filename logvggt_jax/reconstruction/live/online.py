@@ -33,7 +33,7 @@ class OnlineSettings:
         return (
             f"windows of {window.size} frames, {window.stride} of them new; poses are final every "
             f"{self.period or window.stride} frames, from the newest {self.context} frames and {self.max_registers} "
-            "register tokens: time and memory do not grow"
+            "register tokens: time and memory of the device do not grow"
         )
 
 

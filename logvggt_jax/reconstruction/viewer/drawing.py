@@ -67,7 +67,7 @@ def draw_camera(
     return server.scene.add_camera_frustum(
         name,
         fov=2 * float(np.arctan(image_size[0] / 2 / intrinsics[1, 1])),
-        aspect=image_size[1] / image_size[0],
+        aspect=image_size[1] * float(intrinsics[1, 1] / intrinsics[0, 0]) / image_size[0],
         scale=size,
         color=colour,
         **_LINES,
