@@ -9,6 +9,8 @@ which forms sequences can lie on the disk. Batches of 4 clips of 12 frames fit o
 size; on smaller ones lower stages.stage_1.clip_length, or freeze more: --config.optimizer.frozen="('aggregator/*',)".
 """
 
+import dataclasses
+
 from ml_collections import ConfigDict
 
 from configs import h20
@@ -37,6 +39,8 @@ def tuning(model: str) -> ConfigDict:
     if hub_address(model) is None:  # what the hub has is not fetched to be looked at
         path = resolve(model)
         sizes, longer_edge = read_config(path), read_provenance(path).longer_edge or LONGER_EDGE
+        if sizes.encoder.embed_dim >= SMALL:  # a converted VGGT says float32, in which it is stored
+            sizes = dataclasses.replace(sizes, dtype="bfloat16")
     config = h20.get_config()
     config.initial_weights = model
     config.model = sizes.to_dict()

@@ -128,7 +128,8 @@ def counted_compilations() -> Iterator[Compilations]:
 
 def out_of_device_memory(error: jax.errors.JaxRuntimeError) -> bool:
     """Whether this is what the back end raises where a program or an array does not fit the device."""
-    return "RESOURCE_EXHAUSTED" in str(error)
+    # So is a file called that has no room on its disk.
+    return "RESOURCE_EXHAUSTED" in str(error) and "No space left" not in str(error)
 
 
 def device_bytes(device: jax.Device) -> int | None:

@@ -119,6 +119,11 @@ def test_finetuning_takes_sizes_and_pictures_from_the_model_it_starts_from(
     assert own.model == small_config and own.initial_weights == str(tmp_path)
     assert own.stages[0].sizes == ((56, 70), (42, 70), (70, 56), (70, 42))
     assert own.optimizer.learning_rate > vggt.optimizer.learning_rate
+    (tmp_path / "converted").mkdir()
+    known = {"config": ModelConfig().to_dict(), "digests": {}, "provenance": Provenance("vggt", 518).to_dict()}
+    write_description(tmp_path / "converted", known)
+    converted = importlib.import_module("configs.finetune").get_config(str(tmp_path / "converted"))
+    assert TrainConfig.from_dict(converted.to_dict()).model == vggt.model, "stored in float32, trained in bfloat16"
     trained, validated = own.data.sources[0], own.validation.sources[0]
     assert (trained.frames, validated.frames) == ((None, -200), (-200, None)), "what is validated is not trained on"
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from logvggt_jax.config import (
@@ -175,6 +175,7 @@ class DataConfig:
         object.__setattr__(self, "hold_out", tuple(sorted(self.hold_out, key=lambda pair: pair[0])))
         if not self.sources:
             raise InputError("DataConfig.sources is empty: name at least one data set")
+        _require_different(self.sources, "DataConfig.sources")
         require_within(self, "[0, 1]", "reverse")
         require_within(self, "[0, inf)", "worker_count", "num_threads")
         require_within(self, "[0, 1)", "min_valid_depth", "max_broken")
@@ -200,6 +201,7 @@ class ValidationConfig:
         freeze_lists(self)
         if not self.sources:
             raise InputError("ValidationConfig.sources is empty: name at least one data set, or set validation to None")
+        _require_different(self.sources, "ValidationConfig.sources")
         if self.best is not None:
             require_one_of(self, tuple(VALIDATION_METRICS), "best")
         require_counts(self, "every", "num_clips", "clip_length", "stride")
@@ -313,6 +315,14 @@ class TrainConfig:
         if isinstance(stages, Mapping) and list(stages) == sorted(stages):
             values = {**values, "stages": {name: stages[name] for name in sorted(stages, key=_numbers_by_value)}}
         return from_mapping(cls, values, "config")
+
+
+def _require_different(sources: Sequence[SourceConfig], field: str) -> None:
+    """Raises InputError where a data set stands twice: its sequences have one set of names, and it one stride."""
+    names = [source.name for source in sources]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"{field}: {name} is named twice; one folder of it may hold several sequences")
 
 
 def _numbers_by_value(name: str) -> list[tuple[int, str]]:

@@ -15,16 +15,11 @@ def with_sources(settings: Mapping[str, Any], trained: Sequence[str], validated:
     """The settings of a run with other sources, as `parse_source` reads them, to train and to validate on.
 
     No texts, or None, leave what is there; with `none` in the place of the latter the run has no validation. Raises
-    InputError as `parse_source`, for a data set that is named twice, and for a run without validation.
+    InputError as `parse_source`, and for a run without validation.
     """
     changed = dict(settings)
     if trained:
-        sources = [parse_source(text) for text in trained]
-        names = [source["name"] for source in sources]
-        for name in names:
-            if names.count(name) > 1:
-                raise InputError(f"--source: {name} is named twice; one folder of it may hold several sequences")
-        changed["data"] = {**settings["data"], "sources": sources}
+        changed["data"] = {**settings["data"], "sources": [parse_source(text) for text in trained]}
     if validated == _NOTHING:
         changed["validation"] = None
     elif validated is not None:

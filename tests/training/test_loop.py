@@ -367,6 +367,27 @@ def test_a_trace_of_some_steps_is_written(run_config: TrainConfig, tmp_path: Pat
         ProfiledSteps.parse("4:3")
 
 
+@pytest.mark.parametrize("failing", ["start_trace", "stop_trace"])
+def test_a_trace_that_cannot_be_written_ends_no_run(
+    run_config: TrainConfig,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    failing: str,
+) -> None:
+    def full(*_: object) -> None:
+        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: profile/vm.xplane.pb; No space left on device")
+
+    with monkeypatch.context() as patch:
+        stop = jax.profiler.stop_trace
+        patch.setattr(jax.profiler, failing, full)
+        train(run_config, tmp_path, mesh=data_mesh(1), profile=ProfiledSteps.parse("3:4"))
+    if failing == "stop_trace":
+        stop()
+    assert "No space left on device" in caplog.text
+    assert read_metrics(tmp_path / "metrics.jsonl")[-1]["step"] == run_config.total_steps
+
+
 def test_the_data_are_looked_for_before_the_weights_are_read(
     run_config: TrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -46,7 +46,7 @@ def test_sources_take_the_place_of_the_configurations(run_config: TrainConfig) -
     assert changed.validation is not None and changed.validation.sources == (SourceConfig("tum", "/c", "all"),)
     assert with_sources(settings, [], None) == settings
     assert TrainConfig.from_dict(with_sources(settings, ["colmap=/b"], "none")).validation is None
-    with pytest.raises(InputError, match="colmap is named twice"):
-        with_sources(settings, ["colmap=/a", "colmap=/b"], None)
+    with pytest.raises(InputError, match=r"config\.data\.sources: colmap is named twice"):
+        TrainConfig.from_dict(with_sources(settings, ["colmap=/a", "colmap=/b"], None))
     with pytest.raises(InputError, match="validates nothing"):
         with_sources(run_config.to_dict(), [], "colmap=/a")

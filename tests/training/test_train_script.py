@@ -102,3 +102,18 @@ def test_an_argument_that_is_no_flag_is_one_line(run_train: Callable, tmp_path: 
     assert finished.returncode == 1
     expected = "train.py: unknown argument 'configs/h20.py'; settings are given as --config.NAME=VALUE\n"
     assert finished.stderr == expected
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--num_processes=2", "--process_id=0"], "--num_processes is of runs of several processes: add --distributed"),
+        (["--workdir="], "--workdir is empty: name a folder"),
+    ],
+)
+def test_flags_that_would_do_something_else_are_refused(
+    programs: RootPrograms, tmp_path: Path, arguments: list[str], said: str
+) -> None:
+    finished = programs("train.py", "--config=configs/tiny.py", f"--workdir={tmp_path / 'run'}", *arguments)
+    assert finished.returncode == 1 and finished.stderr.startswith(f"train.py: {said}")
+    assert finished.stderr.count("\n") == 1 and not (tmp_path / "run").exists()

@@ -35,7 +35,7 @@ def join_processes(
     process ends with a line that says so.
 
     Returns what watches the others, and ends this process with one line when one of them is lost; None where there are
-    no others, or (with a warning) where process 0 cannot be reached by a port of its choice.
+    no others, or (with a warning) where this process cannot reach process 0 by a port of its choice.
 
     Raises InputError where some of the three are missing or have another form, or the cluster does not know them.
     """
@@ -86,6 +86,13 @@ def _lifeline() -> Lifeline | None:
             with lifeline.listen() as server:
                 global_state.client.key_value_set(_LIFELINE_KEY, f"{server.getsockname()[1]} {secret}")
                 peers = lifeline.accept(server, secret, count)
+            if absent := sorted({*range(1, count)} - {*peers}):
+                logging.warning(
+                    "processes %s cannot reach a port that process 0 has chosen: the loss of one of these is noticed "
+                    "after %d s",
+                    ", ".join(map(str, absent)),
+                    HEARTBEAT_SECONDS,
+                )
         else:
             milliseconds = 1000 * lifeline.CONNECT_SECONDS
             port, secret = global_state.client.blocking_key_value_get(_LIFELINE_KEY, milliseconds).split()

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import jax
+from absl import logging
 
-from logvggt_jax.errors import InputError
+from logvggt_jax.errors import InputError, one_line
 
 
 class ProfiledSteps(NamedTuple):
@@ -37,13 +40,14 @@ class Profiler:
 
     def __exit__(self, *_: object) -> None:
         if self._running:
-            jax.profiler.stop_trace()
+            self.stop()
 
     def before(self, step: int) -> None:
         """Begins the trace with its first step, or with the first that is left where a run goes on among them."""
         if self._steps is not None and not self._running and self._steps.first <= step <= self._steps.last:
-            jax.profiler.start_trace(self._folder)
-            self._running = True
+            with self._forgiven():
+                jax.profiler.start_trace(self._folder)
+                self._running = True
 
     def is_last(self, step: int) -> bool:
         """Whether the trace is to end with this step, once it has finished."""
@@ -51,5 +55,15 @@ class Profiler:
 
     def stop(self) -> None:
         """Ends the trace."""
-        jax.profiler.stop_trace()
+        with self._forgiven():
+            jax.profiler.stop_trace()
         self._running, self._steps = False, None
+
+    @contextlib.contextmanager
+    def _forgiven(self) -> Iterator[None]:
+        """A trace that cannot be written is no reason to end a run."""
+        try:
+            yield
+        except (OSError, RuntimeError) as error:  # the profiler's own are RuntimeErrors
+            logging.warning("no trace in %s: %s", self._folder, one_line(error))
+            self._steps = None

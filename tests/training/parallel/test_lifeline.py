@@ -34,6 +34,20 @@ def three() -> Iterator[tuple[dict[int, Lifeline], dict[int, socket.socket], Hea
         line.close()
 
 
+def test_who_cannot_reach_the_port_costs_the_others_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("logvggt_jax.training.parallel.lifeline.CONNECT_SECONDS", 0.5)
+    heard: queue.Queue[str] = queue.Queue()
+    with listen() as server:
+        peer = connect("localhost", server.getsockname()[1], "secret", 1)
+        accepted = accept(server, "secret", 3)
+    assert accepted.keys() == {1}
+    lines = [Lifeline(accepted, process=0, on_loss=heard.put), Lifeline(peer, process=1, on_loss=heard.put)]
+    lines[1].fail("a bug")
+    assert heard.get(timeout=10) == f"process 1 on {platform.node()} was lost, it ended with: a bug"
+    for line in lines:
+        line.close()
+
+
 def test_the_loss_of_one_is_told_to_all_the_others(three) -> None:  # type: ignore[no-untyped-def]
     _, connections, heard = three
     connections[1].shutdown(socket.SHUT_RDWR)
