@@ -121,7 +121,8 @@ def check_longer_edge(longer_edge: int, what: str = "longer_edge", *, least: int
 
 
 def freeze_lists(config: Any) -> None:
-    """Turns lists among the fields of a frozen dataclass into tuples, so that it hashes; for `__post_init__`."""
+    """Turns lists and numpy's values among the fields of a frozen dataclass into tuples and numbers of Python, so that
+    it hashes and can be written as JSON; for `__post_init__`."""
     for field in dataclasses.fields(config):
         object.__setattr__(config, field.name, _frozen(getattr(config, field.name)))
 
@@ -210,6 +211,8 @@ def _joined(path: str, name: str) -> str:
 
 
 def _frozen(value: Any) -> Any:
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
     return tuple(_frozen(item) for item in value) if isinstance(value, list | tuple) else value
 
 
@@ -245,6 +248,7 @@ class EncoderConfig:
     frozen: bool = True
 
     def __post_init__(self) -> None:
+        freeze_lists(self)
         require_counts(self, "embed_dim", "depth", "num_heads", "mlp_ratio", "num_registers", "position_grid")
         require_one_of(self, (PATCH,), "patch_size")  # images are prepared for no other
         _divides(self, self.embed_dim, self.num_heads, 1, "one slice of channels a head")
@@ -336,6 +340,7 @@ class WindowConfig:
     cache: str = "output"
 
     def __post_init__(self) -> None:
+        freeze_lists(self)
         require_counts(self, "size", "stride")
         if not self.stride < self.size:
             raise InputError(
@@ -364,6 +369,7 @@ class RefinementConfig:
     num_heads: int = 16
 
     def __post_init__(self) -> None:
+        freeze_lists(self)
         require_counts(self, "period", "context", "max_registers", "num_heads")
 
 

@@ -201,6 +201,17 @@ def test_lists_become_tuples_so_that_configurations_hash() -> None:
     assert listed == ModelConfig() and hash(listed) == hash(ModelConfig())
 
 
+def test_numpys_values_become_pythons() -> None:
+    found = ModelConfig(
+        encoder=EncoderConfig(embed_dim=np.int64(1024)),  # type: ignore[arg-type]
+        aggregator=AggregatorConfig(key_layers=np.array([4, 11, 17, 23])),  # type: ignore[arg-type]
+        windows=WindowConfig(size=np.int32(4)),  # type: ignore[arg-type]
+        refinement=RefinementConfig(period=np.int64(2)),  # type: ignore[arg-type]
+    )
+    assert found == dataclasses.replace(ModelConfig(), refinement=RefinementConfig(period=2))
+    assert hash(found) is not None and json.loads(json.dumps(found.to_dict())) == found.to_dict()
+
+
 def test_a_point_head_survives_the_round_trip() -> None:
     config = dataclasses.replace(ModelConfig(), point_head=DPTConfig(features=64))
     assert ModelConfig.from_dict(config.to_dict()) == config

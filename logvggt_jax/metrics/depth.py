@@ -51,6 +51,7 @@ def depth_metrics(
             f"depth_metrics: prediction {prediction.shape} and target {target.shape} must agree; "
             "resize the prediction with resize_depth"
         )
+    mask = None if mask is None else np.asarray(mask)
     if mask is not None and (mask.shape != target.shape or mask.dtype != np.bool_):
         raise ValueError(f"depth_metrics: mask must be bool of shape {target.shape}, got {mask.dtype} {mask.shape}")
     valid = valid_depth(target, max_depth)

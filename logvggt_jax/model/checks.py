@@ -13,6 +13,8 @@ _SLACK = 1e-2
 
 def check_array(name: str, array: jax.Array, shape: tuple[int | None, ...], kind: Any) -> None:
     """Raises ValueError unless an array has this shape (None: any size) and its dtype is of this kind."""
+    if not hasattr(array, "shape"):
+        raise ValueError(f"{name} must be an array, got {type(array).__name__}")
     found = tuple(array.shape)
     fits = len(found) == len(shape) and all(a in (b, None) for a, b in zip(shape, found, strict=True))
     if not fits or not jnp.issubdtype(array.dtype, kind):
@@ -43,7 +45,8 @@ def check_pixels(images: Any, patch_size: int, name: str) -> None:
     if images.dtype != jnp.uint8 and not jnp.issubdtype(images.dtype, jnp.floating):
         raise ValueError(f"{name} must be uint8 or floating point in [0, 1], got dtype {images.dtype}")
     if images.dtype != jnp.uint8 and not isinstance(images, jax.core.Tracer | jax.ShapeDtypeStruct):
-        low, high = float(images.min()), float(images.max())
+        with jax.ensure_compile_time_eval():  # also where a function that is traced closes over them
+            low, high = float(images.min()), float(images.max())
         if not (low >= -_SLACK and high <= 1 + _SLACK):  # NaN as well
             raise ValueError(
                 f"{name} must be floating point in [0, 1], got values from {low:g} to {high:g}; divide those of 0 to "

@@ -16,12 +16,13 @@ def splits_as_its_batch(method: Method) -> Method:
     """Lets a method of (self, variables, arrays …) run over meshes of `AxisType.Explicit`.
 
     Where an array is split explicitly, the compiler partitions what happens inside, and results are split along their
-    first axis as that array is. The model itself does not know how it is split.
+    first axis as the batch is: the arrays after the variables, however those are split. The model itself does not know
+    how it is split.
     """
 
     @functools.wraps(method)
     def call(self: Any, *arrays: Any, **options: Any) -> Any:
-        sharding = _explicit_batch((arrays, options))
+        sharding = _explicit_batch((arrays[1:], options)) or _whole(arrays[:1])
         if sharding is None:
             return method(self, *arrays, **options)
         named = {name: value for name, value in options.items() if hasattr(value, "dtype")}
@@ -41,4 +42,13 @@ def _explicit_batch(tree: Any) -> NamedSharding | None:
         sharding = jax.typeof(leaf).sharding if isinstance(leaf, jax.Array) else None
         if sharding is not None and sharding.mesh.explicit_axes and sharding.spec and sharding.spec[0] is not None:
             return NamedSharding(sharding.mesh, PartitionSpec(sharding.spec[0]))
+    return None
+
+
+def _whole(tree: Any) -> NamedSharding | None:
+    """Results that are not split, on the mesh of the first array that is split explicitly; None where none is."""
+    for leaf in jax.tree.leaves(tree):
+        sharding = jax.typeof(leaf).sharding if isinstance(leaf, jax.Array) else None
+        if sharding is not None and sharding.mesh.explicit_axes and any(part is not None for part in sharding.spec):
+            return NamedSharding(sharding.mesh, PartitionSpec())
     return None

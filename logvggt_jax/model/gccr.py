@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from logvggt_jax.model.attention import attention
+from logvggt_jax.model.initializers import constant
 from logvggt_jax.model.layers import dense, layer_norm, sums_of
 
 
@@ -43,7 +44,7 @@ class GCCR(nn.Module):
         self.query = dense(self.width, "query", self.dtype, sums=sums_of(self.dtype))
         self.key = dense(self.width, "key", self.dtype, sums=sums_of(self.dtype))
         self.value = dense(self.width, "value", self.dtype, sums=sums_of(self.dtype))
-        self.output = dense(self.width, "output", self.dtype, kernel_init=nn.initializers.zeros_init())
+        self.output = dense(self.width, "output", self.dtype, kernel_init=constant(0.0))
 
     def __call__(self, camera_tokens: jax.Array, register_tokens: jax.Array, frames: jax.Array) -> jax.Array:
         """[B, N, 2C], [B, M, 4, 2C] and the frames whose registers count -> [B, N, 2C]; see `attend`."""

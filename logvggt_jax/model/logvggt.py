@@ -188,7 +188,11 @@ class LogVGGT:
 
     @splits_as_its_batch
     def finish(self, variables: Variables, state: WindowState) -> WindowOutput:
-        """The K − s frames that the last window still holds."""
+        """The K − s frames that the last window still holds.
+
+        Before the first `step` no frame has met another, and `frame_mask` of the result is False throughout: a sequence
+        of at most K − s frames takes one `step` whose frames are all masked.
+        """
         return self.windows.finish(variables, state)
 
     @splits_as_its_batch

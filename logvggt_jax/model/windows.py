@@ -170,9 +170,10 @@ class Windows:
         return state, out
 
     def finish(self, variables: Variables, state: WindowState) -> WindowOutput:
-        """The K − s frames that the last window still holds."""
+        """The K − s frames that the last window still holds; where there was no window yet, none of them counts."""
         held = WindowTokens(state.key_tokens, state.special_tokens)
-        return self.decode_dense(variables, held, state.frame_mask, state.image_size, state.masks)
+        frame_mask = state.frame_mask & (state.step > 0)[:, None]
+        return self.decode_dense(variables, held, frame_mask, state.image_size, state.masks)
 
     # A whole sequence.
 

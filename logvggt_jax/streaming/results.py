@@ -112,7 +112,7 @@ def decoded_cameras(encodings: np.ndarray, image_size: tuple[int, int], *, final
     # A field of view of zero, which untrained models predict, is an infinite focal length.
     with np.errstate(divide="ignore"):
         extrinsics, intrinsics = decode_poses(encodings, image_size)
-    return Cameras(encodings, extrinsics, intrinsics, np.arange(len(encodings)) < final)
+    return Cameras(encodings.copy(), extrinsics, intrinsics, np.arange(len(encodings)) < final)
 
 
 def checked_frames(
@@ -128,7 +128,8 @@ def checked_frames(
     Raises:
       ValueError: another shape or dtype.
     """
-    frames = np.asarray(frames)
+    # A copy: a stream keeps frames until their window is full, and whoever reads a camera may use one buffer for all.
+    frames = np.array(frames)
     frames = frames[None] if frames.ndim == 3 else frames
     shape = frames.shape
     if len(shape) != 4 or shape[-1] != 3 or 0 in shape:
@@ -172,7 +173,7 @@ def checked_masks(
             f"masks must be bool {list(size)} or {list(size[1:])} for these frames, got {masks.dtype} "
             f"{list(masks.shape)}"
         )
-    return np.broadcast_to(masks, size)
+    return np.array(np.broadcast_to(masks, size))
 
 
 def refuse_masks(masks: object, instead: str) -> None:

@@ -16,8 +16,10 @@ class Rows:
 
     @property
     def array(self) -> np.ndarray:
-        """All rows; a view that later rows do not change."""
-        return self._buffer[: self._count]
+        """All rows; a view to read, which later rows do not change."""
+        rows = self._buffer[: self._count]
+        rows.flags.writeable = False
+        return rows
 
     def append(self, rows: np.ndarray) -> None:
         """Adds rows [n, ...]."""

@@ -22,3 +22,27 @@ def test_a_batch_over_explicit_axes_gives_its_numbers_split_as_it_was(
     found, expected = start(everywhere, split, frame_mask=mask), start(small_variables, images, frame_mask=mask)
     assert found.patch_tokens.sharding.spec[0] == "data" and len(found.patch_tokens.sharding.device_set) == 2
     np.testing.assert_allclose(found.patch_tokens, expected.patch_tokens, rtol=1e-5, atol=1e-5)
+
+
+def test_parameters_that_are_split_are_not_taken_for_the_batch(
+    small_config: ModelConfig, small_variables: dict
+) -> None:
+    model = LogVGGT(small_config)
+    mesh = jax.make_mesh((2, 2), ("data", "parts"), axis_types=(AxisType.Explicit, AxisType.Explicit))
+
+    def split(leaf: np.ndarray) -> jax.Array:
+        kernel = leaf.ndim == 2 and leaf.shape[0] % 2 == 0
+        return jax.device_put(leaf, NamedSharding(mesh, P("parts") if kernel else P()))
+
+    parts = jax.tree.map(split, small_variables)
+    frames, width = 4, 2 * small_config.encoder.embed_dim
+    generator = np.random.default_rng(0)
+    for batch, spec in ((2, P("data")), (1, P())):
+        tokens = generator.standard_normal((batch, frames, 5, width)).astype(np.float32)
+        given = [jax.device_put(array, NamedSharding(mesh, spec)) for array in (tokens[:, :, 0], tokens[:, :, 1:])]
+        mask = jax.device_put(np.ones((batch, frames), bool), NamedSharding(mesh, spec))
+        found = jax.jit(model.refine)(parts, *given, mask, mask)
+        assert tuple(found.sharding.spec)[:1] in (tuple(spec), (None,))
+        everyone = np.ones((batch, frames), bool)
+        expected = model.refine(small_variables, tokens[:, :, 0], tokens[:, :, 1:], everyone, everyone)
+        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)

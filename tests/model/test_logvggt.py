@@ -225,3 +225,9 @@ def test_configuration_survives_json(small_config):
     listed["aggregator"]["key_layer"] = 3
     with pytest.raises(ValueError, match=r"unknown field model.aggregator.key_layer; .* key_layers"):
         ModelConfig.from_dict(listed)
+
+
+def test_parameters_are_float32_where_jax_counts_in_64_bits(small_config):
+    with jax.enable_x64(True):
+        drawn = jax.eval_shape(lambda: LogVGGT(small_config).init(jax.random.key(0), video(1)))
+    assert {leaf.dtype for leaf in jax.tree.leaves(drawn)} == {jnp.dtype("float32")}

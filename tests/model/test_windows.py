@@ -251,6 +251,7 @@ def test_donated_state_holds_no_buffer_twice(small_config, small_variables):
         (np.zeros((1, 0, 28, 42, 3), np.float32), None, "T >= 1"),
         (np.zeros((1, 2, 28, 42, 3), np.float32), np.ones((1, 3), bool), "frame_mask"),
         (np.zeros((1, 2, 28, 42, 3), np.float32), np.ones((1, 2)), "frame_mask"),
+        (np.zeros((1, 2, 28, 42, 3), np.float32), [[True, True]], "frame_mask must be an array, got list"),
     ],
 )
 def test_wrong_input_is_named(small_config, small_variables, images, mask, message):
@@ -273,3 +274,24 @@ def test_step_names_what_it_takes(small_config, small_variables, frames, message
     with pytest.raises(ValueError, match=message) as error:
         jax.eval_shape(model.step, small_variables, state, frames)
     assert "\n" not in str(error.value)
+
+
+def test_a_traced_function_may_close_over_images_of_floating_point(small_config, small_variables):
+    """Their values are looked at as they are outside; only what is traced itself has none."""
+    model = LogVGGT(small_config)
+    images = jnp.asarray(video(2), jnp.float32)
+    start = jax.eval_shape(lambda variables: model.start(variables, images), small_variables)
+    assert start.patch_tokens.shape[:2] == (1, 2)
+    grey_levels = 2 + images
+    with pytest.raises(ValueError, match=r"must be floating point in \[0, 1\], got values from"):
+        jax.eval_shape(lambda variables: model.start(variables, grey_levels), small_variables)
+
+
+def test_before_the_first_window_no_frame_counts(small_config, small_variables):
+    model = LogVGGT(small_config)
+    start, step, finish = jitted(model)
+    images = video(4)
+    state = start(small_variables, images[:, :2])
+    assert not finish(small_variables, state).frame_mask.any()
+    state, _ = step(small_variables, state, images[:, 2:], np.ones((1, 2), bool))
+    assert finish(small_variables, state).frame_mask.all()

@@ -10,7 +10,7 @@ import pytest
 
 from logvggt_jax import LogVGGT, ModelConfig, Predictions, RefinementConfig, WindowConfig
 from logvggt_jax.errors import InputError
-from logvggt_jax.streaming import LoopSettings, pose_stream
+from logvggt_jax.streaming import METHODS, LoopSettings, open_predictor, pose_stream
 from logvggt_jax.streaming import windows as session_module
 from logvggt_jax.streaming.loops import LoopCloser
 from logvggt_jax.streaming.results import Cameras
@@ -352,3 +352,37 @@ def test_options_by_name_take_the_place_of_settings(small_config: ModelConfig, s
     assert by_name._settings == WindowSettings(provisional=True, ahead=0, first_capacity=4)
     with pytest.raises(TypeError, match="unknown"):
         StreamSession(model, small_variables, unknown=1)
+
+
+@pytest.mark.parametrize("method", ["windows", "offline", "chunks", "causal"])
+def test_whoever_pushes_frames_may_use_one_buffer_for_all(
+    small_config: ModelConfig, small_variables: dict, frames: np.ndarray, method: str
+) -> None:
+    expected, found = (
+        open_predictor(method, with_modes(small_config), small_variables, METHODS[method].settings()) for _ in range(2)
+    )
+    buffer, results, wanted = np.empty_like(frames[0]), [], []
+    for frame in frames[:6]:
+        buffer[...] = frame
+        results += found.push(buffer)
+        wanted += expected.push(frame.copy())
+    buffer[...] = 0
+    results += found.close()
+    wanted += expected.close()
+    assert len(results) == len(wanted) == 6
+    for result, other in zip(results, wanted, strict=True):
+        np.testing.assert_array_equal(result.depth, other.depth)
+
+
+def test_what_is_done_to_results_does_nothing_to_the_stream(
+    small_config: ModelConfig, small_variables: dict, frames: np.ndarray
+) -> None:
+    session = StreamSession(with_modes(small_config, period=2), small_variables, ahead=0)
+    for result in (result for frame in frames[:8] for result in session.push(frame)):
+        if result.pose_encoding is not None:
+            with pytest.raises(ValueError, match="read-only"):
+                result.pose_encoding[:3] *= 100
+    before = session.cameras()
+    kept = before.pose_encoding.copy()
+    before.pose_encoding[:, :3] *= 100
+    np.testing.assert_array_equal(session.cameras().pose_encoding, kept)
