@@ -17,7 +17,7 @@ import jax.monitoring
 import jax.numpy as jnp
 
 from logvggt_jax.errors import InputError, install_line, one_line
-from logvggt_jax.files import user_cache_folder
+from logvggt_jax.files import user_cache_folder, user_path
 
 # What JAX reports for every program it makes.
 _COMPILATION = "/jax/core/compile/backend_compile_duration"
@@ -155,11 +155,18 @@ def default_cache_folder() -> Path:
 def enable_compilation_cache(folder: str | None = None) -> Path | None:
     """Turns JAX's persistent compilation cache on in `folder`, which it returns; `none` leaves it off and gives None.
 
-    The default is JAX's own `JAX_COMPILATION_CACHE_DIR` if set, else `default_cache_folder`.
+    The default is JAX's own `JAX_COMPILATION_CACHE_DIR` if set, else `default_cache_folder`, or none for a user without
+    a home. Raises InputError where a file has the folder's name.
     """
-    if folder == "none":
+    folder = folder or os.environ.get("JAX_COMPILATION_CACHE_DIR")
+    if folder is None:
+        with contextlib.suppress(InputError):
+            folder = str(default_cache_folder())
+    if folder in (None, "none"):
         jax.config.update("jax_enable_compilation_cache", False)
         return None
-    chosen = Path(folder or os.environ.get("JAX_COMPILATION_CACHE_DIR") or default_cache_folder()).expanduser()
+    chosen = user_path(folder)
+    if chosen.exists() and not chosen.is_dir():
+        raise InputError(f"{chosen} is no folder: give another --compilation_cache, or `none`")
     jax.config.update("jax_compilation_cache_dir", str(chosen))
     return chosen

@@ -16,6 +16,8 @@ from filelock import FileLock, Timeout
 
 from logvggt_jax.errors import DiskError, InputError, OutputExists, disk_errors, one_line
 
+EMPTY_PATH = "the path is empty (a variable without a value?)"
+
 
 @contextmanager
 def open_regular(path: str | Path) -> Iterator[BinaryIO]:
@@ -59,7 +61,8 @@ def atomic_file(path: str | Path) -> Iterator[Path]:
     MissingInput where the file cannot be written, whatever the operating system's reason.
     """
     path = Path(path)
-    temporary = path.with_name(f".{path.stem}.{_unique()}{path.suffix}")
+    # Not longer for long names, which a file system bounds.
+    temporary = path.with_name(f".{_unique()}{path.suffix}")
     with disk_errors(path):
         try:
             yield temporary
@@ -97,6 +100,20 @@ def atomic_folder(path: str | Path, *, replace: bool = False) -> Iterator[Path]:
         shutil.rmtree(partial, ignore_errors=True)
 
 
+def user_path(path: str | Path, *, resolved: bool = False) -> Path:
+    """A path as somebody has written it, `~` expanded; absolute and without links where it is to be `resolved`.
+
+    Raises InputError where it is empty, names the home of nobody, or goes through a link that leads to itself.
+    """
+    if not str(path).strip():
+        raise InputError(EMPTY_PATH)
+    try:
+        found = Path(path).expanduser()
+        return found.resolve() if resolved else found
+    except RuntimeError as error:
+        raise InputError(f"{path}: {one_line(error)}") from error
+
+
 def check_output(output: str | Path, *, overwrite: bool, marker: str, in_place: bool = False) -> Path:
     """The absolute path of `output`, provided that a result may be written there; OutputExists otherwise.
 
@@ -105,10 +122,7 @@ def check_output(output: str | Path, *, overwrite: bool, marker: str, in_place: 
     other folder. Unless what is written goes `in_place`, into the folder itself, a new folder takes its place at the
     end, which the top of a volume gives up for nobody.
     """
-    try:
-        output = Path(output).expanduser().resolve()
-    except RuntimeError as error:  # a link that leads to itself, the home of nobody
-        raise InputError(f"{output}: {error}") from error
+    output = user_path(output, resolved=True)
     with disk_errors(output):
         if output.is_mount() and not in_place:
             raise OutputExists(f"{output} is the top of a volume, which nothing can replace: choose a folder in it")
@@ -197,8 +211,15 @@ def to_disk(paths: Iterable[Path]) -> None:
 
 
 def user_cache_folder(kind: str) -> Path:
-    """`logvggt/<kind>` in the user's cache folder (`XDG_CACHE_HOME`, else `~/.cache`); not created here."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "logvggt" / kind
+    """`logvggt/<kind>` in the user's cache folder (`XDG_CACHE_HOME`, else `~/.cache`); not created here.
+
+    Raises InputError for a user without a home.
+    """
+    try:
+        caches = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
+    except RuntimeError as error:
+        raise InputError(f"there is no home for what is kept between runs ({error}): set XDG_CACHE_HOME") from error
+    return caches / "logvggt" / kind
 
 
 def _unique() -> str:

@@ -399,3 +399,33 @@ def test_view_saves_a_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert main(["view", str(tmp_path / "result"), "--save", page]) == 2
     assert "page.html exists: choose another name or pass --overwrite" in capsys.readouterr().err
     assert main(["view", str(tmp_path / "result"), "--save", page, "--overwrite"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["reconstruct", "walk", "--output", "", "--checkpoint", "rooms"], "argument --output: the path is empty"),
+        (["export", "", "--format", "ply"], "argument result: the path is empty"),
+        (["reconstruct", "1.jpg", "2.jpg", "--output", "o", "--checkpoint", "rooms"], r"put a pattern in quotes"),
+        (
+            ["reconstruct", "1.jpg", "3.jpg", "--output", "o", "--checkpoint", "rooms"],
+            "unrecognized arguments: 3.jpg\n",
+        ),
+    ],
+)
+def test_slips_of_the_shell_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, arguments: list[str], said: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("1.jpg", "2.jpg"):
+        (tmp_path / name).touch()
+    with pytest.raises(SystemExit) as caught:
+        main(arguments)
+    assert caught.value.code == 2 and said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("given", ["", "~nobody-of-this-name/model"])
+def test_a_checkpoint_that_is_no_path_is_one_line(given: str, capsys: pytest.CaptureFixture) -> None:
+    assert main(["info", given]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("logvggt: error: ") and error.count("\n") == 1

@@ -91,3 +91,23 @@ def test_entry_points_say_that_devices_do_not_start(arguments: list[str], tmp_pa
     assert "JAX_PLATFORMS=rocm" in done.stderr
     assert "Traceback" not in done.stderr
     assert not (tmp_path / "out").exists()
+
+
+def test_a_user_without_a_home_has_no_cache(monkeypatch: pytest.MonkeyPatch) -> None:
+    def nobody(self: Path) -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    for name in ("XDG_CACHE_HOME", "JAX_COMPILATION_CACHE_DIR"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(Path, "expanduser", nobody)
+    before = jax.config.jax_enable_compilation_cache
+    try:
+        assert module.enable_compilation_cache() is None
+    finally:
+        jax.config.update("jax_enable_compilation_cache", before)
+
+
+def test_a_cache_that_is_a_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "cache").touch()
+    with pytest.raises(InputError, match=r"cache is no folder: give another --compilation_cache"):
+        module.enable_compilation_cache(str(tmp_path / "cache"))

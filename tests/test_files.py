@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from logvggt_jax.errors import DiskError, InputError, MissingInput, OutputExists, one_line, printable
-from logvggt_jax.files import atomic_file, atomic_folder, check_output, open_regular, write_text
+from logvggt_jax.files import atomic_file, atomic_folder, check_output, open_regular, user_path, write_text
 
 
 def names(folder: Path) -> list[str]:
@@ -164,3 +164,20 @@ def test_of_two_runs_the_second_to_end_leaves_the_first_result(tmp_path: Path) -
         with atomic_folder(target) as first:
             (first / "done").write_text("first")
     assert (target / "done").read_text() == "first" and names(tmp_path) == ["out"]
+
+
+def test_a_name_of_the_longest_kind_can_be_written(tmp_path: Path) -> None:
+    write_text(tmp_path / f"{'n' * 251}.txt", "whole")
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["whole"]
+
+
+@pytest.mark.parametrize("resolved", [False, True])
+def test_paths_that_are_none_are_one_line(tmp_path: Path, resolved: bool) -> None:
+    with pytest.raises(InputError, match="the path is empty"):
+        user_path(" ", resolved=resolved)
+    with pytest.raises(InputError, match=r"~nobody-of-this-name/x: .*home directory"):
+        user_path("~nobody-of-this-name/x", resolved=resolved)
+    (tmp_path / "loop").symlink_to("loop")
+    if resolved:
+        with pytest.raises(InputError, match="loop"):
+            user_path(tmp_path / "loop", resolved=True)

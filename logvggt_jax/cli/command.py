@@ -7,6 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from logvggt_jax.files import EMPTY_PATH
+
 if TYPE_CHECKING:
     from logvggt_jax.model.logvggt import LogVGGT, Variables
 
@@ -45,9 +47,16 @@ def add_command(
     return added
 
 
+def given_path(text: str) -> Path:
+    """For `type` of an option; an empty text would mean the current folder."""
+    if not text.strip():
+        raise argparse.ArgumentTypeError(EMPTY_PATH)
+    return Path(text)
+
+
 def output_option(parser: argparse.ArgumentParser) -> None:
     """Adds the folder that a command makes."""
-    parser.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder to make")
+    parser.add_argument("--output", type=given_path, required=True, metavar="DIR", help="folder to make")
 
 
 def overwrite_option(parser: argparse.ArgumentParser, what: str) -> None:

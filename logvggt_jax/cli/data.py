@@ -5,10 +5,9 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
-from pathlib import Path
 from typing import Any
 
-from logvggt_jax.cli.command import add_command, output_option, overwrite_option
+from logvggt_jax.cli.command import add_command, given_path, output_option, overwrite_option
 from logvggt_jax.cli.exit_codes import PROBLEMS_FOUND
 from logvggt_jax.errors import printable
 
@@ -74,7 +73,7 @@ def _size(text: str) -> tuple[int, int]:
 def _copy_arguments(parser: argparse.ArgumentParser) -> None:
     """Which copy of a data set, and which part of it."""
     parser.add_argument("name", help="data set, as `logvggt data list` names it")
-    parser.add_argument("root", type=Path, help="folder of the copy")
+    parser.add_argument("root", type=given_path, help="folder of the copy")
     parser.add_argument(
         "--split", choices=("train", "val", "test", "all"), default="all", help="only this split's sequences"
     )
@@ -119,7 +118,7 @@ def add_to(commands: Any) -> None:
     )
     sub.add_argument(
         "--output",
-        type=Path,
+        type=given_path,
         default=None,
         metavar="PICTURE",
         help="PNG file to write: frames, their depth, and the cameras from above",
@@ -138,7 +137,7 @@ def add_to(commands: Any) -> None:
         "fails in training as it did before.",
     )
     _copy_arguments(sub)
-    sub.add_argument("--output", type=Path, required=True, metavar="FOLDER", help="folder to write the shards to")
+    sub.add_argument("--output", type=given_path, required=True, metavar="FOLDER", help="folder to write the shards to")
     sub.add_argument(
         "--frames-per-shard", type=int, default=2000, metavar="N", help="a sequence is never divided between shards"
     )

@@ -6,10 +6,16 @@ import argparse
 import json
 import sys
 import warnings
-from pathlib import Path
 from typing import Any
 
-from logvggt_jax.cli.command import add_command, execution_options, loaded_model, longer_edge_option, overwrite_option
+from logvggt_jax.cli.command import (
+    add_command,
+    execution_options,
+    given_path,
+    loaded_model,
+    longer_edge_option,
+    overwrite_option,
+)
 from logvggt_jax.cli.exit_codes import BAD_INPUT
 from logvggt_jax.cli.viewing import stay_open, watch_options, watched
 from logvggt_jax.errors import InputError, one_line
@@ -92,7 +98,11 @@ def add_to(commands: Any) -> None:
     )
     sub.add_argument("--checkpoint", required=True, metavar="PATH_OR_REPO", help="model, as for `logvggt reconstruct`")
     sub.add_argument(
-        "--output", type=Path, default=None, metavar="DIR", help="folder to make, as `logvggt reconstruct` makes it"
+        "--output",
+        type=given_path,
+        default=None,
+        metavar="DIR",
+        help="folder to make, as `logvggt reconstruct` does",
     )
     overwrite_option(sub, "an earlier reconstruction")
     longer_edge_option(sub)

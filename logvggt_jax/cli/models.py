@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import Any
 
-from logvggt_jax.cli.command import add_command, overwrite_option
+from logvggt_jax.cli.command import add_command, given_path, overwrite_option
 
 
 def _convert(options: argparse.Namespace) -> None:
@@ -59,7 +58,7 @@ def add_to(commands: Any) -> None:
         help="VGGT checkpoint: a file of PyTorch or safetensors, its folder, or a hub repository, hf:OWNER/NAME[/FILE] "
         "or OWNER/NAME where no folder OWNER is here",
     )
-    sub.add_argument("--output", type=Path, required=True, metavar="DIR", help="model folder to make")
+    sub.add_argument("--output", type=given_path, required=True, metavar="DIR", help="model folder to make")
     sub.add_argument("--point-head", action="store_true", help="keep the point head")
     sub.add_argument(
         "--trained-for",

@@ -6,6 +6,7 @@ import sys
 import traceback
 import warnings
 from collections.abc import Sequence
+from pathlib import Path
 
 from logvggt_jax.cli import data, doctor, live, models, reconstruct, results
 from logvggt_jax.cli.exit_codes import BAD_INPUT, OUTPUT_LOST
@@ -33,7 +34,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: Sequence[str]) -> int:
-    options = command_parser().parse_args(with_dashes(arguments))
+    parser = command_parser()
+    options, unknown = parser.parse_known_args(with_dashes(arguments))
+    if unknown:
+        parser.error(f"unrecognized arguments: {' '.join(unknown)}{_unquoted(unknown)}")
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
@@ -64,6 +68,13 @@ def command_parser() -> argparse.ArgumentParser:
     for module in (models, reconstruct, live, results, data, doctor):
         module.add_to(commands)
     return parser
+
+
+def _unquoted(unknown: Sequence[str]) -> str:
+    """A remark where a shell has made files of a pattern."""
+    if any(argument.startswith("-") or not Path(argument).exists() for argument in unknown):
+        return ""
+    return "; one source is taken: put a pattern in quotes ('walk/*.jpg'), or give the folder"
 
 
 class _Version(argparse.Action):

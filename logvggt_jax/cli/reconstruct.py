@@ -172,7 +172,11 @@ def add_to(commands: Any) -> None:
         "taken up by the same command. Ctrl-C ends the sequence at the window at hand and leaves a valid result of the "
         "frames so far; a second one stops at once.",
     )
-    sub.add_argument("source", help="folder of images (natural order; 7-Scenes: its colour images), or a video")
+    sub.add_argument(
+        "source",
+        help="folder of images (natural order; 7-Scenes: its colour images), a pattern in quotes ('walk/*.jpg'), a "
+        "text file that lists images, a video, a camera's number, or the address of a stream",
+    )
     sub.add_argument(
         "--checkpoint",
         required=True,

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from logvggt_jax.cli.choices import FORMATS
-from logvggt_jax.cli.command import add_command, output_option, overwrite_option
+from logvggt_jax.cli.command import add_command, given_path, output_option, overwrite_option
 from logvggt_jax.cli.viewing import address, address_options, say_access
 from logvggt_jax.errors import printable
 
@@ -81,7 +80,7 @@ def _view(options: argparse.Namespace) -> None:
 
 
 def _result_argument(parser: argparse.ArgumentParser, reading: str = "") -> None:
-    parser.add_argument("result", type=Path, help=f"output of `logvggt reconstruct`{reading}")
+    parser.add_argument("result", type=given_path, help=f"output of `logvggt reconstruct`{reading}")
 
 
 def add_to(commands: Any) -> None:
@@ -109,7 +108,7 @@ def add_to(commands: Any) -> None:
         help=f"one of {', '.join(FORMATS)}; may be given several times",
     )
     sub.add_argument(
-        "--output", type=Path, default=None, metavar="DIR", help="folder for them (default: RESULT/exports)"
+        "--output", type=given_path, default=None, metavar="DIR", help="folder for them (default: RESULT/exports)"
     )
     sub.add_argument(
         "--max-points",
@@ -164,7 +163,7 @@ def add_to(commands: Any) -> None:
     ways.add_argument("--poses", default=None, metavar="FILE", help="cameras in metres, files as for `logvggt fuse`")
     ways.add_argument(
         "--depth",
-        type=Path,
+        type=given_path,
         default=None,
         metavar="DIR",
         help="depth of a sensor, 16-bit PNG files whose names begin as the frames'",
@@ -194,9 +193,13 @@ def add_to(commands: Any) -> None:
         "ssh -N -L 8080:localhost:8080 USER@THIS_MACHINE. With --save nothing is served: one file of less than 25 MB "
         "holds the scene, thinned to fit, and opens anywhere.",
     )
-    sub.add_argument("folder", type=Path, help="output of `logvggt reconstruct`")
+    sub.add_argument("folder", type=given_path, help="output of `logvggt reconstruct`")
     address_options(sub)
     sub.add_argument(
-        "--save", type=Path, default=None, metavar="PAGE", help="write one HTML file to keep or send instead of serving"
+        "--save",
+        type=given_path,
+        default=None,
+        metavar="PAGE",
+        help="write one HTML file to keep instead of serving",
     )
     overwrite_option(sub, "an earlier page")

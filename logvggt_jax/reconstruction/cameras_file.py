@@ -57,7 +57,8 @@ def write_cameras(
       model_size: (H, W) of the depth maps.
       complete: whether the sequence was read to its end.
       skipped: frames that could not be read, with the reason.
-      noted_focal_length: pixels of the original images, as the camera noted it; None where it is not known.
+      noted_focal_length: pixels of the original images, the median of what the camera noted; None where it is not
+        known.
       source: where the frames came from; None where they cannot be read again.
       metric: whether lengths are metres.
       depth_scale: [N], by which the depth files' depth has to be multiplied to fit the cameras; None where it fits.

@@ -49,7 +49,7 @@ class FrameWriter:
     Attributes:
       names, timestamps: of the frames that were added.
       transform: from the original images to the model's; None before the first frame.
-      focal_length: pixels of the original images, as the camera noted it; None where it did not.
+      focal_lengths: pixels of the original images, of the frames that were added for which the camera noted one.
       masked: of the frames that were added, the share of the pixels that their mask drops; empty without masks.
       images: of the frames whose depth is not final yet, by position in the sequence.
       health: measures of the frames that are written.
@@ -61,7 +61,7 @@ class FrameWriter:
         self.timestamps: list[float] = []
         self.masked: list[float] = []
         self.transform: ResizeTransform | None = None
-        self.focal_length: float | None = None
+        self.focal_lengths: list[float] = []
         self.images: dict[int, np.ndarray] = {}
         self.health = HealthRecorder()
         self._written: set[int] = set()
@@ -75,7 +75,9 @@ class FrameWriter:
         self.timestamps.append(picture.timestamp)
         if picture.mask is not None:
             self.masked.append(1 - float(picture.mask.mean()))
-        self.transform, self.focal_length = picture.transform, picture.focal_length or self.focal_length
+        self.transform = picture.transform
+        if picture.focal_length:
+            self.focal_lengths.append(picture.focal_length)
 
     def live_result(self, result: FrameResult) -> LiveResult:
         """The frame of a result that is not written yet, for whoever looks on."""
@@ -143,7 +145,7 @@ class FrameWriter:
             model_size=transform.size,
             complete=complete,
             skipped=skipped,
-            noted_focal_length=self.focal_length,
+            noted_focal_length=float(np.median(self.focal_lengths)) if self.focal_lengths else None,
             source=source,
             depth_scale=cameras.depth_scale,
             loops=cameras.loops,

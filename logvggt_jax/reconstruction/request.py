@@ -13,7 +13,7 @@ import jax
 from logvggt_jax.config import ModelConfig
 from logvggt_jax.data.feeding.transforms import check_longer_edge, resized_size
 from logvggt_jax.errors import InputError
-from logvggt_jax.files import check_output, check_space, check_writable
+from logvggt_jax.files import check_output, check_space, check_writable, user_path
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.operations import matmul_flops_per_second
 from logvggt_jax.reconstruction.calibration import Calibration
@@ -49,9 +49,14 @@ def check_request(
         check_longer_edge(longer_edge)
     if num_previews < 0:
         raise InputError(f"previews must not be negative, got {num_previews}")
+    if calibration is not None and calibration.pinhole is not None and source.is_cut:
+        raise InputError(
+            f"intrinsics are those of whole images, of which {source.name} gives parts: take --size-mismatch skip, or "
+            "cut the images beforehand"
+        )
     if calibration is not None and source.image_size is not None:
         calibration.check(source.image_size)
-    target = Path(output).expanduser().resolve()
+    target = user_path(output, resolved=True)
     if target in (source.path.resolve(), *source.path.resolve().parents):
         raise InputError(f"output {output} contains the source {source.path}: choose another output")
     if overwrite or not is_unfinished(target):

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from logvggt_jax.errors import InputError, disk_errors, printable
+from logvggt_jax.files import user_path
 from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE, read_cameras
 from logvggt_jax.reconstruction.depth_files import read_depth, read_picture
 from logvggt_jax.reconstruction.health.report import HEALTH_FILE, HEALTH_PAGE, Health, read_health
@@ -41,7 +42,8 @@ class Reconstruction:
       metric: whether lengths are metres; else they are up to one common scale.
       complete: False if the run was ended before the end of its source.
       skipped: names of frames that could not be read and are left out.
-      noted_focal_length: pixels of the original images, as the camera noted it in EXIF; None where it did not.
+      noted_focal_length: pixels of the original images, the median of what the camera noted in EXIF; None where it did
+        not.
       source: where the frames came from; None where they cannot be read again.
       depth_scale: [N] float64, by which the depth files' depth is multiplied where it is read, so that it fits the
         extrinsics.
@@ -79,7 +81,7 @@ class Reconstruction:
           InputError: the folder is not one, its cameras cannot be used, or a file is missing or cut off. What else is
             wrong with a file is said when it is read.
         """
-        folder = Path(folder).expanduser()
+        folder = user_path(folder)
         result = cls.with_cameras_of(folder)
         files = [depth_file(folder, name) for name in result.names]
         with disk_errors(folder / IMAGE_FOLDER):
@@ -207,7 +209,7 @@ class Reconstruction:
         if self.noted_focal_length:
             focal = float(np.median(self.intrinsics[:, 0, 0]))
             notes.append(
-                f"focal length: {focal:.0f} pixels predicted, {self.noted_focal_length:.0f} by the camera's EXIF"
+                f"focal length: {focal:.0f} pixels in the result, {self.noted_focal_length:.0f} by the camera's EXIF"
             )
         try:
             health = self.health

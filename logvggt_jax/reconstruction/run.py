@@ -202,7 +202,7 @@ class Run:
             "masked": self._frames.masked,
             "masks": None if self._source.masks is None else self._source.masks.fingerprint(self._frames.names),
             "skipped": self._source.skipped,
-            "focal_length": self._frames.focal_length,
+            "focal_lengths": self._frames.focal_lengths,
             "size": None if self._frames.transform is None else self._frames.transform.original_size,
             "model_size": None if self._frames.transform is None else self._frames.transform.size,
         }
@@ -226,7 +226,7 @@ class Run:
                 "--overwrite to start anew"
             )
         self._frames.masked = facts.get("masked", [])  # of earlier versions
-        self._frames.focal_length = facts["focal_length"]
+        self._frames.focal_lengths = facts.get("focal_lengths", [])
         self._frames.names, self._frames.timestamps = facts["names"], facts["timestamps"]
         self._source.skipped[:] = [SkippedFrame(*each) for each in facts["skipped"]]
         if facts["size"]:

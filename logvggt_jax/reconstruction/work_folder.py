@@ -125,7 +125,8 @@ def work_path(output: Path) -> Path:
 
 def is_unfinished(folder: Path) -> bool:
     """Whether a result folder was left early and can be taken up."""
-    return (folder / _PROGRESS / _STATE).is_file() and not is_complete(folder / CAMERAS_FILE)
+    with disk_errors(folder):
+        return (folder / _PROGRESS / _STATE).is_file() and not is_complete(folder / CAMERAS_FILE)
 
 
 def check_leftovers(output: Path, request: Mapping[str, str], *, overwrite: bool) -> None:

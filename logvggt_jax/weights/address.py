@@ -4,7 +4,8 @@ import difflib
 import re
 from pathlib import Path
 
-from logvggt_jax.errors import MissingInput
+from logvggt_jax.errors import MissingInput, disk_errors
+from logvggt_jax.files import user_path
 from logvggt_jax.weights.files import SUFFIXES
 from logvggt_jax.weights.folder import run_model
 from logvggt_jax.weights.hub import PREFIX, download
@@ -31,8 +32,10 @@ def resolve(path_or_repo: str | Path) -> Path:
         )
     if shipped := shipped_model(path_or_repo):
         return shipped
-    path = Path(path_or_repo).expanduser()
-    if not path.exists():
+    path = user_path(path_or_repo)
+    with disk_errors(path):
+        there = path.exists()
+    if not there:
         raise MissingInput(
             f"{path}: no such file or folder{similar(path)}; give a checkpoint file, its folder, a hub repository as "
             f"{PREFIX}owner/name, or a model that ships with this package: {', '.join(SHIPPED)}"

@@ -24,7 +24,7 @@ from rich.progress import Progress
 
 from logvggt_jax.config import ModelConfig, from_mapping
 from logvggt_jax.errors import DiskError, InputError, MissingInput, OutputExists, disk_errors, one_line
-from logvggt_jax.files import atomic_folder, check_output, check_regular_files, check_space, check_writable
+from logvggt_jax.files import atomic_folder, check_output, check_regular_files, check_space, check_writable, user_path
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.weights.address import hub_address, resolve, similar
 from logvggt_jax.weights.digests import check_finite, digests, named_leaves, verify_digests
@@ -60,7 +60,7 @@ def save_model(
     `params` is the parameter tree, `variables["params"]`; `provenance` says what the weights were trained for and where
     they come from. Raises OutputExists where `path` exists and is not a model folder, or is not to be replaced.
     """
-    path = Path(path).expanduser().absolute()
+    path = user_path(path).absolute()
     check_destination(path)
     description = _description(config, params, provenance)
     with atomic_folder(path, replace=replace) as fresh, writing_with_orbax(path):
@@ -101,7 +101,7 @@ def save_rounded_model(path: str | Path, config: ModelConfig, params: Any, prove
 
     Returns how much rounding changed the parameters (`rounded`). Raises OutputExists as `save_model`.
     """
-    path = Path(path).expanduser().absolute()
+    path = user_path(path).absolute()
     check_destination(path)
     leaves, change = rounded(params)
     with atomic_folder(path, replace=True) as fresh, disk_errors(path):
@@ -141,7 +141,7 @@ def load_model(path: str | Path) -> tuple[LogVGGT, dict[str, Any]]:
     field, the parameters do not fit it, a file is damaged, a leaf or the description differs from its digest, or a
     parameter is NaN or infinite.
     """
-    path = shipped_model(path) or run_model(Path(path).expanduser().absolute())
+    path = shipped_model(path) or run_model(user_path(path).absolute())
     if not path.exists():
         raise MissingInput(
             f"{path / 'config.json'}: no such folder{similar(path)}; give a model folder, or a model that ships with "

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from logvggt_jax.errors import InputError, MissingInput
+from logvggt_jax.errors import InputError, MissingInput, disk_errors
 from logvggt_jax.files import open_regular, read_json
 from logvggt_jax.weights.digests import MEND, json_digest
 
@@ -15,8 +15,9 @@ _ENTRIES = {"format", "version", "config", "provenance", "digests", "libraries",
 
 def is_model_folder(path: Path) -> bool:
     """Whether a folder is one of this package's, be it damaged; hub repositories have a config.json as well."""
-    if (path / "params").is_dir():
-        return True
+    with disk_errors(path):
+        if (path / "params").is_dir():
+            return True
     try:
         with open_regular(path / "config.json") as stream:
             return FORMAT.encode() in stream.read()

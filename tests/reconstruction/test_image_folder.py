@@ -15,6 +15,7 @@ import numpy as np
 import pillow_heif
 import pytest
 from PIL import Image
+from PIL.ExifTags import IFD, Base
 
 from logvggt_jax.errors import DiskError, InputError, MissingInput, MissingPackage
 from logvggt_jax.reconstruction.sources import FolderSource, SourceFrame, SourceOptions, image_folder, open_source
@@ -535,3 +536,38 @@ def test_pictures_as_users_have_them(
     corners = np.array([[frame.image[y, x] for y in (5, -5) for x in (5, -5)] for frame in frames]).astype(int)
     truth = [[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 0]]
     assert np.abs(corners - truth).max() < 25
+
+
+def test_depth_is_told_from_a_later_picture_where_the_first_is_blank(tmp_path: Path) -> None:
+    depth = np.full((20, 30), 1500, np.uint16)
+    depth[::3] = 0
+    for number in range(6):
+        assert cv2.imwrite(str(tmp_path / f"{number}.png"), depth * np.uint16(number > 0))
+    with pytest.raises(InputError, match=r"\.png.*depth map"):
+        open_source(tmp_path)
+
+
+def test_a_folder_may_have_brackets_in_its_name(tmp_path: Path) -> None:
+    folder = tmp_path / "photos [2020]"
+    folder.mkdir()
+    write_numbered(folder, 3)
+    assert names(open_source(folder / "*.png")) == ["0", "1", "2"]
+
+
+def test_several_lenses_are_told_and_the_median_is_noted(tmp_path: Path) -> None:
+    for number, millimetres in enumerate((26, 26, 52, 78)):
+        exif = Image.Exif()
+        exif.get_ifd(IFD.Exif)[Base.FocalLengthIn35mmFilm] = millimetres
+        Image.new("RGB", (84, 56), (number, 0, 0)).save(tmp_path / f"{number}.jpg", exif=exif)
+    (note,) = (note for note in open_source(tmp_path).notes if "focal lengths" in note)
+    assert re.fullmatch(
+        r"images of several focal lengths by EXIF, \d\d to \d{3} pixels: no intrinsics are those of all", note
+    )
+
+
+def test_archives_and_an_end_before_the_beginning_are_named(tmp_path: Path) -> None:
+    (tmp_path / "walk.zip").write_bytes(b"PK")
+    with pytest.raises(InputError, match=r"walk\.zip is an archive: unpack it"):
+        open_source(tmp_path / "walk.zip")
+    with pytest.raises(InputError, match=r"end must be above 0 s, got -5"):
+        SourceOptions(end=-5.0)

@@ -278,7 +278,7 @@ def test_the_focal_length_of_the_camera_is_shown_beside_the_predicted_one(tmp_pa
     noted = Reconstruction.open(result.folder).noted_focal_length
     assert noted == pytest.approx(84, rel=0.05)
     predicted = float(np.median(result.intrinsics[:, 0, 0]))
-    assert f"focal length: {predicted:.0f} pixels predicted, {noted:.0f} by the camera's EXIF" in result.summary()
+    assert f"focal length: {predicted:.0f} pixels in the result, {noted:.0f} by the camera's EXIF" in result.summary()
 
 
 @pytest.mark.parametrize("terminal", ["0", "1"])

@@ -17,6 +17,7 @@ from recorder import LONGER_EDGE, Recorder, reconstruct_recorded
 from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.errors import DiskError, InputError
 from logvggt_jax.reconstruction import PointFilter, open_source
+from logvggt_jax.reconstruction.calibration import Calibration
 from logvggt_jax.reconstruction.request import check_request, describe, device_needs, disk_bytes
 from logvggt_jax.streaming import METHODS, ChunkPlan
 
@@ -80,3 +81,15 @@ def test_the_device_needs_its_parameters_and_something_to_work_with(small_config
     assert needs.parameters == 4 * sum(leaf.size for leaf in jax.tree.leaves(shapes))
     assert needs.working is not None and needs.working > 28 * 42 * 4
     assert 0 < needs.seconds_a_frame < 60
+
+
+def test_intrinsics_of_whole_images_are_refused_for_parts_of_them(tmp_path: Path) -> None:
+    (tmp_path / "walk").mkdir()
+    for index, size in enumerate(((160, 120), (160, 100), (120, 160))):
+        Image.new("RGB", size, (index, 0, 0)).save(tmp_path / "walk" / f"{index}.png")
+    options = {"longer_edge": LONGER_EDGE, "overwrite": False}
+    calibration = Calibration((150.0, 150.0, 59.5, 49.5))
+    source = open_source(tmp_path / "walk", size_mismatch="crop")
+    with pytest.raises(InputError, match=r"intrinsics are those of whole images, of which .*walk gives parts"):
+        check_request(source, tmp_path / "out", calibration=calibration, **options)
+    check_request(source, tmp_path / "out", calibration=Calibration(shared=True), **options)

@@ -46,9 +46,10 @@ class SourceFiles:
         return {name: each for name, each in folders.items() if any(self.exists(each / sign) for sign in signs)}
 
     def text(self, path: Path, expected: str) -> str:
-        """A text file's content; MissingFiles saying what was `expected`, InputError for other bytes."""
+        """A text file's content, without a byte order mark; MissingFiles saying what was `expected`, InputError for
+        other bytes."""
         try:
-            return self.content(path, expected).decode()
+            return self.content(path, expected).decode("utf-8-sig")
         except UnicodeDecodeError as error:
             raise InputError(f"{path}: not a text file ({error.reason}): fetch it again") from error
 

@@ -32,7 +32,7 @@ from logvggt_jax.data.packed.index import (
 from logvggt_jax.data.packed.records import broken_record, frame_record
 from logvggt_jax.data.registry import READERS, open_dataset
 from logvggt_jax.errors import DiskError, InputError, MissingPackage, OutputExists, disk_errors, install_line, one_line
-from logvggt_jax.files import FolderLock, atomic_file, check_writable, to_disk, write_text
+from logvggt_jax.files import FolderLock, atomic_file, check_writable, to_disk, user_path, write_text
 
 FRAMES_PER_SHARD = 2000
 # One record in a group: a frame is read without its neighbours. Stronger compression takes twice the time for 3 %.
@@ -89,7 +89,7 @@ def pack(
         raise InputError(f"frames per shard and workers must be at least 1, got {frames_per_shard} and {workers}")
     if is_packed(root):
         raise InputError(f"{root} is packed already")
-    output = Path(output).expanduser().absolute()
+    output = user_path(output).absolute()
     check_writable(output)
     reader = open_dataset(name, root, split, **options)
     with disk_errors(output):

@@ -14,7 +14,7 @@ from typing import Protocol
 
 from logvggt_jax.data.formats.nerfstudio_transforms import TRANSFORMS_FILE
 from logvggt_jax.errors import InputError, OutputExists, disk_errors
-from logvggt_jax.files import atomic_folder, check_output, check_writable
+from logvggt_jax.files import atomic_folder, check_output, check_writable, user_path
 from logvggt_jax.reconstruction.exporters.colmap import export_colmap, export_colmap_text
 from logvggt_jax.reconstruction.exporters.depth_exr import export_depth_exr
 from logvggt_jax.reconstruction.exporters.depth_npz import export_depth_npz
@@ -117,7 +117,7 @@ def export(
     """
     check_formats(names)
     names = list(dict.fromkeys(names))
-    folder = result.folder / EXPORT_FOLDER if output is None else Path(output).expanduser()
+    folder = result.folder / EXPORT_FOLDER if output is None else user_path(output)
     if folder.resolve() == result.folder.resolve():
         raise InputError(f"{folder} is the result itself, whose files exports would replace: choose another output")
     targets = [_checked(folder / EXPORTERS[name].file, EXPORTERS[name], overwrite) for name in names]

@@ -13,7 +13,7 @@ from logvggt_jax.data.formats.colmap_model import read_cameras, read_images
 from logvggt_jax.data.formats.nerfstudio_transforms import CAMERA, TRANSFORMS_FILE, camera_of, is_pinhole
 from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.errors import InputError, MissingInput, disk_errors
-from logvggt_jax.files import open_regular
+from logvggt_jax.files import open_regular, user_path
 from logvggt_jax.reconstruction.exporters.tum import read_trajectory
 
 # The squares of larger numbers are infinite in float32.
@@ -46,7 +46,7 @@ def read_poses(path: str | Path) -> list[ExternalPose]:
       MissingInput: nothing is there.
       InputError: it is none of these, damaged, or holds no pose; names file and line or picture.
     """
-    path = Path(path).expanduser()
+    path = user_path(path)
     with disk_errors(path):
         path.stat()
         if path.is_dir():

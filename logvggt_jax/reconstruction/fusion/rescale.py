@@ -10,7 +10,7 @@ import numpy as np
 
 from logvggt_jax.data.formats.image import read_depth as read_depth_picture
 from logvggt_jax.errors import InputError, disk_errors
-from logvggt_jax.files import open_regular
+from logvggt_jax.files import open_regular, user_path
 from logvggt_jax.geometry import camera_centres, points_at
 from logvggt_jax.reconstruction.exporters.frame_names import file_stems
 from logvggt_jax.reconstruction.frame_pool import FramePool
@@ -64,7 +64,7 @@ def rescale(
         factor = similarity.scale
         notes.append(said)
     elif depth is not None:
-        factor = _from_depth(result, Path(depth).expanduser(), depth_unit, notes)
+        factor = _from_depth(result, user_path(depth), depth_unit, notes)
     elif frames is not None:
         centres = camera_centres(result.extrinsics[[find_frame(result, name) for name in frames]])
         factor = _from_distance(centres, distance, f"the cameras of {frames[0]} and {frames[1]}", notes)

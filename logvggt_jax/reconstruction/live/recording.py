@@ -10,6 +10,7 @@ from pathlib import Path
 from types import TracebackType
 
 from logvggt_jax.errors import InputError
+from logvggt_jax.files import user_path
 from logvggt_jax.reconstruction.calibration import Calibration
 from logvggt_jax.reconstruction.finishing import finish
 from logvggt_jax.reconstruction.frame_pool import FramePool
@@ -53,7 +54,7 @@ class Recording:
     ) -> None:
         if num_previews < 0:
             raise InputError(f"num_previews must not be negative, got {num_previews}")
-        self._target = Path(output).expanduser().resolve()
+        self._target = user_path(output, resolved=True)
         self._filter, self._calibration = point_filter or PointFilter(), calibration or Calibration()
         self._num_previews, self._overwrite, self._workers = num_previews, overwrite, workers
         self._stack = contextlib.ExitStack()

@@ -8,6 +8,7 @@ from typing import Any
 from urllib.parse import unquote
 
 from logvggt_jax.errors import InputError, MissingInput, disk_errors
+from logvggt_jax.files import EMPTY_PATH
 from logvggt_jax.reconstruction.sources.image_folder import FolderSource
 from logvggt_jax.reconstruction.sources.listing import names_pictures
 from logvggt_jax.reconstruction.sources.masks import Masks
@@ -18,6 +19,7 @@ from logvggt_jax.reconstruction.sources.video import VideoSource, is_live
 __all__ = ["FolderSource", "SkippedFrame", "Source", "SourceFrame", "SourceOptions", "VideoSource", "open_source"]
 
 
+_ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar")
 _EXPECTED = "expected a folder of images or a video file"
 # As file managers give it; a `Path` keeps one slash only.
 _FILE_ADDRESS = re.compile(r"file:(?://(?:localhost)?)?(/[^/].*)")
@@ -41,7 +43,7 @@ def open_source(path: str | Path, *, masks: str | Path | None = None, **options:
         return VideoSource(path, chosen, of_frames)
     given = path
     if not str(path):
-        raise InputError(f"the path is empty (a variable without a value?): {_EXPECTED}")
+        raise InputError(f"{EMPTY_PATH}: {_EXPECTED}")
     if (address := _FILE_ADDRESS.fullmatch(str(path))) and not Path(path).exists():
         path = unquote(address[1])
     try:
@@ -62,4 +64,6 @@ def open_source(path: str | Path, *, masks: str | Path | None = None, **options:
             f"{path} is a single image, or an animation (make it an mp4 or a GIF): give the folder that holds the "
             "sequence, a glob, or a video"
         )
+    if path.suffix.lower() in _ARCHIVES:
+        raise InputError(f"{path} is an archive: unpack it, and give the folder of the images or the video in it")
     return VideoSource(path, chosen, of_frames)

@@ -16,6 +16,7 @@ from pathlib import Path
 from logvggt_jax.data.errors import BrokenPicture
 from logvggt_jax.data.formats.ordering import natural_order, time_stamps
 from logvggt_jax.errors import InputError, MissingInput, MissingPackage, disk_errors
+from logvggt_jax.frames import evenly_spaced
 from logvggt_jax.reconstruction.sources.headers import PictureHeader, read_header
 from logvggt_jax.reconstruction.sources.listing import is_glob, list_pictures, some, stem
 from logvggt_jax.reconstruction.sources.masks import Masked, Masks
@@ -23,6 +24,8 @@ from logvggt_jax.reconstruction.sources.pictures import read_picture, refuse_dep
 from logvggt_jax.reconstruction.sources.source import SkippedFrame, Source, SourceFrame, SourceOptions, fingerprint
 
 _LONGEST_NAME = 240  # bytes; a file of the result adds its suffix, and file systems allow 255
+_LOOKED_AT = 4  # pictures with 16 bits, whether they are depth
+_ONE_LENS = 1.05  # ratio of focal lengths that rounding may give one lens
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,6 +82,13 @@ class FolderSource(Source):
         if times is None and not listing.in_order:
             self.notes += _against_clock(pictures)
         self._pictures, self._size = self._of_one_size(pictures)
+        self.is_cut = any(picture.header.size != self._size for picture in self._pictures)
+        noted = [focal for picture in self._pictures if (focal := picture.header.focal_length)]
+        if noted and max(noted) > _ONE_LENS * min(noted):
+            self.notes.append(
+                f"images of several focal lengths by EXIF, {min(noted):.0f} to {max(noted):.0f} pixels: no intrinsics "
+                "are those of all"
+            )
         if masks is not None:
             if masks.path.resolve() in {picture.file.resolve().parent for picture in self._pictures}:
                 raise InputError(f"{masks.path} holds the images themselves: give their masks in a folder of their own")
@@ -180,12 +190,14 @@ class FolderSource(Source):
                 if self.options.strict:
                     raise
                 no_decoder.append((file, error))
-        if deep := [picture for picture in pictures if picture.header.deep_grey][:1]:
+        deep = [picture for picture in pictures if picture.header.deep_grey]
+        for picture in [deep[place] for place in evenly_spaced(len(deep), _LOOKED_AT)] if deep else []:
+            # Not the first alone: sensors begin with a blank one.
             try:
-                refuse_depth(deep[0].file)
+                refuse_depth(picture.file)
             except BrokenPicture as error:
-                self._leave_out(deep[0].name, error)
-                pictures.remove(deep[0])
+                self._leave_out(picture.name, error)
+                pictures.remove(picture)
         for suffix, count in Counter(file.suffix for file, _ in no_decoder).items():
             inside = "" if suffix.lower().startswith(".h") else " that are HEIC inside"
             self.notes.append(f"{count} {suffix}{inside} ignored: install logvggt-jax[heic], or convert to JPEG")

@@ -109,7 +109,7 @@ def _of_folder(folder: Path, pattern: str | None) -> Listing:
 
 def _of_glob(path: Path, pattern: str | None) -> Listing:
     root = path.parent
-    while is_glob(root):
+    while is_glob(root) and not root.exists():  # names of folders may have brackets
         root = root.parent
     entries = sorted(root.glob(str(path.relative_to(root))))
     files, left_out = _pictures([entry for entry in entries if _matches(entry, pattern)], told=True)

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from logvggt_jax.errors import InputError, MissingInput, disk_errors
+from logvggt_jax.files import user_path
 from logvggt_jax.frames import evenly_spaced
 from logvggt_jax.reconstruction.sources.headers import read_header
 from logvggt_jax.reconstruction.sources.listing import some, stem
@@ -62,7 +63,7 @@ class Masks:
     """
 
     def __init__(self, path: str | Path) -> None:
-        self.path = Path(path).expanduser()
+        self.path = user_path(path)
         self._files: dict[str, Path] = {}  # by name without suffix
         self._of_frame: dict[str, Path] = {}
         with disk_errors(self.path):

@@ -77,6 +77,8 @@ class SourceOptions:
                 raise InputError(f"{name} must be at least 1, got {value}")
         if self.fps is not None and not 0 < self.fps < float("inf"):
             raise InputError(f"fps must be above 0, got {self.fps}")
+        if self.end is not None and not self.end > 0:
+            raise InputError(f"end must be above 0 s, got {self.end} s")
         if not 0 <= (self.start or 0.0) < (float("inf") if self.end is None else self.end):
             raise InputError(f"start must lie between 0 and the end ({self.end} s), got {self.start} s")
         if self.size_mismatch not in SIZE_MISMATCH:
@@ -97,6 +99,7 @@ class Source(abc.ABC):
       options: which frames are taken.
       masks: of the frames; None where all pixels count. They are no part of `fingerprint`, and have one of their own.
       notes: what the user should know before the work begins, one line each: what is left out, and why.
+      is_cut: whether frames are parts of larger images.
       skipped: frames that could not be read, filled when the source is opened and while frames are loaded.
     """
 
@@ -106,6 +109,7 @@ class Source(abc.ABC):
         self.address: Path | None = path
         self.notes: list[str] = []
         self.skipped: list[SkippedFrame] = []
+        self.is_cut = False
 
     def __iter__(self) -> Iterator[SourceFrame]:
         """The frames that can be read, one at a time."""

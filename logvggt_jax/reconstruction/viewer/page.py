@@ -14,7 +14,7 @@ import numpy as np
 
 from logvggt_jax.colours import depth_picture
 from logvggt_jax.errors import InputError, OutputExists, disk_errors, printable
-from logvggt_jax.files import check_writable, write_text
+from logvggt_jax.files import check_writable, user_path, write_text
 from logvggt_jax.frames import evenly_spaced
 from logvggt_jax.geometry import camera_centres
 from logvggt_jax.reconstruction.depth_files import encode_picture
@@ -56,7 +56,7 @@ def save_page(
       OutputExists: `path` exists.
     """
     result = Reconstruction.open(folder)
-    path = Path(path).expanduser()
+    path = user_path(path)
     if path.suffix.lower() not in (_SUFFIX, ".htm"):
         raise InputError(f"{path}: a page's name must end in {_SUFFIX}")
     with disk_errors(path):

@@ -94,3 +94,9 @@ def test_times_that_are_none_are_named(recording: Path, table: str, time: str):
     path.write_text("\n".join(lines))
     with pytest.raises(InputError, match=rf"{table}\.txt, line 3: expected a time in seconds"):
         TUMRecording(recording.parent).num_frames(NAME)
+
+
+def test_a_calibration_may_begin_with_a_byte_order_mark(recording: Path):
+    before = TUMRecording(recording.parent).read(NAME, [0]).intrinsics
+    (recording / "calibration.txt").write_text(f"\ufeff{CALIBRATION}", encoding="utf-8")
+    np.testing.assert_array_equal(TUMRecording(recording.parent).read(NAME, [0]).intrinsics, before)
