@@ -4,7 +4,13 @@
 
 `initial_weights` takes what `logvggt convert` wrote, a VGGT checkpoint, or a hub repository. Set the data sets'
 folders with --config.data.sources.scannet.root=/data/scannet and so on; --config=configs/h20.py:DATA_ROOT puts all
-of them under one folder. --config.data.allow_missing=True trains on those that are there. The paper gives clip
+of them under one folder. --config.data.allow_missing=True trains on those that are there. A stage can be trained alone,
+the second from what the first has left in another work folder, or from any other weights:
+
+    python train.py --config=configs/h20.py:DATA_ROOT,stage_2 --workdir=runs/h20-long \
+        --config.initial_weights=runs/h20/model
+
+The paper gives clip
 lengths, epochs, windows and data sets. Optimiser, mixture, strides, batch sizes and the length of an epoch are choices
 of this project.
 """
@@ -13,6 +19,7 @@ from ml_collections import ConfigDict
 from ml_collections.config_dict import placeholder
 
 from logvggt_jax.data.feeding.holdouts import PUBLISHED
+from logvggt_jax.errors import InputError
 
 STEPS_PER_EPOCH = 800
 NUM_DEVICES = 16
@@ -37,7 +44,11 @@ MIXTURE = {
 
 
 def get_config(data_root: str = "data") -> ConfigDict:
-    """The run; the model's sizes are the defaults of `ModelConfig`, VGGT-1B."""
+    """The run; the model's sizes are the defaults of `ModelConfig`, VGGT-1B. After a comma, the name of its one stage.
+
+    Raises InputError for a stage that it does not have.
+    """
+    data_root, _, stage = data_root.partition(",")
     config = ConfigDict()
     config.seed = 0
     config.initial_weights = "facebook/VGGT-1B"
@@ -64,6 +75,10 @@ def get_config(data_root: str = "data") -> ConfigDict:
         },
         sort_keys=False,
     )
+    if stage:
+        if stage not in config.stages:
+            raise InputError(f"configs/h20.py has stages {', '.join(config.stages)}, got {stage!r} after the comma")
+        config.stages = ConfigDict({stage: config.stages[stage]})
     config.optimizer = {
         "learning_rate": 5e-5,
         "final_learning_rate": 1e-8,

@@ -15,7 +15,7 @@ from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.data.feeding.holdouts import PUBLISHED
 from logvggt_jax.data.rooms.rooms import Rooms
 from logvggt_jax.described import cudnn_by_description
-from logvggt_jax.errors import MissingInput
+from logvggt_jax.errors import InputError, MissingInput
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.parallel.sharding import check_batch_size, data_mesh
 from logvggt_jax.training.step.costs import abstract_clips
@@ -157,6 +157,16 @@ def test_h20_is_the_papers_training(monkeypatch: pytest.MonkeyPatch) -> None:
     assert [name for name, stride in strides.items() if stride is None] == ["blendedmvs"], "the only unordered set"
     for stage in config.stages:
         check_batch_size(stage, data_mesh(16))
+
+
+@pytest.mark.parametrize("stage", ["stage_1", "stage_2"])
+def test_each_of_the_papers_stages_can_be_trained_alone(stage: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, alone = _config("h20", monkeypatch), importlib.import_module("configs.h20").get_config(f"/data,{stage}")
+    found = TrainConfig.from_dict(alone.to_dict())
+    assert found.stages == tuple(each for each in whole.stages if each.name == stage)
+    assert found.data.sources[0].root.startswith("/data/")
+    with pytest.raises(InputError, match=r"has stages stage_1, stage_2, got 'stage_3'"):
+        importlib.import_module("configs.h20").get_config("/data,stage_3")
 
 
 def _abstract_run(config: TrainConfig, num_devices: int) -> tuple[TrainState, jax.stages.Wrapped]:
