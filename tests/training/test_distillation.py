@@ -5,6 +5,7 @@ import functools
 from pathlib import Path
 from typing import Any
 
+import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +16,7 @@ from pixel_teacher import PixelTeacher
 from logvggt_jax import ModelConfig
 from logvggt_jax.data import open_dataset
 from logvggt_jax.data.errors import BrokenPicture
-from logvggt_jax.data.feeding.batches import training_batches
+from logvggt_jax.data.feeding.batches import BatchIterator, training_batches
 from logvggt_jax.data.feeding.frame_range import FrameRange
 from logvggt_jax.data.feeding.listed_frames import listed_frames
 from logvggt_jax.errors import InputError
@@ -106,7 +107,7 @@ def test_sequences_shorter_than_a_clip_give_what_they_have(rooms: Any, tmp_path:
     assert [dataset.num_frames(name) for name in dataset.sequences] == [4, 4]
 
 
-def test_a_clip_that_cannot_be_read_is_left_out_and_named(
+def test_a_clip_that_cannot_be_read_is_a_broken_one_and_named(
     rooms: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole, broken = rooms.read, {(rooms.sequences[0], 5)}
@@ -118,14 +119,42 @@ def test_a_clip_that_cannot_be_read_is_left_out_and_named(
 
     monkeypatch.setattr(rooms, "read", read)
     logging.use_python_logging(quiet=True)
-    assert len(labelled(rooms, tmp_path).sequences) == 5
-    assert f"{rooms.sequences[0]}@4: left out, its pictures cannot be read: frame 5 is broken" in caplog.text
+    dataset, damaged = labelled(rooms, tmp_path), f"{rooms.sequences[0]}@4"
+    assert len(dataset.sequences) == 6 and damaged not in dataset.labelled().sequences
+    assert f"{damaged}: a broken clip, its pictures cannot be read: frame 5 is broken" in caplog.text
+    for ask in (dataset.read, dataset.confidence):
+        with pytest.raises(InputError, match=rf"{damaged} has no labels.*: mend them and start the run again"):
+            ask(damaged, [3])  # of frame 7, which can be read
     broken |= {(name, i) for name in rooms.sequences for i in range(10)}
     with pytest.raises(InputError, match="rooms: no clip of two frames or more that can be read"):
         labelled(rooms, tmp_path)
 
 
-def test_every_process_reads_its_share_and_all_leave_out_what_one_cannot_read(
+def test_a_run_goes_on_whatever_pictures_were_mended_or_damaged(tmp_path: Path) -> None:
+    generator, pictures = np.random.default_rng(0), [tmp_path / "walk" / f"{i:02}.png" for i in range(12)]
+    pictures[0].parent.mkdir()
+    for path in pictures:
+        cv2.imwrite(str(path), generator.integers(0, 256, (*SIZE, 3), np.uint8))
+
+    def start(damaged: int) -> BatchIterator:
+        whole = pictures[damaged].read_bytes()
+        pictures[damaged].write_bytes(whole[:100])
+        images = open_dataset("images", tmp_path / "walk", "all")
+        dataset = taught("images", images, PixelTeacher(), TEACHER, [SIZE, SIZE[::-1]], tmp_path / "cache")
+        pictures[damaged].write_bytes(whole)
+        assert len(dataset.sequences) == 3
+        sizes = [SIZE, SIZE[::-1]]
+        return training_batches({"images": dataset}, clip_length=3, batch_size=2, sizes=sizes, seed=0, max_broken=0.5)
+
+    with start(damaged=5) as first, start(damaged=9) as again:
+        for _ in range(3):
+            next(first)
+        again.set_state(first.get_state())
+        assert first.broken.count and all("walk@4 has no labels" in message for message in first.broken.messages)
+        next(again)
+
+
+def test_every_process_reads_its_share_and_all_know_what_one_cannot_read(
     rooms: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two processes one after the other: what they tell is noted first, and then handed to both."""
@@ -152,8 +181,8 @@ def test_every_process_reads_its_share_and_all_leave_out_what_one_cannot_read(
     monkeypatch.setattr(module, "any_process", lambda wants: wants)
     noted(0)
     second, first = noted(1), noted(0)
-    assert first._clips == second._clips and len(first.sequences) == 5
-    assert f"{rooms.sequences[0]}@4" not in first.sequences
+    assert first._clips == second._clips and len(first.sequences) == 6
+    assert [name for name in first.sequences if name not in first.labelled().sequences] == [f"{rooms.sequences[0]}@4"]
     assert sum(process == 1 for process, _ in read) == 4 + 4 + 2
 
 

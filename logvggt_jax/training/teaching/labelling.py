@@ -38,10 +38,11 @@ def taught(
     Every sequence is cut into clips of `config.clip_length` frames, `config.stride` apart, the last one ending where
     the sequence ends; of several `sizes` (H, W) they have the one nearest to the pictures' aspect. Of several processes
     each reads and labels its share and tells the others, so that all have the same clips; all have to call this. A
-    clip whose pictures cannot be read is left out, with a warning that names it.
+    clip whose pictures cannot be read has no labels, and a warning names it: it stays, as a broken clip, so that the
+    others keep their places whatever can be read.
 
-    Raises InputError where no clip is left, for a data set that is drawn on the device, and on every process where one
-    of them fails or sees other sequences.
+    Raises InputError where no clip has labels, for a data set that is drawn on the device, and on every process where
+    one of them fails or sees other sequences.
     """
     if isinstance(dataset, DrawnOnDevice):
         raise InputError(
@@ -49,7 +50,8 @@ def taught(
         )
     wanted = list(itertools.islice(_cut(dataset, config), most))
     check_agreement(f"{name}: the sequences", [[sequence, *frames] for sequence, frames in wanted])
-    found = np.zeros((len(wanted), 1 + DIGEST_BYTES), np.uint8)
+    # Of each clip: the number of its size, the first where it is unknown; whether it has labels; their digest.
+    found = np.zeros((len(wanted), 2 + DIGEST_BYTES), np.uint8)
     failure: InputError | None = None
     console = Console(stderr=True, quiet=not progress)
     try:
@@ -59,27 +61,27 @@ def taught(
                 sequence, frames = wanted[place]
                 try:
                     size = nearest_size(dataset.image_size(sequence), sizes)
+                    found[place, 0] = list(sizes).index(size)
                     images = fit_each((dataset.read(sequence, [i]) for i in frames), len(frames), size).images
                 except Exception as error:  # of a decoder: one damaged picture is not to end a run of a week
                     where = f"{name}, {sequence}@{frames[0]}"
-                    logging.warning("%s: left out, its pictures cannot be read: %s", where, describe(error))
+                    logging.warning("%s: a broken clip, its pictures cannot be read: %s", where, describe(error))
                     continue
                 digest = label_digest(images, teacher.digest)
                 folder = label_folder(cache, digest)
                 if not is_labelled(folder, images.shape):
                     write_labels(folder, teacher.label(images))
-                found[place] = [1 + list(sizes).index(size), *digest]
+                found[place, 1:] = [1, *digest]
     except InputError as error:
         failure = error
     # Whoever has failed: the others wait for its clips.
     if any_process(failure is not None):
         raise failure or InputError(f"{name}: another process cannot label its clips; its output says why")
     clips: dict[str, TaughtClip] = {}
-    for (sequence, frames), (number, *digest) in zip(wanted, from_all(found).max(0), strict=True):
-        if number:  # 0: left out
-            folder = label_folder(cache, bytes(digest))
-            clips[f"{sequence}@{frames[0]}"] = TaughtClip(sequence, frames, sizes[number - 1], folder)
-    if not clips:
+    for (sequence, frames), (size_number, has_labels, *digest) in zip(wanted, from_all(found).max(0), strict=True):
+        labels = label_folder(cache, bytes(digest)) if has_labels else None
+        clips[f"{sequence}@{frames[0]}"] = TaughtClip(sequence, frames, sizes[size_number], labels)
+    if all(clip.labels is None for clip in clips.values()):
         raise InputError(
             f"{name}: no clip of two frames or more that can be read in {len(dataset.sequences)} sequences, nothing to "
             f"be taught on; {longest(dataset)}"

@@ -54,5 +54,8 @@ def label(
     if config.validation is not None and settings.validation:
         size = [config.validation.size]
         for source in config.validation.sources:
-            validated.append(taught(source.name, open_source(source), teacher, settings, size, cache, **shared))
+            # Validation replaces no clip that cannot be read.
+            validated.append(
+                taught(source.name, open_source(source), teacher, settings, size, cache, **shared).labelled()
+            )
     return found, validated

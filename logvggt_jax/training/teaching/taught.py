@@ -10,26 +10,31 @@ import numpy as np
 from logvggt_jax.data.dataset import Dataset, check_indices, check_sequence
 from logvggt_jax.data.feeding.frame_range import frames_of
 from logvggt_jax.data.feeding.transforms import fit
+from logvggt_jax.errors import InputError
 from logvggt_jax.frames import Frames
-from logvggt_jax.training.teaching.labels import stored_labels
+from logvggt_jax.training.teaching.labels import Labels, stored_labels
 
 Size = tuple[int, int]
 
 
 @dataclass(frozen=True)
 class TaughtClip:
-    """One clip that a teacher saw: frames of a sequence of the data set, cut to `size` (H, W), and its labels."""
+    """One clip for a teacher: frames of a sequence of the data set, cut to `size` (H, W), and where its labels lie.
+
+    It has none where its pictures could not be read.
+    """
 
     sequence: str
     frames: tuple[int, ...]
     size: Size
-    labels: Path
+    labels: Path | None
 
 
 class TaughtDataset(Dataset):
     """The clips of a data set that a teacher has labelled, each as a sequence of its own.
 
-    Depth and cameras are the teacher's, with `confidence`; what the data set says of them is not looked at.
+    Depth and cameras are the teacher's, with `confidence`; what the data set says of them is not looked at. Those that
+    have no labels are sequences too, of which no frame can be read.
     """
 
     def __init__(self, dataset: Dataset, clips: Mapping[str, TaughtClip], teacher: str) -> None:
@@ -44,6 +49,11 @@ class TaughtDataset(Dataset):
     def identity(self) -> Mapping[str, Any]:
         """As of `Dataset`."""
         return {**self._dataset.identity, "teacher": self._teacher}
+
+    def labelled(self) -> "TaughtDataset":
+        """The clips that have labels alone."""
+        clips = {name: clip for name, clip in self._clips.items() if clip.labels is not None}
+        return TaughtDataset(self._dataset, clips, self._teacher)
 
     def range(self, sequence: str) -> range:
         """As of `PartOfFrames`."""
@@ -69,8 +79,9 @@ class TaughtDataset(Dataset):
         """As of `Dataset`."""
         clip = self._clip(sequence)
         chosen = check_indices(indices, len(clip.frames), sequence)
+        # First: of a clip without labels no frame is given, also where the one that is damaged is not asked for.
+        labels = self._labels(sequence)
         pictures = fit(self._dataset.read(clip.sequence, [clip.frames[i] for i in chosen]), clip.size)
-        labels = stored_labels(clip.labels)
         return Frames(
             images=pictures.images,
             depth=labels.depth[chosen],
@@ -81,12 +92,21 @@ class TaughtDataset(Dataset):
 
     def confidence(self, sequence: str, indices: Sequence[int]) -> np.ndarray:
         """As of `ConfidentDataset`."""
-        clip = self._clip(sequence)
-        return stored_labels(clip.labels).confidence[check_indices(indices, len(clip.frames), sequence)]
+        chosen = check_indices(indices, self.num_frames(sequence), sequence)
+        return self._labels(sequence).confidence[chosen]
 
     def sfm_extrinsics(self, sequence: str, indices: Sequence[int]) -> np.ndarray | None:
         """As of `Dataset`."""
         return None
+
+    def _labels(self, sequence: str) -> Labels:
+        clip = self._clip(sequence)
+        if clip.labels is None:
+            raise InputError(
+                f"{sequence} has no labels, its pictures could not be read when the run was started (its log names "
+                "them): mend them and start the run again, which labels the clip"
+            )
+        return stored_labels(clip.labels)
 
     def _clip(self, sequence: str) -> TaughtClip:
         check_sequence(sequence, self._clips, "the teacher's clips")
