@@ -72,7 +72,13 @@ class DrawnOnDevice(Protocol):
 
 @runtime_checkable
 class ConfidentDataset(Protocol):
-    """A data set that says how far its depth is to be trusted; its frames have the size that they are trained at."""
+    """A data set of labels, which says how far its depth is to be trusted; its frames have the size that they are
+    trained at."""
+
+    @property
+    def labelled_by(self) -> str:
+        """A digest of what the labels are of, besides the pictures."""
+        ...
 
     def confidence(self, sequence: str, indices: Sequence[int]) -> np.ndarray:
         """[T, H, W] float32, at least 1, for frames `indices` of `sequence`."""

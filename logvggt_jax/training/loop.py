@@ -158,7 +158,7 @@ class _Run:
             if position is not None and position.stage == index:
                 source.set_state(position.data)
             elif position is not None:  # of a stage that is done, on the same sequences
-                source.check_frames(position.data)
+                source.check_sources(position.data)
             # Otherwise they would wait for one another in different programs.
             check_agreement(f"stage {stage.name!r}: the data", {**source.get_state(), "broken": None})
             left.append((index, stage, end, source))

@@ -37,6 +37,7 @@ from logvggt_jax.training.step.optimizer import make_optimizer
 from logvggt_jax.training.step.state import initial_state
 from logvggt_jax.training.step.train_step import make_loss_terms, make_train_step
 from logvggt_jax.training.teaching import labelling as module
+from logvggt_jax.training.teaching import run_data
 from logvggt_jax.training.teaching.labelling import taught
 from logvggt_jax.training.teaching.run_data import label
 from logvggt_jax.training.teaching.taught import TaughtDataset
@@ -270,6 +271,48 @@ def test_a_student_that_never_saw_the_truth_comes_nearer_to_its_teacher(
             state, metrics, _ = step(state, put_batch(next(batches), layout.mesh))
     assert np.isfinite(float(metrics["loss/total"]))
     assert distance(jax.device_get(state.params)) < 0.5 * distance(pixel_params)
+
+
+def test_a_run_does_not_go_on_with_another_teacher(
+    pixel_model: Any, pixel_params: Any, run_config: TrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(loop, "LogVGGT", lambda _: pixel_model)
+    monkeypatch.setattr(loop, "initial_parameters", lambda *_, **__: jax.tree.map(jnp.array, pixel_params))
+    monkeypatch.setattr(loop, "abstract_parameters", lambda _: jax.eval_shape(lambda: pixel_params))
+    # The file's name stands for what is in it.
+    monkeypatch.setattr(run_data, "PlainVGGT", lambda config: PixelTeacher(Path(config.weights).name))
+
+    def train(steps: int, weights: str, **changes: Any) -> int:
+        config = dataclasses.replace(
+            run_config,
+            loss=dataclasses.replace(run_config.loss, name="distillation"),
+            data=dataclasses.replace(run_config.data, cache_dir=str(tmp_path / "cache")),
+            stages=(dataclasses.replace(run_config.stages[0], steps=steps),),
+            teacher=TeacherConfig(weights, **{"clip_length": 4, **changes}),
+        )
+        return int(loop.train(config, tmp_path / "run", mesh=data_mesh(1)).step)
+
+    train(1, "here/first")
+    with pytest.raises(InputError, match=r"labels of another teacher \(digests: rooms first, now second\): set "):
+        train(2, "here/second")
+    with pytest.raises(InputError, match=r"other settings: teacher\.clip_length=4, now 5; teacher\.stride=1, now 2\."):
+        train(2, "here/first", clip_length=5, stride=2)
+    assert train(2, "moved/first", validation=False) == 2
+
+
+def test_states_of_before_teachers_were_listed_are_taken(rooms: Any, tmp_path: Path) -> None:
+    def start(dataset: Any) -> BatchIterator:
+        return training_batches({"rooms": dataset}, clip_length=3, batch_size=2, sizes=[SIZE], seed=0)
+
+    taught_rooms = labelled(rooms, tmp_path)
+    with start(rooms) as untaught, start(taught_rooms) as now, start(taught_rooms) as again:
+        assert "teachers" not in untaught.get_state()
+        before = now.get_state()
+        assert before.pop("teachers") == {"rooms": "first"}
+        again.set_state(before)
+        # Of a stage that is done, to which others are added.
+        with pytest.raises(InputError, match="labels of another teacher"):
+            again.check_sources({"teachers": {"rooms": "second"}})
 
 
 @pytest.mark.slow

@@ -21,7 +21,7 @@ from logvggt_jax.data.feeding.augmentation import ColourAugmentation
 from logvggt_jax.data.feeding.broken_clips import BrokenClips
 from logvggt_jax.data.feeding.clips import BROKEN, NAME, Size
 from logvggt_jax.data.feeding.listed_frames import check_listed_frames
-from logvggt_jax.data.feeding.mixture import FRAMES, mixture
+from logvggt_jax.data.feeding.mixture import FRAMES, TEACHERS, mixture
 from logvggt_jax.data.feeding.sampling import sampler_for
 from logvggt_jax.errors import InputError, one_line
 
@@ -137,19 +137,19 @@ class BatchIterator(Iterator[Batch]):
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Continues after the examples that `state` counts.
 
-        Raises InputError if the state is of another seed, clip or mixture, or of sequences with other frames, whose
-        examples would differ.
+        Raises InputError if the state is of another seed, clip or mixture, of sequences with other frames or of labels
+        of another teacher, whose examples would differ.
         """
         expected = {"examples", "broken", *self._identity}
-        # States of before frames were listed pass without them.
-        if set(state) | {FRAMES} != expected:
+        # States of before frames and teachers were listed pass without them.
+        if set(state) | ({FRAMES, TEACHERS} & expected) != expected:
             raise InputError(
                 f"data state has fields {sorted(state)}, expected {sorted(expected)}: "
                 "it was written by another version or is damaged"
             )
-        self.check_frames(state)
+        self.check_sources(state)
         for name, value in self._identity.items():
-            if name != FRAMES and state[name] != value:
+            if name not in (FRAMES, TEACHERS) and state[name] != value:
                 raise InputError(
                     f"data state was written with {name}={state[name]}, this run has {value}: "
                     "resume with the same data settings, or start a new run"
@@ -158,9 +158,11 @@ class BatchIterator(Iterator[Batch]):
         self._consumed = int(state["examples"])
         self.broken.set_state(state["broken"])
 
-    def check_frames(self, state: Mapping[str, Any]) -> None:
-        """Raises InputError naming sequences that have other frames than where `state`, of any clips, was written."""
+    def check_sources(self, state: Mapping[str, Any]) -> None:
+        """Raises InputError naming sequences that have other frames, or data sets that have labels of another teacher,
+        than where `state`, of any clips, was written."""
         check_listed_frames(state.get(FRAMES, {}), self._identity[FRAMES])
+        _check_teachers(state.get(TEACHERS, {}), self._identity.get(TEACHERS, {}))
 
     def _open(self) -> Iterator[dict[str, Any]]:
         start = self._consumed + self._process_index
@@ -323,6 +325,17 @@ def _drawing(
             )
         return dataset.draw
     return None
+
+
+def _check_teachers(then: Mapping[str, str], now: Mapping[str, str]) -> None:
+    """Raises InputError naming the data sets, of those in both, that another teacher labels now."""
+    changed = [f"{name} {then[name]}, now {now[name]}" for name in then if name in now and then[name] != now[name]]
+    if changed:
+        raise InputError(
+            f"the checkpoint was written with labels of another teacher (digests: {'; '.join(changed)}): set "
+            "teacher.weights to the same weights, which may lie in another folder, or start a new --workdir, which "
+            "--config.initial_weights lets begin with the model of this one"
+        )
 
 
 def _is_killed_worker(error: BaseException) -> bool:

@@ -10,7 +10,7 @@ import grain
 import numpy as np
 from absl import logging
 
-from logvggt_jax.data.dataset import Dataset
+from logvggt_jax.data.dataset import ConfidentDataset, Dataset
 from logvggt_jax.data.feeding.augmentation import ColourAugmentation
 from logvggt_jax.data.feeding.broken_clips import describe
 from logvggt_jax.data.feeding.clips import ClipReader, ReplaceBroken, Size
@@ -21,6 +21,7 @@ from logvggt_jax.data.feeding.transforms import nearest_size
 from logvggt_jax.errors import InputError
 
 FRAMES = "frames"  # in what examples are drawn from: `ListedFrames`
+TEACHERS = "teachers"  # likewise, where there are any: digests of what labelled the data sets, by name
 _SIZE_READERS = 16
 
 
@@ -104,6 +105,8 @@ def mixture(
         "augmentation": repr(augmentation),
         "min_valid_depth": float(min_valid_depth),
     }
+    if teachers := {name: each.labelled_by for name, each in datasets.items() if isinstance(each, ConfidentDataset)}:
+        identity[TEACHERS] = teachers
     if len(examples) > 1:
         turns = [grain.MapDataset.source([size]).repeat().map_with_index(_Turn()) for size in range(len(examples))]
         schedule = grain.MapDataset.mix(turns, weights=size_shares)

@@ -13,6 +13,8 @@ from logvggt_jax.training.config import TrainConfig
 _NAMED = 5
 # How fast, from where and with how many broken clips the data come; the data stream checks that they are the same.
 _FREE_DATA_SETTINGS = ("worker_count", "num_threads", "cache_dir", "max_broken")
+# Where the teacher lies, which the data stream knows by its digest, and whether validation asks it.
+_FREE_TEACHER_SETTINGS = ("weights", "validation")
 
 
 def check_configuration(stored: StoredCheckpoint, config: TrainConfig) -> None:
@@ -25,12 +27,14 @@ def check_configuration(stored: StoredCheckpoint, config: TrainConfig) -> None:
         # Validation may change, and is not to keep the rest from being read where its fields did.
         written = TrainConfig.from_dict({**written, "validation": None}).to_dict()
     found: list[str] = []
-    for part in ("model", "stages", "data", "loss", "optimizer", "seed", "average"):
+    for part in ("model", "stages", "data", "loss", "optimizer", "seed", "average", "teacher"):
         then, now = written.get(part), ours[part]
         if part == "stages" and then is not None and _goes_further(stored.step, then, now):
             continue
         if part == "data" and then is not None:
             then, now = _what_decides_clips(then), _what_decides_clips(now)
+        if part == "teacher":
+            then, now = _what_decides_labels(then), _what_decides_labels(now)
         found += [f"{name}={theirs!r}, now {mine!r}" for name, theirs, mine in _differences(then, now, part)]
     if found:
         more = f"; and {len(found) - _NAMED} more" if len(found) > _NAMED else ""
@@ -61,6 +65,13 @@ def _what_decides_clips(data: Mapping[str, Any]) -> dict[str, Any]:
     kept = {name: value for name, value in data.items() if name not in _FREE_DATA_SETTINGS}
     kept["sources"] = [{name: value for name, value in source.items() if name != "root"} for source in data["sources"]]
     return kept
+
+
+def _what_decides_labels(teacher: Mapping[str, Any] | None) -> dict[str, Any] | None:
+    """The teacher's settings without those that a run may change when it goes on: its labels stay the same."""
+    if teacher is None:
+        return None
+    return {name: value for name, value in teacher.items() if name not in _FREE_TEACHER_SETTINGS}
 
 
 def _differences(theirs: Any, ours: Any, name: str) -> Iterator[tuple[str, Any, Any]]:

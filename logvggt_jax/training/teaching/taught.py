@@ -50,6 +50,11 @@ class TaughtDataset(Dataset):
         """As of `Dataset`."""
         return {**self._dataset.identity, "teacher": self._teacher}
 
+    @property
+    def labelled_by(self) -> str:
+        """As of `ConfidentDataset`."""
+        return self._teacher
+
     def labelled(self) -> "TaughtDataset":
         """The clips that have labels alone."""
         clips = {name: clip for name, clip in self._clips.items() if clip.labels is not None}
