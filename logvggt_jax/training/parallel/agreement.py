@@ -77,8 +77,8 @@ def check_agreement(what: str, value: Any) -> None:
         )
 
 
-def check_shared(folder: Path) -> None:
-    """Raises InputError on every process unless all see the same `folder`, which is made.
+def check_shared(folder: Path, setting: str = "--workdir") -> None:
+    """Raises InputError on every process unless all see the same `folder`, the value of `setting`, which is made.
 
     Process 0 writes a token there, and the others have to find it within `SHARED_SECONDS`. All processes have to ask
     at the same point.
@@ -104,7 +104,7 @@ def check_shared(folder: Path) -> None:
     any_process(False)
     if blind:
         raise InputError(
-            f"--workdir={folder} of the processes {blind} is another folder than that of process 0, on a disk of "
+            f"{setting}={folder} of the processes {blind} is another folder than that of process 0, on a disk of "
             "their own machine: name one that all machines share"
         )
 

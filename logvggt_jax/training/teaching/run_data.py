@@ -10,6 +10,7 @@ from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.training.config import TeacherConfig, TrainConfig
 from logvggt_jax.training.feeding.sources import open_source, open_sources
 from logvggt_jax.training.feeding.truth import check_depth, check_truth
+from logvggt_jax.training.parallel.agreement import check_shared
 from logvggt_jax.training.teaching.labelling import taught
 from logvggt_jax.training.teaching.teacher import PlainVGGT, Teacher
 
@@ -42,11 +43,13 @@ def label(
     """`datasets`, and the validation sources where the student is to be compared with its teacher, as it labels them.
 
     Of several processes each labels its share; all have to call this. At `most` so many clips of a set are labelled,
-    None labels all.
+    None labels all. Raises InputError as `taught`, and on every process where they do not share the cache.
     """
     assert config.data.cache_dir is not None  # as the configuration checks
     shared: dict[str, Any] = {"progress": jax.process_index() == 0, "most": most}
     cache, sizes = Path(config.data.cache_dir), list(dict.fromkeys(s for stage in config.stages for s in stage.sizes))
+    # Each reads what the others have labelled.
+    check_shared(cache, "data.cache_dir")
     found: dict[str, Dataset] = {
         name: taught(name, dataset, teacher, settings, sizes, cache, **shared) for name, dataset in datasets.items()
     }

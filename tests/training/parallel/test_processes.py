@@ -196,6 +196,35 @@ def test_folders_that_are_not_shared_are_an_error_of_the_start(programs: RootPro
     assert not list((tmp_path / "a").iterdir())
 
 
+def test_a_cache_of_labels_that_is_not_shared_is_an_error_before_anything_is_labelled(
+    programs: RootPrograms, tmp_path: Path
+) -> None:
+    def patch(cache: Path) -> str:
+        return f"""
+import dataclasses
+from logvggt_jax.training.config import TeacherConfig
+from logvggt_jax.training.parallel import agreement
+from logvggt_jax.training.teaching import run_data
+from pixel_teacher import PixelTeacher
+agreement.SHARED_SECONDS = 0.5
+run_data.PlainVGGT = lambda _: PixelTeacher()
+def open_data(config):
+    data = dataclasses.replace(config.data, cache_dir={str(cache)!r})
+    loss = dataclasses.replace(config.loss, name="distillation")
+    return run_data.open_data(dataclasses.replace(config, data=data, loss=loss, teacher=TeacherConfig("anything", 16)))
+loop.open_data = open_data
+"""
+
+    patches = (patch(tmp_path / "a"), patch(tmp_path / "b"))
+    with PixelRuns(programs, tmp_path / "run", tmp_path / "run", patches=patches) as runs:
+        for number in range(2):
+            errors = runs.errors(number)
+            assert runs.processes[number].returncode == 1
+            assert re.search(r"data\.cache_dir=\S+ of the processes \[1\] is another folder than that", errors), errors
+            assert "Traceback" not in errors
+    assert not list(tmp_path.glob("*/teacher")) and not list(tmp_path.glob("*/.shared*"))
+
+
 def test_a_preflight_goes_on_together_when_one_process_fails_a_try(programs: RootPrograms, tmp_path: Path) -> None:
     quick = (
         "from logvggt_jax.training import preflight as flight\n"
