@@ -1,7 +1,11 @@
 """A student learns from a teacher alone: labels in the truth's place, kept on disk, and what is refused."""
 
 import dataclasses
+import errno
 import functools
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +23,7 @@ from logvggt_jax.data.errors import BrokenPicture
 from logvggt_jax.data.feeding.batches import BatchIterator, training_batches
 from logvggt_jax.data.feeding.frame_range import FrameRange
 from logvggt_jax.data.feeding.listed_frames import listed_frames
-from logvggt_jax.errors import InputError
+from logvggt_jax.errors import DiskError, InputError
 from logvggt_jax.metrics.depth import depth_metrics
 from logvggt_jax.training import loop
 from logvggt_jax.training.config import (
@@ -101,6 +105,50 @@ def test_what_was_labelled_once_is_not_labelled_again_unless_teacher_or_pictures
     mended = PixelTeacher()
     labelled(rooms, tmp_path, mended)
     assert mended.calls == 1
+
+
+def test_labels_that_cannot_be_written_are_one_line_and_leave_nothing(
+    rooms: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(np, "save", full)
+    with pytest.raises(DiskError, match=r"teacher/[0-9a-f]{32}: No space left on device"):
+        labelled(rooms, tmp_path)
+    assert not list((tmp_path / "teacher").iterdir())
+
+
+def test_what_killed_runs_left_in_the_cache_goes_unless_another_is_at_work(
+    run_config: TrainConfig, rooms: Any, tmp_path: Path
+) -> None:
+    config = dataclasses.replace(
+        run_config,
+        loss=dataclasses.replace(run_config.loss, name="distillation"),
+        data=dataclasses.replace(run_config.data, cache_dir=str(tmp_path)),
+        teacher=TEACHER,
+    )
+    left = [tmp_path / "teacher" / name for name in ("ab.7-cd.partial", ".ab.7-cd.old")]
+
+    def start() -> list[bool]:
+        for folder in left:
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / "depth.npy").write_bytes(b"half")
+        label(config, TEACHER, PixelTeacher(), {"rooms": rooms})
+        return [folder.exists() for folder in left]
+
+    hold = (
+        "import sys; from pathlib import Path; from logvggt_jax.training.teaching.cache_use import cache_in_use\n"
+        "with cache_in_use(Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", hold, str(tmp_path)], text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as other:
+        assert other.stdout is not None and other.stdout.readline() == "held\n"
+        assert start() == [True, True], "it may be writing them"
+        other.kill()
+    assert start() == [False, False]
+    assert len(list((tmp_path / "teacher").iterdir())) == 6
 
 
 def test_sequences_shorter_than_a_clip_give_what_they_have(rooms: Any, tmp_path: Path) -> None:

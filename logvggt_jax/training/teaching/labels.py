@@ -1,6 +1,7 @@
 """What a teacher says of a clip, and where it is kept.
 
     <cache>/teacher/<digest>/   of one clip: depth.npy, confidence.npy, intrinsics.npy, extrinsics.npy
+    <cache>/teacher.lock        held together by all that write labels, see `cache_use`
 
 The digest is of the clip's pictures, as the teacher saw them, and of the teacher: what has been labelled once is never
 labelled again, by whatever run, and never taken for something else.
@@ -12,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from logvggt_jax.errors import InputError, OutputExists
+from logvggt_jax.errors import InputError, OutputExists, disk_errors
 from logvggt_jax.files import atomic_folder
 
 DIGEST_BYTES = 16
@@ -47,9 +48,9 @@ def label_folder(cache: Path, digest: bytes) -> Path:
 
 
 def write_labels(folder: Path, labels: Labels) -> None:
-    """Keeps them in `folder`, in the place of damaged ones."""
+    """Keeps them in `folder`, in the place of damaged ones; DiskError where they cannot be written."""
     try:
-        with atomic_folder(folder, replace=folder.exists()) as fresh:
+        with disk_errors(folder), atomic_folder(folder, replace=folder.exists()) as fresh:
             for name, values in labels._asdict().items():
                 np.save(fresh / f"{name}.npy", values)
     except OutputExists:  # another run labelled the same clip in the meantime

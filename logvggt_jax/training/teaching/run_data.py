@@ -11,6 +11,7 @@ from logvggt_jax.training.config import TeacherConfig, TrainConfig
 from logvggt_jax.training.feeding.sources import open_source, open_sources
 from logvggt_jax.training.feeding.truth import check_depth, check_truth
 from logvggt_jax.training.parallel.agreement import check_shared
+from logvggt_jax.training.teaching.cache_use import cache_in_use
 from logvggt_jax.training.teaching.labelling import taught
 from logvggt_jax.training.teaching.teacher import PlainVGGT, Teacher
 
@@ -50,15 +51,15 @@ def label(
     cache, sizes = Path(config.data.cache_dir), list(dict.fromkeys(s for stage in config.stages for s in stage.sizes))
     # Each reads what the others have labelled.
     check_shared(cache, "data.cache_dir")
-    found: dict[str, Dataset] = {
-        name: taught(name, dataset, teacher, settings, sizes, cache, **shared) for name, dataset in datasets.items()
-    }
     validated: list[Dataset] = []
-    if config.validation is not None and settings.validation:
-        size = [config.validation.size]
-        for source in config.validation.sources:
-            # Validation replaces no clip that cannot be read.
-            validated.append(
-                taught(source.name, open_source(source), teacher, settings, size, cache, **shared).labelled()
-            )
+    with cache_in_use(cache):
+        found: dict[str, Dataset] = {
+            name: taught(name, dataset, teacher, settings, sizes, cache, **shared) for name, dataset in datasets.items()
+        }
+        if config.validation is not None and settings.validation:
+            size = [config.validation.size]
+            for source in config.validation.sources:
+                held_out = taught(source.name, open_source(source), teacher, settings, size, cache, **shared)
+                # Validation replaces no clip that cannot be read.
+                validated.append(held_out.labelled())
     return found, validated

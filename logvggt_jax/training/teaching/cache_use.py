@@ -1,0 +1,41 @@
+"""The use of a cache of labels by many runs at once, and the removal of what killed ones left half-written in it."""
+
+import contextlib
+import fcntl
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+
+@contextlib.contextmanager
+def cache_in_use(cache: Path) -> Iterator[None]:
+    """Who writes labels to `cache` does so in this block, at the same time as other processes and runs.
+
+    One that comes while no other is there removes temporary folders first, which then are of killed ones. All that are
+    there hold one lock together, `<cache>/teacher.lock`, which ends with its process, however that ends. Where nothing
+    can be written, or the file system has no locks, nothing is removed: labels are written all the same.
+    """
+    with contextlib.ExitStack() as stack:
+        with contextlib.suppress(OSError):
+            cache.mkdir(parents=True, exist_ok=True)
+            # Network file systems ask for a file open for writing to lock it alone, for reading to lock it together.
+            lock = stack.enter_context((cache / "teacher.lock").open("a+b"))
+            if _is_alone(lock):
+                _remove_scratch(cache / "teacher")
+            fcntl.flock(lock, fcntl.LOCK_SH)
+        yield
+
+
+def _is_alone(lock: BinaryIO) -> bool:
+    """Whether nobody else holds the lock; who is alone keeps others waiting until it holds the lock together."""
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True
+
+
+def _remove_scratch(folder: Path) -> None:
+    for path in (*folder.glob("*.partial"), *folder.glob(".*.old")):
+        shutil.rmtree(path, ignore_errors=True)
