@@ -10,6 +10,7 @@ Flipped bytes are restored without complaint; the digests, of the float32 parame
 import contextlib
 import dataclasses
 import importlib.metadata
+import logging
 import os
 import re
 from collections.abc import Callable, Iterator
@@ -73,11 +74,12 @@ def write_arrays(path: Path, tree: Any) -> None:
     # Numbers of a network do not compress: a tenth of the space would take three times the processor's time.
     # Nor does Orbax need copies of arrays that stay as they are until it has ended.
     uncopied = ocp.type_handlers.NumpyHandler(deepcopy_host_arrays=False)
+    kinds = (np.ndarray, uncopied), (jax.Array, ocp.type_handlers.ArrayHandler())
     handler = ocp.PyTreeCheckpointHandler(
         use_compression=False,
         save_concurrent_gb=_GB_IN_FLIGHT,
         multiprocessing_options=_alone(),
-        type_handler_registry=ocp.type_handlers.create_type_handler_registry((np.ndarray, uncopied)),
+        type_handler_registry=ocp.type_handlers.create_type_handler_registry(*kinds),
     )
     with ocp.AsyncCheckpointer(handler, multiprocessing_options=_alone()) as checkpointer:
         checkpointer.save(path, args=ocp.args.PyTreeSave(jax.tree.map(np.asarray, jax.device_get(tree))))
@@ -354,7 +356,9 @@ def read_with_orbax(read: Callable[[], Any], where: str, mend: str) -> Any:
 @contextlib.contextmanager
 def writing_with_orbax(path: Path) -> Iterator[None]:
     """Turns the operating system's errors in the block, which writes `path`, into DiskError, as `disk_errors` does;
-    those too that Orbax passes on as the text of another exception."""
+    those too that Orbax passes on as the text of another exception, after it has logged hundreds of lines of them."""
+    logger = logging.getLogger("absl")
+    logger.addFilter(_is_not_orbaxs)
     try:
         with disk_errors(path):
             yield
@@ -365,6 +369,12 @@ def writing_with_orbax(path: Path) -> Iterator[None]:
         if code is None:
             raise
         raise DiskError(f"{path}: {os.strerror(int(code[1]))}") from error
+    finally:
+        logger.removeFilter(_is_not_orbaxs)
+
+
+def _is_not_orbaxs(record: logging.LogRecord) -> bool:
+    return f"{os.sep}orbax{os.sep}" not in record.pathname
 
 
 @contextlib.contextmanager
