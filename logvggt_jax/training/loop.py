@@ -145,7 +145,11 @@ class _Run:
     ) -> None:
         """All stages that are not finished."""
         step, end = int(self.state.step), 0
-        self.in_flight = StepsInFlight(skipped=int(self.state.skipped), step_ended=self.watchdog.step_ended)
+        self.in_flight = StepsInFlight(
+            skipped=int(self.state.skipped),
+            in_a_row=int(self.state.skipped_in_a_row),
+            step_ended=self.watchdog.step_ended,
+        )
         self.times = RunTimes(self.config, productive=log.productive_seconds, peak=self.peak)
         left: list[tuple[int, StageConfig, int, BatchIterator]] = []
         # All of them at once: data that do not fit the last stage are an error of the first minute.
@@ -258,7 +262,7 @@ class _Run:
         self._save(position, in_place_of=latest if step - latest <= row else None)
         self.checkpoints.wait()
         raise NonFiniteTraining(
-            f"step {step}: {longest:.0f} updates in a row had a non-finite loss or gradient "
+            f"step {step}: {longest} updates in a row had a non-finite loss or gradient "
             f"(max_skipped_in_a_row={self.config.max_skipped_in_a_row}), with {self.in_flight.blamed}; the same "
             "command goes on past them; if that does not help start a new --workdir with a lower "
             "optimizer.learning_rate, or resume from an earlier checkpoint with --resume_step"

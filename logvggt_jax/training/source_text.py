@@ -19,11 +19,11 @@ def with_sources(settings: Mapping[str, Any], trained: Sequence[str], validated:
     """
     changed = dict(settings)
     if trained:
-        changed["data"] = {**settings["data"], "sources": [parse_source(text) for text in trained]}
+        changed["data"] = {**settings.get("data", {}), "sources": [parse_source(text) for text in trained]}
     if validated == _NOTHING:
         changed["validation"] = None
     elif validated is not None:
-        if settings["validation"] is None:
+        if settings.get("validation") is None:
             raise InputError("--validation_source: this configuration validates nothing")
         changed["validation"] = {**settings["validation"], "sources": [parse_source(validated)]}
     return changed

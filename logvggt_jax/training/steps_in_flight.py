@@ -21,13 +21,15 @@ class StepsInFlight:
 
     Attributes:
       means: of the steps that have finished since they were last read.
-      longest_skip: updates left out in a row, the longest row so far.
+      longest_skip: updates left out in a row, the longest row since this start; it may have begun before.
     """
 
-    def __init__(self, *, skipped: int, step_ended: Callable[[], None]) -> None:
-        """Args: `skipped` updates were left out before; `step_ended` is called for every step that has finished."""
+    def __init__(self, *, skipped: int, in_a_row: int, step_ended: Callable[[], None]) -> None:
+        """Args: `skipped` updates were left out before, `in_a_row` of them last; `step_ended` is called for every step
+        that has finished."""
         self.means = IntervalMeans()
-        self.longest_skip = 0.0
+        self.longest_skip = 0
+        self._in_a_row = in_a_row
         self._skipped, self._step_ended = float(skipped), step_ended
         self._steps: deque[tuple[int, Metrics, jax.Array, list[str]]] = deque()
         # Clips of the latest updates left out in a row, and its last step.
@@ -53,7 +55,11 @@ class StepsInFlight:
             self.means.add(values)
             if values["skipped"] > self._skipped:
                 self._blame(step, *clips_to_blame(finite, names))
-            self._skipped, self.longest_skip = values["skipped"], values["longest_skip"]
+                self._in_a_row += 1
+                self.longest_skip = max(self.longest_skip, self._in_a_row)
+            else:
+                self._in_a_row = 0
+            self._skipped = values["skipped"]
 
     def _blame(self, step: int, clips: list[str], reason: str) -> None:
         if step != self._last_skip + 1:

@@ -672,6 +672,27 @@ def test_clips_that_make_updates_useless_are_named_and_the_same_command_goes_pas
     assert [entry["step"] for entry in _numbers(tmp_path)] == [1, 2, 3, 4, 5, 6]
 
 
+def test_updates_left_out_before_a_start_do_not_end_it(
+    run_config: TrainConfig, pixel_model: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(loop, "LogVGGT", lambda _: DazzledModel(pixel_model.config, pixel_model))
+    read = ClipReader.__call__
+
+    # Those of the second step, in the first stage alone.
+    def reading(reader: ClipReader, index: int, sequence: str) -> dict[str, Any]:
+        clip = read(reader, index, sequence)
+        return (
+            {**clip, "images": np.zeros_like(clip["images"])} if index in (2, 3) and len(clip["images"]) == 2 else clip
+        )
+
+    monkeypatch.setattr(ClipReader, "__call__", reading)
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyError, match="crash"):
+        _at_step(patch, 5, _crash)
+        train(run_config, tmp_path, mesh=data_mesh(1))
+    state = train(dataclasses.replace(run_config, max_skipped_in_a_row=1), tmp_path, mesh=data_mesh(1))
+    assert int(state.skipped) == 1 and int(state.step) == run_config.total_steps
+
+
 def test_useless_restarts_do_not_push_good_checkpoints_out(
     run_config: TrainConfig, pixel_model: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -16,6 +16,8 @@ from logvggt_jax.weights.checkpoints import check_destination, read_licence, rea
 from logvggt_jax.weights.folder import is_model_folder
 from logvggt_jax.weights.provenance import Provenance, TrainingRecord
 
+_STARTING_POINTS = ("initial_weights", "teacher")  # of a configuration, whose licences are the model's
+
 
 class RunModels:
     """The models `<workdir>/model`, of the newest checkpoint, and `<workdir>/best`, of the best validation.
@@ -72,7 +74,10 @@ class RunModels:
         if terms := " and ".join(dict.fromkeys(filter(None, found))):
             return terms
         earlier = read_provenance(self.newest) if is_model_folder(self.newest) else Provenance()
-        return earlier.licence if earlier.source == self._source else None
+        started_from = None if earlier.training is None else earlier.training.configuration
+        ours = self._config.to_dict()
+        same = started_from is not None and all(started_from.get(part) == ours[part] for part in _STARTING_POINTS)
+        return earlier.licence if same else None
 
     def _provenance(self, step: int) -> Provenance:
         longer_edge = max(max(size) for stage in self._config.stages for size in stage.sizes)

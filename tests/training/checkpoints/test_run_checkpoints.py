@@ -24,6 +24,7 @@ from logvggt_jax.training.checkpoints import checkpoint_files, run_checkpoints
 from logvggt_jax.training.checkpoints import run_models as module
 from logvggt_jax.training.checkpoints.checkpoint_files import Position
 from logvggt_jax.training.checkpoints.run_checkpoints import RunCheckpoints
+from logvggt_jax.training.checkpoints.run_models import RunModels
 from logvggt_jax.training.config import OptimizerConfig, TeacherConfig, TrainConfig
 from logvggt_jax.training.step.optimizer import make_optimizer
 from logvggt_jax.training.step.state import TrainState, initial_state
@@ -193,6 +194,8 @@ def test_a_model_has_the_licences_of_what_it_was_made_of(
         tmp_path / run / "model", {"config": small_config.to_dict(), "digests": {}, "provenance": provenance.to_dict()}
     )
     assert licence(tuned) == "vggt-1b" and licence(run_config) is None
+    moved = shutil.move(tmp_path / run, tmp_path / "elsewhere")
+    assert RunModels(Path(moved), tuned)._provenance(0).licence == "vggt-1b"
 
 
 def test_a_model_that_the_run_did_not_write_is_never_replaced(
