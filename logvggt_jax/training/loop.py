@@ -34,7 +34,7 @@ from logvggt_jax.training.reporting.run_times import RunTimes
 from logvggt_jax.training.reporting.wandb_run import WandbRun, load_wandb
 from logvggt_jax.training.step.compilation import compiled_steps
 from logvggt_jax.training.step.costs import step_flops
-from logvggt_jax.training.step.device_memory import memory_explained
+from logvggt_jax.training.step.device_memory import memory_explained, validation_memory_explained
 from logvggt_jax.training.step.initialization import initial_parameters
 from logvggt_jax.training.step.program import abstract_parameters, make_program
 from logvggt_jax.training.step.state import TrainState
@@ -300,11 +300,12 @@ class _Run:
         return every is not None and (step % every == 0 or step == self.config.total_steps)
 
     def _validate(self, step: int, log: MetricsLog) -> None:
-        if self.validation is None:
+        if self.validation is None or self.config.validation is None:
             return
         started = time.perf_counter()
         with self.times.other("validation"), self.watchdog.other("the validation"):
-            values, pictures = self.validation(self.state.averaged)
+            with validation_memory_explained(self.config.validation, self.mesh):
+                values, pictures = self.validation(self.state.averaged)
             # Before the line of this validation: a run that is killed between the two validates again.
             best = self._keep_if_best(step, values, log)
         log.show(step, pictures)

@@ -448,6 +448,26 @@ def test_a_step_that_does_not_fit_says_what_it_needs_and_what_lowers_it(
         train(run_config, tmp_path, mesh=data_mesh(2))
 
 
+@pytest.mark.parametrize("at", [0, 3])
+def test_a_validation_that_does_not_fit_names_what_lowers_it(
+    at: int, run_config: TrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    judged, steps = loop.Validation.__call__, iter((0, 3))
+
+    def full(*given: Any) -> Judgement:
+        if next(steps) == at:
+            raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory while trying to allocate")
+        return judged(*given)
+
+    monkeypatch.setattr(loop.Validation, "__call__", full)
+    message = (
+        r"^validation does not fit the memory of cpu, which takes one clip at a time: lower "
+        r"validation\.size=\(28, 42\) or validation\.clip_length=3 \(RESOURCE_EXHAUSTED"
+    )
+    with pytest.raises(InputError, match=message):
+        train(_validated(run_config), tmp_path, mesh=data_mesh(1))
+
+
 def test_validation_reports_held_out_clips(run_config: TrainConfig, tmp_path: Path) -> None:
     source = SourceConfig(name="rooms", root=None, split="val", options=run_config.data.sources[0].options)
     validation = ValidationConfig(sources=(source,), every=4, num_clips=4, clip_length=3, stride=2, size=(28, 42))

@@ -38,7 +38,7 @@ class Judgement(NamedTuple):
 
 
 class Validation:
-    """Fixed clips, read once, and the jitted model that is tried on them.
+    """Fixed clips, read once, and the jitted model that is tried on them, on each device clip by clip.
 
     Clip i of a source shows frames start, start + stride, … of a sequence that is long enough. As many sequences as
     there are have clips; those of one sequence start evenly spaced, the first one at frame 0. `datasets` take the place
@@ -62,8 +62,15 @@ class Validation:
         self._images = jax.make_array_from_callback(images.shape, split(mesh), lambda index: images[index])
 
         def predict(params: Any, images: jax.Array) -> tuple[jax.Array, ...]:
-            predictions = model.apply({"params": layout.in_parts(params)}, images)
-            return predictions.depth, predictions.extrinsics, predictions.depth_confidence
+            variables = {"params": layout.in_parts(params)}
+
+            def one(clip: jax.Array) -> tuple[jax.Array, ...]:
+                predictions = model.apply(variables, clip[None])
+                return predictions.depth[0], predictions.extrinsics[0], predictions.depth_confidence[0]
+
+            # One by one: what a device needs does not grow with the number of clips.
+            found: tuple[jax.Array, ...] = jax.lax.map(one, images)
+            return found
 
         def on_all_devices(params: Any, images: jax.Array) -> tuple[jax.Array, ...]:
             specs = (layout.specs(params), P(DATA_AXIS))

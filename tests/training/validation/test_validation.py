@@ -91,6 +91,38 @@ def test_any_number_of_clips_is_judged_on_any_number_of_devices(pixel_model: Any
         assert judged(devices) == pytest.approx(one, rel=1e-5)
 
 
+def test_what_a_device_needs_does_not_grow_with_the_clips(layered: Any, layered_params: dict[str, Any]) -> None:
+    options = (*ROOMS[:2], ("num_rooms", 8), ROOMS[3])
+    config = ValidationConfig(
+        (SourceConfig("rooms", None, "val", options=options),),
+        every=1,
+        num_clips=1,
+        clip_length=3,
+        stride=2,
+        size=(28, 42),
+    )
+    layout = parameter_layout(layered_params, data_mesh(1), shard=False)
+
+    def temporaries(clips: int) -> int:
+        validation = Validation(layered, dataclasses.replace(config, num_clips=clips), layout)
+        program = validation._predict.lower(layered_params, validation._images).compile()
+        return int(program.memory_analysis().temp_size_in_bytes)
+
+    # Of each further clip its depth and confidence alone, not the sixteen numbers that layers have of every pixel.
+    assert temporaries(8) - temporaries(2) < 4 * 6 * (4 * 3 * 28 * 42)
+
+
+def test_parameters_in_parts_judge_as_whole_ones(layered: Any, layered_params: dict[str, Any]) -> None:
+    source = SourceConfig("rooms", None, "val", options=ROOMS)
+    config = ValidationConfig((source,), every=1, num_clips=4, clip_length=3, stride=2, size=(28, 42))
+
+    def judged(shard: bool) -> dict[str, float]:
+        layout = parameter_layout(layered_params, data_mesh(2), shard=shard)
+        return Validation(layered, config, layout)(layout.put(layered_params)).values
+
+    assert judged(True) == pytest.approx(judged(False), rel=1e-5)
+
+
 def test_each_source_has_its_clips_its_means_and_its_pictures(pixel_model: Any, pixel_params: dict[str, Any]) -> None:
     others = (*ROOMS[:3], ("seed", 5), ROOMS[3])
     sources = (
