@@ -92,7 +92,9 @@ def train(
         tracked = None
         if wandb is not None and not silent:
             tracked = stack.enter_context(WandbRun(wandb, workdir, config.to_dict()))
-        with MetricsLog(workdir, first_step=first, console=Console(), silent=silent, wandb=tracked) as log:
+        with MetricsLog(
+            workdir, first_step=first, anew=position is None, console=Console(), silent=silent, wandb=tracked
+        ) as log:
             log.say(f"{mesh.size} devices, {first}/{config.total_steps} steps done, results in {workdir}")
             run.train(datasets, position, log, stop)
     return run.state
@@ -134,6 +136,7 @@ class _Run:
         # The checkpoint of step 0 is there to show that one can be written: nothing is lost by beginning again.
         if resume_step is None and not any(self.checkpoints.steps):
             params = initial_parameters(config.model, seed=config.seed, weights=config.initial_weights)
+            self.checkpoints.begin_anew()
             self.state = self.program.initial_state(params)
             return 0, None
         like = self.program.abstract_state(self.shapes)

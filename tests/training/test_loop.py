@@ -606,6 +606,35 @@ def test_settings_may_change_until_a_step_is_done(run_config: TrainConfig, tmp_p
     assert int(train(other, tmp_path, mesh=data_mesh(1)).step) == 6
 
 
+@pytest.mark.parametrize("best", [0, 3])
+def test_a_run_that_begins_anew_keeps_no_validation_of_the_start_before(
+    best: int, run_config: TrainConfig, tmp_path: Path
+) -> None:
+    values = {f"validation/{name}": 0.0 for name in (*VALIDATION_METRICS, "constant_abs_rel", "identity_rotation")}
+
+    def judge(patch: pytest.MonkeyPatch, *errors: float) -> None:
+        judged = iter(errors)
+        patch.setattr(
+            loop, "Validation", lambda *_: lambda _: Judgement({**values, "validation/abs_rel": next(judged)}, {})
+        )
+
+    config = dataclasses.replace(_validated(run_config, best="abs_rel"), save_every=100)
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyError, match="crash"):
+        judge(patch, 0.2, 0.1 if best else 0.3)
+        _at_step(patch, 4, _crash)
+        train(config, tmp_path, mesh=data_mesh(1))
+    kept = read_provenance(tmp_path / "best").training
+    assert kept is not None and kept.steps == best
+    other = dataclasses.replace(_validated(run_config), loss=dataclasses.replace(run_config.loss, alpha=0.5))
+    with pytest.MonkeyPatch.context() as patch:
+        judge(patch, 0.9, 0.8, 0.7)
+        train(other, tmp_path, mesh=data_mesh(1))
+    errors = [entry["validation/abs_rel"] for entry in _numbers(tmp_path) if "validation/abs_rel" in entry]
+    assert errors == [0.9, 0.8, 0.7]
+    # What had learned something is not thrown away.
+    assert [path.name for path in tmp_path.glob("best*")] == (["best.aside"] if best else [])
+
+
 def test_a_run_goes_on_when_its_initial_weights_are_gone(
     run_config: TrainConfig, straight: tuple[TrainState, Path], finished: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

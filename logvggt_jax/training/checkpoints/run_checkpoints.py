@@ -161,6 +161,21 @@ class RunCheckpoints:
                     write_text(self._honoured, json.dumps({"resume_step": step}))
         return state, position
 
+    def begin_anew(self) -> None:
+        """Takes away the `best` model of a start that was given up before its first save: aside where it had learned,
+        for good where it is what that start began with."""
+        step = self.models.best_step if jax.process_index() == 0 else None
+        if step is None:
+            return
+        best = self.models.best
+        with disk_errors(self.folder):
+            if step > 0:
+                logging.warning("the run begins anew; best model, of step %d, moved to %s", step, _set_aside(best))
+                return
+            # Under another name first, which `remove_scratch` knows: what is deleted by half is no model.
+            leaving = best.rename(best.with_name(f"{best.name}.{step}.partial"))
+        shutil.rmtree(leaving, ignore_errors=True)
+
     @staticmethod
     def _copied(tree: Any) -> Any:
         """Arrays on the host of process 0, nothing on the others; all have to call this at the same point."""

@@ -31,8 +31,9 @@ class MetricsLog:
       productive_seconds: what earlier sessions spent on the steps that are left of them.
 
     On a run that resumes at `first_step`, lines of later steps (of the run that was interrupted) are dropped, so
-    that the file reads like one uninterrupted run. Raises DiskError where one of the files cannot be written, at once:
-    a run whose metrics have a hole is not one that was left alone.
+    that the file reads like one uninterrupted run; on one that begins `anew`, perhaps with other settings, the metrics
+    of step 0 too. Raises DiskError where one of the files cannot be written, at once: a run whose metrics have a hole
+    is not one that was left alone.
     """
 
     def __init__(
@@ -40,6 +41,7 @@ class MetricsLog:
         workdir: Path,
         *,
         first_step: int,
+        anew: bool = False,
         console: Console,
         silent: bool = False,
         wandb: WandbRun | None = None,
@@ -56,11 +58,12 @@ class MetricsLog:
         times = workdir / TIMES_NAME
         with disk_errors(workdir):
             workdir.mkdir(parents=True, exist_ok=True)
-            for path in (self.path, times):
-                _drop_later_lines(path, first_step)
+            _drop_lines(self.path, beginning=0 if anew else first_step + 1)
+            # The goodput counts from the first start, whatever its settings were.
+            _drop_lines(times, beginning=first_step + 1)
             # Without a buffer, which would fail once more when it is closed.
             self._file, self._times = self.path.open("ab", buffering=0), times.open("ab", buffering=0)
-        self._events = EventFile(workdir / "tensorboard", purge_step=first_step + 1)
+        self._events = EventFile(workdir / "tensorboard", purge_step=0 if anew else first_step + 1)
         known = [entry for entry in read_metrics(times) if {"time", "productive_seconds"} <= entry.keys()]
         if known:
             self.started = known[0]["time"]
@@ -131,8 +134,9 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
     return entries
 
 
-def _drop_later_lines(path: Path, last_step: int) -> None:
+def _drop_lines(path: Path, *, beginning: int) -> None:
+    """Leaves the lines of the steps before `beginning`."""
     if not path.exists():
         return
-    kept = [entry for entry in read_metrics(path) if entry["step"] <= last_step]
+    kept = [entry for entry in read_metrics(path) if entry["step"] < beginning]
     write_text(path, "".join(json.dumps(entry) + "\n" for entry in kept))

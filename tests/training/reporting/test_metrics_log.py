@@ -77,6 +77,21 @@ def test_resumed_run_replaces_later_lines_and_an_unfinished_one(tmp_path: Path) 
     assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
 
 
+def test_a_run_that_begins_anew_replaces_step_0_and_keeps_when_it_began(tmp_path: Path) -> None:
+    with _log(tmp_path, 0) as log:
+        log.write(0, {"validation/abs_rel": 0.5})
+    (earlier,) = (tmp_path / "tensorboard").iterdir()
+    earlier.unlink()
+    times = (tmp_path / TIMES_NAME).read_bytes()
+    with MetricsLog(tmp_path, first_step=0, anew=True, console=Console(quiet=True)) as log:
+        log.write(0, {"validation/abs_rel": 0.25})
+    assert [entry["validation/abs_rel"] for entry in read_metrics(tmp_path / FILE_NAME)] == [0.25]
+    assert (tmp_path / TIMES_NAME).read_bytes() == times
+    (file,) = (tmp_path / "tensorboard").iterdir()
+    begun = [event.step for event in _events(file.read_bytes()) if event.HasField("session_log")]
+    assert begun == [0], "where it takes over from the start before"
+
+
 def test_damaged_lines_cost_a_resumed_run_no_others(tmp_path: Path) -> None:
     with _log(tmp_path, 0) as log:
         for step in range(1, 4):
