@@ -40,7 +40,7 @@ from logvggt_jax.training.step.program import abstract_parameters, make_program
 from logvggt_jax.training.step.state import TrainState
 from logvggt_jax.training.steps_in_flight import StepsInFlight
 from logvggt_jax.training.teaching.run_data import open_data
-from logvggt_jax.training.validation.earlier import is_best, is_validated
+from logvggt_jax.training.validation.earlier import VALIDATION_SET, is_best, is_validated, validation_digest
 from logvggt_jax.training.validation.validation import Validation, validation_line
 
 
@@ -312,7 +312,7 @@ class _Run:
             # Before the line of this validation: a run that is killed between the two validates again.
             best = self._keep_if_best(step, values, log)
         log.show(step, pictures)
-        log.write(step, values)
+        log.write(step, values, **{VALIDATION_SET: validation_digest(self.config)})
         log.say(
             f"validation after step {step} ({duration(time.perf_counter() - started)}): {validation_line(values)}{best}"
         )
@@ -324,7 +324,12 @@ class _Run:
             return ""
         # Process 0 has the earlier values and decides.
         better = not log.silent and is_best(
-            read_metrics(log.path), step, name, values, held=self.checkpoints.models.best_step
+            read_metrics(log.path),
+            step,
+            name,
+            values,
+            held=self.checkpoints.models.best_step,
+            digest=validation_digest(self.config),
         )
         if not any_process(better):
             return ""

@@ -89,8 +89,8 @@ def _at_step(monkeypatch: pytest.MonkeyPatch, step: int, action: Callable[[], No
     """Does `action` when the metrics of `step` are written."""
     write = MetricsLog.write
 
-    def intercept(log: MetricsLog, at: int, values: dict[str, float]) -> None:
-        write(log, at, values)
+    def intercept(log: MetricsLog, at: int, values: dict[str, float], **words: str) -> None:
+        write(log, at, values, **words)
         if at == step:
             action()
 
@@ -515,7 +515,10 @@ def test_the_best_model_is_compared_with_the_one_that_is_kept() -> None:
     lines = [{"step": 0, "validation/abs_rel": 0.2}, {"step": 3, "validation/abs_rel": 0.4}]
     name = "validation/abs_rel"
     judged = {
-        held: [is_best(lines, 6, "abs_rel", {name: value}, held) for value in (0.1, 0.3, 0.5, float("nan"))]
+        held: [
+            is_best(lines, 6, "abs_rel", {name: value}, held=held, digest="any")
+            for value in (0.1, 0.3, 0.5, float("nan"))
+        ]
         for held in (None, 0, 3, 9)
     }
     assert judged == {
@@ -524,6 +527,38 @@ def test_the_best_model_is_compared_with_the_one_that_is_kept() -> None:
         3: [True, True, False, False],
         9: [True, False, False, False],
     }
+
+
+def test_the_best_model_is_compared_on_the_same_clips_alone(
+    run_config: TrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    values = {f"validation/{name}": 0.0 for name in (*VALIDATION_METRICS, "constant_abs_rel", "identity_rotation")}
+    judged = iter((0.1, 0.2, 0.5, 0.4, 0.6))
+    monkeypatch.setattr(
+        loop, "Validation", lambda *_: lambda _: Judgement({**values, "validation/abs_rel": next(judged)}, {})
+    )
+
+    def kept(config: TrainConfig) -> int | None:
+        train(config, tmp_path, mesh=data_mesh(1))
+        training = read_provenance(tmp_path / "best").training
+        return None if training is None else training.steps
+
+    first, last = run_config.stages
+    easy = _validated(_at_constant_rate(run_config, first, last), best="abs_rel")
+    assert easy.validation is not None
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyError, match="crash"):
+        _at_step(patch, 4, _crash)
+        train(easy, tmp_path, mesh=data_mesh(1))
+    # Of other clips 0.5 is the first that is known; how often they are judged does not make them others.
+    hard = dataclasses.replace(easy, validation=dataclasses.replace(easy.validation, stride=1))
+    assert kept(hard) == 6
+    often = dataclasses.replace(easy, validation=dataclasses.replace(easy.validation, stride=1, every=100))
+    assert kept(dataclasses.replace(often, stages=(first, dataclasses.replace(last, steps=3)))) == 7
+    assert kept(dataclasses.replace(often, stages=(first, dataclasses.replace(last, steps=4)))) == 7
+    lines = [line for line in _numbers(tmp_path) if "validation/abs_rel" in line]
+    assert [line["step"] for line in lines] == [0, 3, 6, 7, 8]
+    sets = [line["validation_set"] for line in lines]
+    assert sets[0] == sets[1] != sets[2] == sets[3] == sets[4]
 
 
 def test_a_run_that_is_killed_between_its_best_model_and_the_line_about_it_shows_both(

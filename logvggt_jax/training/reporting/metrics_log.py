@@ -80,16 +80,17 @@ class MetricsLog:
             self._times.close()
             self._events.close()
 
-    def write(self, step: int, values: dict[str, float]) -> None:
-        """Appends one line {"step", "time" (seconds since 1970), …}; non-finite values become null."""
+    def write(self, step: int, values: Mapping[str, float], **words: str) -> None:
+        """Appends one line {"step", "time" (seconds since 1970), …}; non-finite values become null. Only the line has
+        the `words`."""
         if not self.silent:
-            self._append(self._file, step, values)
+            self._append(self._file, step, values, words)
             self._draw(step, values)
 
     def write_times(self, step: int, values: dict[str, float]) -> None:
         """The same for what differs from one machine and session to the next, in a file of its own."""
         if not self.silent:
-            self._append(self._times, step, values)
+            self._append(self._times, step, values, {})
             self._draw(step, {f"times/{name}": value for name, value in values.items()})
 
     def show(self, step: int, pictures: Mapping[str, np.ndarray]) -> None:
@@ -101,14 +102,14 @@ class MetricsLog:
         if self._wandb is not None:
             self._wandb.show(step, pictures)
 
-    def _append(self, file: FileIO, step: int, values: dict[str, float]) -> None:
+    def _append(self, file: FileIO, step: int, values: Mapping[str, float], words: Mapping[str, str]) -> None:
         finite = {name: value if math.isfinite(value) else None for name, value in values.items()}
-        line = (json.dumps({"step": step, "time": round(time.time(), 3), **finite}) + "\n").encode()
+        line = (json.dumps({"step": step, "time": round(time.time(), 3), **finite, **words}) + "\n").encode()
         with disk_errors(file.name):
             while line:  # what a disk takes before it is full is no error
                 line = line[file.write(line) :]
 
-    def _draw(self, step: int, values: dict[str, float]) -> None:
+    def _draw(self, step: int, values: Mapping[str, float]) -> None:
         finite = {name: value for name, value in values.items() if math.isfinite(value)}
         for name, value in finite.items():
             self._events.add_scalar(step, name, value)

@@ -6,7 +6,24 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from logvggt_jax.training.config import VALIDATION_METRICS
+from logvggt_jax.training.config import VALIDATION_METRICS, TrainConfig
+from logvggt_jax.weights.digests import json_digest
+
+# Of the digest in the line of a validation.
+VALIDATION_SET = "validation_set"
+
+
+def validation_digest(config: TrainConfig) -> str:
+    """Of what decides the clips of validation and their truth: its settings, but for when it is due and what is kept,
+    and the teacher's where that labels them.
+
+    A set that was moved to another folder counts as another one: for some readers the folder is all that tells them
+    apart.
+    """
+    settings = config.to_dict()
+    chosen = {name: value for name, value in settings["validation"].items() if name not in ("every", "best")}
+    labelled = config.teacher is not None and config.teacher.validation
+    return json_digest([chosen, settings["teacher"] if labelled else None])
 
 
 def is_validated(lines: Sequence[Mapping[str, Any]], step: int) -> bool:
@@ -15,15 +32,27 @@ def is_validated(lines: Sequence[Mapping[str, Any]], step: int) -> bool:
 
 
 def is_best(
-    lines: Sequence[Mapping[str, Any]], step: int, metric: str, values: Mapping[str, float], held: int | None
+    lines: Sequence[Mapping[str, Any]],
+    step: int,
+    metric: str,
+    values: Mapping[str, float],
+    *,
+    held: int | None,
+    digest: str,
 ) -> bool:
     """Whether the metric's value of this step is better than that of the model that is `held`, of another step; None:
     of no one.
 
     Where nothing is known of that step, it has to be better than every validation before. What is no number is not.
+    Values on other clips tell nothing: only lines with this `digest` count, and those of earlier versions, which have
+    none, so that a model that was kept before does not give place to a worse one.
     """
     name = f"validation/{metric}"
     sign = 1.0 if VALIDATION_METRICS[metric] else -1.0
-    known = {line["step"]: sign * line[name] for line in lines if line["step"] < step and line.get(name) is not None}
+    known = {
+        line["step"]: sign * line[name]
+        for line in lines
+        if line["step"] < step and line.get(name) is not None and line.get(VALIDATION_SET, digest) == digest
+    }
     rivals = [] if held is None else [known[held]] if held in known else known.values()
     return math.isfinite(values[name]) and sign * values[name] > max(rivals, default=-math.inf)
