@@ -1,4 +1,4 @@
-"""What a run will need, tried in minutes before it is queued: network, data, folder, and the step."""
+"""What a run will need, tried in minutes before it is queued: network, folder, weights, data, and the step."""
 
 from __future__ import annotations
 
@@ -23,16 +23,19 @@ from logvggt_jax.files import check_writable
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.training.checkpoints.checkpoint_files import Position
 from logvggt_jax.training.checkpoints.run_checkpoints import RunCheckpoints
-from logvggt_jax.training.config import SourceConfig, StageConfig, TeacherConfig, TrainConfig
+from logvggt_jax.training.config import SourceConfig, StageConfig, TeacherConfig, TrainConfig, ValidationConfig
 from logvggt_jax.training.feeding.batches import stage_batches
-from logvggt_jax.training.feeding.sources import open_sources
+from logvggt_jax.training.feeding.sources import open_source, open_sources
 from logvggt_jax.training.feeding.truth import check_depth, check_truth
 from logvggt_jax.training.parallel.agreement import any_process, check_shared
-from logvggt_jax.training.parallel.sharding import DATA_AXIS, check_batch_size, split
+from logvggt_jax.training.parallel.sharding import DATA_AXIS, check_batch_size, parameter_layout, split
 from logvggt_jax.training.step.costs import step_costs
+from logvggt_jax.training.step.initialization import check_weights
 from logvggt_jax.training.step.program import abstract_parameters, make_program
+from logvggt_jax.training.teaching.labelling import unlabelled
 from logvggt_jax.training.teaching.run_data import label
 from logvggt_jax.training.teaching.teacher import PlainVGGT, Teacher
+from logvggt_jax.training.validation.validation import Validation, clip_starts
 
 CLIPS = 20
 _EXCHANGED_BYTES = 2**26
@@ -40,8 +43,9 @@ _GIB = 2**30
 
 
 def preflight(config: TrainConfig, workdir: Path, mesh: Mesh, say: Callable[[str], None] = print) -> None:
-    """Tries what a run does later: an all-reduce, clips of every source (of those of a teacher one a process), a
-    checkpoint, the steps' compilation.
+    """Tries what a run does later: an all-reduce, to go on from what the folder holds, or else the sizes of the initial
+    weights, clips of every source (of those of a teacher one a process) and of validation, a checkpoint, the steps'
+    compilation.
 
     All processes do it together; process 0 says a line for each. Nothing is left in `workdir`. Raises InputError at
     the end where something failed on a process, and at once where the folder is not shared.
@@ -66,6 +70,11 @@ def preflight(config: TrainConfig, workdir: Path, mesh: Mesh, say: Callable[[str
             say(f"{what}: {found} ({time.perf_counter() - started:.1f} s)")
 
     attempt("all-reduce", lambda: _all_reduce(mesh))
+    resumed: list[int] = []
+    attempt("work folder", lambda: _work_folder(config, workdir, resumed))
+    weights = config.initial_weights
+    if weights is not None:
+        attempt("initial weights", lambda: _initial_weights(config, weights, resumed))
     datasets: dict[str, Dataset] = {}
 
     def find_data() -> str:
@@ -99,6 +108,9 @@ def preflight(config: TrainConfig, workdir: Path, mesh: Mesh, say: Callable[[str
     for source in config.data.sources:
         if source.name in datasets:
             attempt(source.name, functools.partial(_read_clips, datasets[source.name], source, config))
+    validation = config.validation
+    if validation is not None:
+        attempt("validation", lambda: _validation(config, validation, mesh))
     attempt("checkpoint", lambda: _checkpoint(config, workdir, mesh))
     for stage in config.stages:
         attempt(f"step of {stage.name}", functools.partial(_compile, config, stage, mesh))
@@ -125,6 +137,21 @@ def _all_reduce(mesh: Mesh) -> str:
     if not bool(jnp.all(total == expected)):
         raise InputError(f"the sum over {mesh.size} devices is {float(total[0])}, expected {expected}")
     return f"{_EXCHANGED_BYTES / 2**20:.0f} MiB over {mesh.size} devices in {seconds * 1e3:.1f} ms"
+
+
+def _work_folder(config: TrainConfig, workdir: Path, resumed: list[int]) -> str:
+    step = RunCheckpoints(workdir, config).resumed_step()
+    if step is None:
+        return f"a run begins in {workdir}"
+    resumed.append(step)
+    return f"a run goes on from step {step} in {workdir}"
+
+
+def _initial_weights(config: TrainConfig, weights: str, resumed: list[int]) -> str:
+    if resumed:
+        return f"{weights} not needed, the run goes on from its own"
+    check_weights(config.model, weights)
+    return f"{weights} found, of the model's sizes"
 
 
 def _teacher(config: TrainConfig, settings: TeacherConfig, teachers: list[Teacher]) -> str:
@@ -158,6 +185,19 @@ def _read_clips(dataset: Dataset, source: SourceConfig, config: TrainConfig) -> 
     if broken.count > math.ceil(config.data.max_broken * CLIPS):
         raise InputError(f"{broken.count} of {CLIPS} clips are broken: {printable('; '.join(broken.messages))}")
     return f"{CLIPS} clips of {stage.clip_length} frames, {rate:.1f} a second in one process, {broken.count} broken"
+
+
+def _validation(config: TrainConfig, settings: ValidationConfig, mesh: Mesh) -> str:
+    count = settings.num_clips * len(settings.sources)
+    clips = f"{count} clips of {settings.clip_length} frames at {settings.size[0]}x{settings.size[1]}"
+    if config.teacher is not None and config.teacher.validation:
+        # To label them takes hours; how long they are is known before.
+        for source in settings.sources:
+            clip_starts(source.name, unlabelled(open_source(source), config.teacher), settings)
+        return f"{clips}, to be labelled"
+    layout = parameter_layout(abstract_parameters(config.model), mesh, shard=config.shard_parameters)
+    Validation(LogVGGT(config.model), settings, layout)
+    return f"{clips}, read"
 
 
 def _checkpoint(config: TrainConfig, workdir: Path, mesh: Mesh) -> str:

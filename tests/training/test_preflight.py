@@ -4,17 +4,24 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
+import jax
+import numpy as np
 import pytest
 from pixel_teacher import PixelTeacher
 
 from logvggt_jax.data.registry import open_dataset
 from logvggt_jax.errors import DiskError, InputError
 from logvggt_jax.training import preflight as module
+from logvggt_jax.training.checkpoints.checkpoint_files import Position, write_checkpoint
 from logvggt_jax.training.checkpoints.run_checkpoints import RunCheckpoints
-from logvggt_jax.training.config import TeacherConfig, TrainConfig
+from logvggt_jax.training.config import TeacherConfig, TrainConfig, ValidationConfig
 from logvggt_jax.training.parallel.sharding import data_mesh
 from logvggt_jax.training.preflight import preflight
+from logvggt_jax.training.step import initialization
 from logvggt_jax.training.step.costs import StepCosts
+from logvggt_jax.training.step.program import make_program
+from logvggt_jax.weights.address import resolve
+from logvggt_jax.weights.checkpoints import read_config
 
 
 @pytest.fixture
@@ -36,10 +43,11 @@ def test_everything_is_tried_and_nothing_is_left(
     lines: list[str] = []
     preflight(run_config, tmp_path, data_mesh(2), lines.append)
     assert [line.split(":")[0] for line in lines] == [
-        "all-reduce", "data sets", "rooms", "checkpoint", "step of first", "step of second", "preflight",
+        "all-reduce", "work folder", "data sets", "rooms", "checkpoint", "step of first", "step of second", "preflight",
     ]  # fmt: skip
     assert "64 MiB over 2 devices" in lines[0]
-    assert "20 clips of 2 frames" in lines[2] and "0 broken" in lines[2]
+    assert lines[1].startswith(f"work folder: a run begins in {tmp_path}")
+    assert "20 clips of 2 frames" in lines[3] and "0 broken" in lines[3]
     assert lines[-1] == "preflight: all is well"
     assert compiled == [(1, 2, (28, 42)), (1, 3, (28, 42))]
     assert not list(tmp_path.iterdir())
@@ -71,10 +79,78 @@ def test_of_a_teachers_clips_one_is_labelled(
             preflight(config, tmp_path, data_mesh(1), lines.append)
         return
     preflight(config, tmp_path, data_mesh(1), lines.append)
-    assert [line.split(":")[0] for line in lines[1:5]] == ["data sets", "teacher", "labels", "rooms"]
-    assert "one clip a process labelled; rooms, with clips for every stage" in lines[3]
-    assert "20 clips of 2 frames" in lines[4] and "0 broken" in lines[4]
+    assert [line.split(":")[0] for line in lines[2:6]] == ["data sets", "teacher", "labels", "rooms"]
+    assert "one clip a process labelled; rooms, with clips for every stage" in lines[4]
+    assert "20 clips of 2 frames" in lines[5] and "0 broken" in lines[5]
     assert teacher.calls == len(list((cache / "teacher").iterdir())) == 1
+
+
+@pytest.mark.parametrize("clip_length", [4, 5])
+def test_clips_of_validation_are_no_longer_than_those_of_the_teacher_that_labels_them(
+    clip_length: int, run_config: TrainConfig
+) -> None:
+    config = dataclasses.replace(
+        run_config,
+        loss=dataclasses.replace(run_config.loss, name="distillation"),
+        data=dataclasses.replace(run_config.data, cache_dir="cache"),
+        teacher=TeacherConfig("anything", clip_length=4),
+    )
+    settings = _validated(run_config, clip_length)
+    if clip_length == 4:
+        assert "to be labelled" in module._validation(config, settings, data_mesh(1))
+        return
+    with pytest.raises(InputError, match="validation: data set 'rooms' has 0 sequences of at least 5 frames"):
+        module._validation(config, settings, data_mesh(1))
+
+
+def _validated(config: TrainConfig, clip_length: int) -> ValidationConfig:
+    source = dataclasses.replace(config.data.sources[0], split="val")
+    return ValidationConfig((source,), every=3, num_clips=2, clip_length=clip_length, stride=1, size=(28, 42))
+
+
+@pytest.fixture
+def begun(run_config: TrainConfig, pixel_model: Any, pixel_params: Any, tmp_path: Path) -> Path:
+    """The folder of a run that has done three steps."""
+    state = make_program(pixel_model, run_config, pixel_params, data_mesh(1)).initial_state(pixel_params)
+    after = jax.device_get(state)._replace(step=np.int32(3))
+    write_checkpoint(tmp_path / "begun" / "checkpoints" / "3", after, Position(0, {}), run_config)
+    return tmp_path / "begun"
+
+
+def test_what_would_end_a_run_at_once_is_named(
+    run_config: TrainConfig,
+    compiled: list[tuple[Any, ...]],
+    begun: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(module, "_checkpoint", lambda *_: "written")
+    other = dataclasses.replace(
+        run_config, seed=7, initial_weights=str(tmp_path / "none"), validation=_validated(run_config, 9)
+    )
+    lines: list[str] = []
+    with pytest.raises(InputError, match="3 of the tries failed: work folder, initial weights, validation"):
+        preflight(other, begun, data_mesh(1), lines.append)
+    failed = [line for line in lines if "FAILED" in line]
+    for line, reason in zip(failed, ("seed=0, now 7", "no such file", "0 sequences of at least 9 frames"), strict=True):
+        assert reason in line
+    # A run that goes on does not look at its initial weights, which may be gone.
+    lines.clear()
+    preflight(
+        dataclasses.replace(other, seed=0, validation=_validated(run_config, 8)), begun, data_mesh(1), lines.append
+    )
+    assert "work folder: a run goes on from step 3" in lines[1] and "not needed" in lines[2]
+    assert any(line.startswith("validation: 2 clips of 8 frames at 28x42, read") for line in lines)
+
+
+def test_initial_weights_of_other_sizes_are_named_and_no_parameter_is_read(
+    run_config: TrainConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(initialization, "from_pretrained", lambda *_, **__: pytest.fail("the weights were read"))
+    fitting = dataclasses.replace(run_config, model=read_config(resolve("rooms")))
+    assert "rooms found" in module._initial_weights(fitting, "rooms", [])
+    with pytest.raises(InputError, match=r"initial_weights=rooms: .* has shape .*, config\.model asks for"):
+        module._initial_weights(run_config, "rooms", [])
 
 
 def test_all_that_fails_is_named_at_the_end(

@@ -161,6 +161,24 @@ class RunCheckpoints:
                     write_text(self._honoured, json.dumps({"resume_step": step}))
         return state, position
 
+    def resumed_step(self) -> int | None:
+        """The step that `restore` would go on from, as far as descriptions tell; None where a run begins anew.
+
+        Raises InputError for a checkpoint of another configuration, and DamagedCheckpoint where no description can be
+        read.
+        """
+        steps = self.steps if any(self.steps) else []
+        for step in reversed(steps):
+            try:
+                stored = StoredCheckpoint(self.folder / str(step))
+            except DamagedCheckpoint:
+                if step == steps[0]:
+                    raise
+                continue  # as a run does, which goes on from the one before
+            check_configuration(stored, self.config)
+            return step
+        return None
+
     def begin_anew(self) -> None:
         """Takes away the `best` model of a start that was given up before its first save: aside where it had learned,
         for good where it is what that start began with."""

@@ -10,7 +10,8 @@ from logvggt_jax.config import ModelConfig
 from logvggt_jax.errors import InputError
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.model.parameters import stack_layers
-from logvggt_jax.weights.checkpoints import first_misfit, from_pretrained
+from logvggt_jax.weights.address import resolve
+from logvggt_jax.weights.checkpoints import first_misfit, from_pretrained, read_config
 from logvggt_jax.weights.vggt import parameter_shapes
 
 
@@ -27,9 +28,20 @@ def initial_parameters(config: ModelConfig, *, seed: int, weights: str | None = 
             model, images = LogVGGT(config), jnp.zeros((1, 1, patch, patch, 3))
             return jax.device_get(stack_layers(model.init(jax.random.key(seed), images)["params"]))
         params = from_pretrained(weights, point_head=config.point_head is not None)[1]["params"]
-        if wrong := first_misfit(params, parameter_shapes(config), "config.model"):
-            raise InputError(f"initial_weights={weights}: {wrong}; give config.model the sizes of the checkpoint")
+        _check_fit(params, config, weights)
         return jax.device_get(stack_layers(params))
+
+
+def check_weights(config: ModelConfig, weights: str) -> None:
+    """Raises InputError where `initial_parameters` would for `weights`, as far as is seen without reading a parameter;
+    those of a hub are downloaded."""
+    found = read_config(resolve(weights), point_head=config.point_head is not None)
+    _check_fit(parameter_shapes(found), config, weights)
+
+
+def _check_fit(params: Any, config: ModelConfig, weights: str) -> None:
+    if wrong := first_misfit(params, parameter_shapes(config), "config.model"):
+        raise InputError(f"initial_weights={weights}: {wrong}; give config.model the sizes of the checkpoint")
 
 
 def _on_host() -> contextlib.AbstractContextManager[Any]:

@@ -89,6 +89,15 @@ def taught(
     return TaughtDataset(dataset, clips, teacher.digest)
 
 
+def unlabelled(dataset: Dataset, config: TeacherConfig) -> TaughtDataset:
+    """The clips that `taught` would label, for whoever asks how many there are and how long: none can be read."""
+    clips = {
+        f"{sequence}@{frames[0]}": TaughtClip(sequence, frames, dataset.image_size(sequence), Path())
+        for sequence, frames in _cut(dataset, config)
+    }
+    return TaughtDataset(dataset, clips, teacher="")
+
+
 def _cut(dataset: Dataset, config: TeacherConfig) -> Iterator[tuple[str, tuple[int, ...]]]:
     """Sequence and frames of every clip."""
     span = (config.clip_length - 1) * config.stride + 1

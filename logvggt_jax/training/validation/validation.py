@@ -118,8 +118,9 @@ def _means(results: list[dict[str, float | None]], prefix: str) -> dict[str, flo
     return {f"{prefix}/{name}": value for name, value in means.items()}
 
 
-def _read_clips(name: str, dataset: Dataset, config: ValidationConfig) -> list[Frames]:
-    span = (config.clip_length - 1) * config.stride + 1
+def clip_starts(name: str, dataset: Dataset, config: ValidationConfig) -> list[tuple[str, int]]:
+    """Sequence and first frame of every clip of a data set; InputError where it has not as many."""
+    span = _span(config)
     # Starts that a sequence has room for.
     room = {sequence: dataset.num_frames(sequence) - span + 1 for sequence in dataset.sequences}
     sequences = [sequence for sequence in dataset.sequences if room[sequence] > 0][: config.num_clips]
@@ -130,12 +131,23 @@ def _read_clips(name: str, dataset: Dataset, config: ValidationConfig) -> list[F
             f"num_clips={config.num_clips} needs more or longer ones, {longest(dataset)}; lower num_clips, clip_length "
             "or stride"
         )
-    clips = []
-    for sequence in sequences:
-        for start in np.linspace(0, room[sequence] - 1, counts[sequence]).round().astype(int):
-            frames = dataset.read(sequence, range(start, start + span, config.stride))
-            clips.append(fit(frames, config.size))
-    return clips
+    return [
+        (sequence, int(start))
+        for sequence in sequences
+        for start in np.linspace(0, room[sequence] - 1, counts[sequence]).round()
+    ]
+
+
+def _span(config: ValidationConfig) -> int:
+    """Frames of a sequence from the first to the last of a clip."""
+    return (config.clip_length - 1) * config.stride + 1
+
+
+def _read_clips(name: str, dataset: Dataset, config: ValidationConfig) -> list[Frames]:
+    return [
+        fit(dataset.read(sequence, range(start, start + _span(config), config.stride)), config.size)
+        for sequence, start in clip_starts(name, dataset, config)
+    ]
 
 
 def _clip_metrics(depth: np.ndarray, extrinsics: np.ndarray, clip: Frames) -> dict[str, float | None]:
