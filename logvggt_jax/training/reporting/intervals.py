@@ -27,7 +27,7 @@ def report_interval(
     bytes that a device of this process held.
     """
     speed = times.read(stage)
-    log.write(step, {**values, "frames_per_second": speed.frames_per_second})
+    log.write(step, values)
     stage_seconds = times.remaining_seconds(step, end)
     later = len(config.stages) - 1 - config.stages.index(stage)
     run_seconds = times.remaining_seconds(step, compilations=later)
@@ -35,6 +35,7 @@ def report_interval(
         step,
         {
             "productive_seconds": times.productive,
+            "frames_per_second": speed.frames_per_second,
             "data_share": speed.data_share,
             "stage_seconds_left": stage_seconds,
             "run_seconds_left": run_seconds,

@@ -19,7 +19,7 @@ from logvggt_jax.training.reporting.event_file import EventFile
 from logvggt_jax.training.reporting.wandb_run import WandbRun
 
 FILE_NAME = "metrics.jsonl"
-# Beside the metrics, which are the same however often a run was interrupted.
+# Beside the metrics, whose file is the same, byte by byte, however often a run was interrupted.
 TIMES_NAME = "times.jsonl"
 
 
@@ -81,16 +81,16 @@ class MetricsLog:
             self._events.close()
 
     def write(self, step: int, values: Mapping[str, float], **words: str) -> None:
-        """Appends one line {"step", "time" (seconds since 1970), …}; non-finite values become null. Only the line has
-        the `words`."""
+        """Appends one line {"step", …}; non-finite values become null. Only the line has the `words`."""
         if not self.silent:
-            self._append(self._file, step, values, words)
+            self._append(self._file, {"step": step, **_finite(values), **words})
             self._draw(step, values)
 
     def write_times(self, step: int, values: dict[str, float]) -> None:
-        """The same for what differs from one machine and session to the next, in a file of its own."""
+        """The same for what differs from one machine and session to the next, in a file of its own, with `time`
+        (seconds since 1970)."""
         if not self.silent:
-            self._append(self._times, step, values, {})
+            self._append(self._times, {"step": step, "time": round(time.time(), 3), **_finite(values)})
             self._draw(step, {f"times/{name}": value for name, value in values.items()})
 
     def show(self, step: int, pictures: Mapping[str, np.ndarray]) -> None:
@@ -102,9 +102,8 @@ class MetricsLog:
         if self._wandb is not None:
             self._wandb.show(step, pictures)
 
-    def _append(self, file: FileIO, step: int, values: Mapping[str, float], words: Mapping[str, str]) -> None:
-        finite = {name: value if math.isfinite(value) else None for name, value in values.items()}
-        line = (json.dumps({"step": step, "time": round(time.time(), 3), **finite, **words}) + "\n").encode()
+    def _append(self, file: FileIO, entry: Mapping[str, Any]) -> None:
+        line = (json.dumps(entry) + "\n").encode()
         with disk_errors(file.name):
             while line:  # what a disk takes before it is full is no error
                 line = line[file.write(line) :]
@@ -120,6 +119,10 @@ class MetricsLog:
         """One line on the terminal."""
         if not self.silent:
             self.console.print(message, highlight=False, soft_wrap=True)
+
+
+def _finite(values: Mapping[str, float]) -> dict[str, float | None]:
+    return {name: value if math.isfinite(value) else None for name, value in values.items()}
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
