@@ -20,7 +20,7 @@ import jax
 from jax.sharding import NamedSharding, PartitionSpec
 
 from logvggt_jax.compile import out_of_device_memory
-from logvggt_jax.errors import InputError, one_line
+from logvggt_jax.errors import InputError, disk_errors, one_line
 from logvggt_jax.files import atomic_folder, to_disk
 from logvggt_jax.model.parameters import stack_layers, unstack_layers
 from logvggt_jax.training.config import TrainConfig
@@ -65,6 +65,9 @@ def write_checkpoint(folder: Path, state: TrainState, position: Position, config
             (fresh / name).mkdir()
             (fresh / name / "metadata").write_text(json.dumps(content))
         to_disk([*fresh.rglob("*"), fresh])
+    # Its name too, before older checkpoints go: a machine may lose its power in between.
+    with disk_errors(folder):
+        to_disk([folder.parent])
 
 
 class StoredCheckpoint:

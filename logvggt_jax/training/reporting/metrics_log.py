@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import time
 from collections.abc import Mapping
 from io import FileIO
@@ -107,6 +108,8 @@ class MetricsLog:
         with disk_errors(file.name):
             while line:  # what a disk takes before it is full is no error
                 line = line[file.write(line) :]
+            # Before the checkpoint of its step: after a loss of power there would be a hole.
+            os.fsync(file.fileno())
 
     def _draw(self, step: int, values: Mapping[str, float]) -> None:
         finite = {name: value for name, value in values.items() if math.isfinite(value)}
