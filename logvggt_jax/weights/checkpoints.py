@@ -36,7 +36,14 @@ from logvggt_jax.weights.hub import licence
 from logvggt_jax.weights.lazy import LazyTensors
 from logvggt_jax.weights.provenance import Provenance
 from logvggt_jax.weights.shipped_models import SHIPPED, shipped_model
-from logvggt_jax.weights.vggt import ConversionReport, config_from_vggt, parameter_shapes, params_from_vggt, vggt_rules
+from logvggt_jax.weights.vggt import (
+    ConversionReport,
+    check_vggt,
+    config_from_vggt,
+    parameter_shapes,
+    params_from_vggt,
+    vggt_rules,
+)
 
 _UNKNOWN = Provenance()
 _VGGT_LONGER_EDGE = 518
@@ -186,7 +193,11 @@ def read_licence(path_or_repo: str | Path) -> str | None:
 
 
 def read_config(path: str | Path, *, dtype: str | None = None, point_head: bool = False) -> ModelConfig:
-    """The sizes of the model that `from_pretrained` would give; reads no parameter. `path` is local, see `resolve`."""
+    """The sizes of the model that `from_pretrained` would give; reads no parameter. `path` is local, see `resolve`.
+
+    Raises InputError as `from_pretrained`, for what can be seen without reading parameters: of a VGGT checkpoint its
+    tensors' names, shapes and types.
+    """
     path = Path(path)
     if path.is_dir() and is_model_folder(path):
         with _naming(path / "config.json"):
@@ -194,6 +205,7 @@ def read_config(path: str | Path, *, dtype: str | None = None, point_head: bool 
     else:
         with open_state_dict(path) as state_dict, _naming(path):
             config = config_from_vggt(state_dict, point_head=point_head)
+            check_vggt(state_dict, config)
     return config if dtype is None else dataclasses.replace(config, dtype=dtype)
 
 
@@ -269,7 +281,7 @@ def convert(
                 progress.advance(task)
                 return state_dict[name]
 
-            params, report = params_from_vggt(LazyTensors(list(state_dict), read), config)
+            params, report = params_from_vggt(LazyTensors(list(state_dict), read, header=state_dict.header), config)
     with progress_console.status("Writing the model folder"):
         save_model(destination, config, params, _vggt_provenance(source, trained_for), replace=overwrite)
     Console().print(

@@ -1,7 +1,7 @@
 """VGGT checkpoint files: which file a path means, and its tensors read one by one."""
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 
@@ -11,7 +11,7 @@ import safetensors
 from logvggt_jax.errors import InputError, MissingInput, disk_errors, one_line
 from logvggt_jax.files import open_regular
 from logvggt_jax.weights.content import content_of
-from logvggt_jax.weights.lazy import LazyTensors, refused_type
+from logvggt_jax.weights.lazy import Header, LazyTensors, refused_type
 from logvggt_jax.weights.shards import INDEX_SUFFIX, is_shard, present_shards, read_index
 from logvggt_jax.weights.state_dicts import plain_names
 from logvggt_jax.weights.torch_zip import open_torch_zip
@@ -29,8 +29,11 @@ _USUAL_NAMES = (
 # What trainers write beside the model.
 _NO_MODEL = re.compile(r"optim|sched|rng_state|random_state|sampler|scaler|training_args", re.IGNORECASE)
 _DISTRIBUTED = ".distcp"
-_FLOATS = {"F64", "F32", "F16", "BF16"}
-_INTEGERS = {"I64", "I32", "I16", "I8", "U64", "U32", "U16", "U8", "BOOL"}
+# Types of safetensors that are read, and numpy's names of them.
+_FLOATS = {"F64": "float64", "F32": "float32", "F16": "float16", "BF16": "bfloat16"}
+_SIGNED = {"I64": "int64", "I32": "int32", "I16": "int16", "I8": "int8", "BOOL": "bool"}
+_UNSIGNED = {"U64": "uint64", "U32": "uint32", "U16": "uint16", "U8": "uint8"}
+_DTYPES = _FLOATS | _SIGNED | _UNSIGNED
 
 
 def find_weights(path: Path) -> Path:
@@ -83,7 +86,7 @@ def choose_weights(names: Sequence[str], where: str, prefix: str) -> str:
     raise InputError(f"{where}: holds several checkpoints, {', '.join(weights)}; give one as {prefix}{weights[0]}")
 
 
-def open_state_dict(path: str | Path) -> AbstractContextManager[Mapping[str, np.ndarray]]:
+def open_state_dict(path: str | Path) -> AbstractContextManager[LazyTensors]:
     """Opens a checkpoint file, or a folder that holds one: PyTorch names to arrays in the file's own dtype.
 
     The content says what the file is: safetensors, an archive of `torch.save`, or the index of several of them. A state
@@ -95,14 +98,19 @@ def open_state_dict(path: str | Path) -> AbstractContextManager[Mapping[str, np.
 
 
 @contextmanager
-def _open_plain(path: Path) -> Iterator[Mapping[str, np.ndarray]]:
+def _open_plain(path: Path) -> Iterator[LazyTensors]:
     with ExitStack() as stack:
         if content_of(path) == "json":
             tensors = _enter_shards(stack, path)
         else:
             tensors = stack.enter_context(_open_file(path))
         names = plain_names(list(tensors), str(path))
-        yield LazyTensors(list(names), lambda name: tensors[names[name]], tensors.origin)
+        yield LazyTensors(
+            list(names),
+            lambda name: tensors[names[name]],
+            tensors.origin,
+            lambda name: tensors.header(names[name]),
+        )
 
 
 def _open_file(path: Path) -> AbstractContextManager[LazyTensors]:
@@ -118,7 +126,11 @@ def _enter_shards(stack: ExitStack, path: Path) -> LazyTensors:
     for tensor, name in weight_map.items():
         if tensor not in shards[name]:
             raise InputError(f"{path}: puts {tensor} into {name}, which lacks it; the shards are of another checkpoint")
-    return LazyTensors(list(weight_map), lambda tensor: shards[weight_map[tensor]][tensor])
+    return LazyTensors(
+        list(weight_map),
+        lambda tensor: shards[weight_map[tensor]][tensor],
+        header=lambda tensor: shards[weight_map[tensor]].header(tensor),
+    )
 
 
 @contextmanager
@@ -134,13 +146,17 @@ def open_safetensors(path: Path) -> Iterator[LazyTensors]:
         ) from error
     with opened as file:
 
+        def header(name: str) -> Header:
+            found = file.get_slice(name)
+            if found.get_dtype() not in _DTYPES:
+                raise refused_type(path, name, found.get_dtype())
+            return Header(tuple(found.get_shape()), _DTYPES[found.get_dtype()])
+
         def read(name: str) -> np.ndarray:
-            dtype = file.get_slice(name).get_dtype()
-            if dtype not in _FLOATS | _INTEGERS:
-                raise refused_type(path, name, dtype)
+            header(name)
             return file.get_tensor(name)
 
-        yield LazyTensors(list(file.keys()), read)
+        yield LazyTensors(list(file.keys()), read, header=header)
 
 
 def _is_weights(name: str) -> bool:

@@ -2,23 +2,39 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from logvggt_jax.errors import InputError
 
 
+class Header(NamedTuple):
+    """What a file says of a tensor before it is read; the type by numpy's name."""
+
+    shape: tuple[int, ...]
+    dtype: str
+
+
 class LazyTensors(Mapping[str, np.ndarray]):
     """A mapping of tensor names, in file order, whose arrays `read` gives each time they are asked for; none is kept.
 
     It keeps the conversion of a 5 GB checkpoint at one copy of the parameters in memory. `origin` says, for errors,
-    which entry of the file it is, where it is not the whole file.
+    which entry of the file it is, where it is not the whole file. `header` gives what is known of a tensor without
+    reading it, None of each where nothing is.
     """
 
-    def __init__(self, names: Sequence[str], read: Callable[[str], np.ndarray], origin: str | None = None) -> None:
+    def __init__(
+        self,
+        names: Sequence[str],
+        read: Callable[[str], np.ndarray],
+        origin: str | None = None,
+        header: Callable[[str], Header | None] = lambda _: None,
+    ) -> None:
         self._names = dict.fromkeys(names)
         self._read = read
         self.origin = origin
+        self.header = header
 
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self._names:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from logvggt_jax.errors import InputError, disk_errors, one_line
-from logvggt_jax.weights.lazy import LazyTensors, refused_type
+from logvggt_jax.weights.lazy import Header, LazyTensors, refused_type
 from logvggt_jax.weights.state_dicts import described, find_state_dict
 from logvggt_jax.weights.unpickling import RefusedError, TensorLayout, UnreadTensor, unpickle
 
@@ -27,7 +27,7 @@ def open_torch_zip(path: Path) -> Iterator[LazyTensors]:
     The archive's pickle is a mapping of names to dense tensors, or a trainer's checkpoint with such a mapping inside;
     yields a lazy mapping of names to read-only arrays in the file's dtype (bfloat16 as `ml_dtypes.bfloat16`). Raises
     InputError: not such an archive, damaged or big-endian, no mapping of tensors in it, or one that holds anything but
-    tensors. Damage inside a storage, and a type that is not read, are raised when the tensor is read.
+    tensors. Damage inside a storage is raised when the tensor is read, a type that is not read with its header too.
     """
     try:
         with disk_errors(path):
@@ -43,17 +43,25 @@ def open_torch_zip(path: Path) -> Iterator[LazyTensors]:
             raise InputError(f"{path}: byte order {order!r:.20} is not supported, expected little-endian; {_MEND}")
         layouts, origin = _layouts(_read(archive, f"{root}data.pkl", path), path)
 
-        def read(name: str) -> np.ndarray:
+        def layout_of(name: str) -> TensorLayout:
             layout = layouts[name]
             if isinstance(layout, UnreadTensor):
                 raise refused_type(path, name, layout.kind)
+            return layout
+
+        def header(name: str) -> Header:
+            layout = layout_of(name)
+            return Header(layout.shape, layout.dtype.name)
+
+        def read(name: str) -> np.ndarray:
+            layout = layout_of(name)
             data = _read(archive, f"{root}data/{layout.key}", path)
             try:
                 return layout.view(data)
             except ValueError as error:
                 raise InputError(f"{path}: tensor {name}: {error}; the file is damaged, copy it again") from error
 
-        yield LazyTensors(list(layouts), read, origin)
+        yield LazyTensors(list(layouts), read, origin, header)
 
 
 def _root(archive: zipfile.ZipFile, path: Path) -> str:

@@ -24,6 +24,7 @@ from logvggt_jax.config import (
 from logvggt_jax.errors import InputError
 from logvggt_jax.model.logvggt import LogVGGT, shallow, variable_shapes
 from logvggt_jax.weights.digests import non_finite
+from logvggt_jax.weights.lazy import Header, LazyTensors
 
 ParamPath = tuple[str, ...]
 Layout = Callable[[np.ndarray], np.ndarray]
@@ -206,6 +207,31 @@ def vggt_rules(config: ModelConfig) -> list[Rule]:
     return rules
 
 
+def check_vggt(state_dict: Mapping[str, np.ndarray], config: ModelConfig) -> None:
+    """Compares a state dict with what a model of this configuration uses: names, and shapes and types as far as they
+    are known without reading tensors. Raises InputError as `params_from_vggt`.
+    """
+    rules = vggt_rules(config)
+    known = {rule.name for rule in rules}
+    heads = _BUFFERS + (("track_head.",) if config.point_head is not None else ("track_head.", "point_head."))
+    unknown = [name for name in state_dict if name not in known and not name.startswith(heads)]
+    if unknown:
+        others = f" and {len(unknown) - 1} others" if len(unknown) > 1 else ""
+        raise InputError(
+            f"unknown key {unknown[0]!r}{others} in the state dict, expected those of VGGT's aggregator, camera_head, "
+            f"depth_head, point_head and track_head{_differences(state_dict, config)}"
+        )
+    missing = [rule.name for rule in rules if rule.name not in state_dict and rule.name != _MASK_TOKEN]
+    if missing:
+        raise InputError(
+            f"{len(missing)} of {len(rules)} keys are missing from the state dict, first {', '.join(missing[:3])}"
+            f"{_differences(state_dict, config)}; {_seen(state_dict)}"
+        )
+    for rule in rules:
+        if rule.name in state_dict and (header := _header(state_dict, rule.name)) is not None:
+            _check_header(rule, header, state_dict, config)
+
+
 def params_from_vggt(
     state_dict: Mapping[str, np.ndarray], config: ModelConfig
 ) -> tuple[dict[str, Any], ConversionReport]:
@@ -216,7 +242,7 @@ def params_from_vggt(
 
     Args:
       state_dict: PyTorch names to arrays in PyTorch layouts, floating point of any width. Each is read once, so a
-        lazy mapping never holds two copies of the weights.
+        lazy mapping never holds two copies of the weights; what its headers tell is checked before.
       config: Sizes of the model; `config_from_vggt` reads them off a state dict.
 
     Returns:
@@ -226,34 +252,16 @@ def params_from_vggt(
       InputError: A name is unknown or missing, or a tensor has another shape, is not floating point, or holds NaN or
         infinite values.
     """
+    check_vggt(state_dict, config)
     rules = vggt_rules(config)
-    report = ConversionReport()
     known = {rule.name for rule in rules}
-    heads = _BUFFERS + (("track_head.",) if config.point_head is not None else ("track_head.", "point_head."))
-    unknown = [name for name in state_dict if name not in known and not name.startswith(heads)]
-    if unknown:
-        others = f" and {len(unknown) - 1} others" if len(unknown) > 1 else ""
-        raise InputError(
-            f"unknown key {unknown[0]!r}{others} in the state dict, expected those of VGGT's aggregator, camera_head, "
-            f"depth_head, point_head and track_head{_differences(state_dict, config)}"
-        )
-    report.skipped = [name for name in state_dict if name not in known]
-    present = [rule for rule in rules if rule.name in state_dict]
-    missing = [rule.name for rule in rules if rule.name not in state_dict and rule.name != _MASK_TOKEN]
-    if missing:
-        raise InputError(
-            f"{len(missing)} of {len(rules)} keys are missing from the state dict, first {', '.join(missing[:3])}"
-            f"{_differences(state_dict, config)}; {_seen(state_dict)}"
-        )
+    report = ConversionReport(skipped=[name for name in state_dict if name not in known])
     params: dict[str, Any] = {}
-    for rule in present:
+    for rule in rules:
+        if rule.name not in state_dict:
+            continue
         tensor = np.asarray(state_dict[rule.name])
-        if tensor.shape != rule.shape:
-            raise InputError(
-                f"{rule.name} has shape {tensor.shape}, expected {rule.shape}{_differences(state_dict, config)}"
-            )
-        if tensor.dtype.name not in _DTYPES:
-            raise InputError(f"{rule.name} is {tensor.dtype.name}, expected one of {', '.join(_DTYPES)}")
+        _check_header(rule, Header(tensor.shape, tensor.dtype.name), state_dict, config)
         tensor = tensor.astype(np.float32, copy=False)
         if wrong := non_finite(tensor):
             raise InputError(f"{rule.name} has {wrong}; the checkpoint is of a training that failed, or damaged")
@@ -277,7 +285,7 @@ def config_from_vggt(state_dict: Mapping[str, np.ndarray], *, point_head: bool =
     24 layers; the camera head runs 4 rounds.
 
     Args:
-      state_dict: PyTorch names to arrays; a dozen small ones are read.
+      state_dict: PyTorch names to arrays; a dozen small ones are read where there are no headers.
       point_head: Whether the model gets the point head, which the checkpoint then has to hold.
 
     Raises:
@@ -288,7 +296,7 @@ def config_from_vggt(state_dict: Mapping[str, np.ndarray], *, point_head: bool =
     def shape(name: str, rank: int) -> tuple[int, ...]:
         if name not in state_dict:
             raise InputError(f"the state dict lacks {name}, which VGGT has; {_seen(state_dict)}")
-        found = np.shape(state_dict[name])
+        found = _shape(state_dict, name)
         if 0 in found:
             raise InputError(
                 f"{name} is empty, as in one process's share of a training in shards; make one file of all shares, "
@@ -352,13 +360,37 @@ def config_from_vggt(state_dict: Mapping[str, np.ndarray], *, point_head: bool =
     )
 
 
+def _header(state_dict: Mapping[str, np.ndarray], name: str) -> Header | None:
+    """What is known of a tensor without reading it; of a mapping of some other kind, which may be lazy too, nothing."""
+    if isinstance(state_dict, LazyTensors):
+        return state_dict.header(name)
+    if isinstance(state_dict, dict):
+        tensor = np.asarray(state_dict[name])
+        return Header(tensor.shape, tensor.dtype.name)
+    return None
+
+
+def _shape(state_dict: Mapping[str, np.ndarray], name: str) -> tuple[int, ...]:
+    header = _header(state_dict, name)
+    return np.shape(state_dict[name]) if header is None else header.shape
+
+
+def _check_header(rule: Rule, header: Header, state_dict: Mapping[str, np.ndarray], config: ModelConfig) -> None:
+    if header.shape != rule.shape:
+        raise InputError(
+            f"{rule.name} has shape {header.shape}, expected {rule.shape}{_differences(state_dict, config)}"
+        )
+    if header.dtype not in _DTYPES:
+        raise InputError(f"{rule.name} is {header.dtype}, expected one of {', '.join(_DTYPES)}")
+
+
 def _seen(state_dict: Mapping[str, np.ndarray]) -> str:
     """Some names of a state dict with their shapes, for the end of an error's line."""
     origin = getattr(state_dict, "origin", None)
     some = []
     for name in list(state_dict)[:3]:
         try:
-            some.append(f"{name} {np.shape(state_dict[name])}")
+            some.append(f"{name} {_shape(state_dict, name)}")
         except InputError:  # damage that has no part in the error at hand
             some.append(name)
     where = f"{origin} holds" if origin else "it holds"

@@ -21,12 +21,14 @@ from logvggt_jax.weights.checkpoints import (
     convert,
     from_pretrained,
     load_model,
+    read_config,
     read_provenance,
     save_model,
     writing_with_orbax,
 )
 from logvggt_jax.weights.digests import digests, verify_digests
 from logvggt_jax.weights.folder import read_description, write_description
+from logvggt_jax.weights.lazy import LazyTensors
 from logvggt_jax.weights.provenance import Provenance
 from logvggt_jax.weights.vggt import params_from_vggt
 
@@ -280,6 +282,36 @@ def test_a_refused_conversion_leaves_nothing(tmp_path, vggt_state_dict):
     ):
         convert(tmp_path / "model.safetensors", tmp_path / "model")
     assert [entry.name for entry in tmp_path.iterdir()] == ["model.safetensors"]
+
+
+def _without(tensors, name):
+    return {other: tensor for other, tensor in tensors.items() if other != name}
+
+
+@pytest.mark.parametrize("suffix", [".safetensors", ".pt"])
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda t: _without(t, "camera_head.token_norm.bias"), r"1 of \d+ keys are missing.*token_norm\.bias"),
+        (lambda t: {**t, "aggregator.gate": np.zeros(3, np.float32)}, "unknown key 'aggregator.gate'"),
+        (lambda t: {**t, "camera_head.embed_pose.weight": np.zeros((32, 8), np.float32)}, r"has shape \(32, 8\), exp"),
+        (lambda t: {**t, "camera_head.embed_pose.bias": np.zeros(32, np.int64)}, "embed_pose.bias is int64, expected"),
+    ],
+)
+def test_names_shapes_and_types_are_checked_before_a_tensor_is_read(
+    tmp_path, vggt_state_dict, write_torch_file, monkeypatch, suffix, change, words
+):
+    file, tensors = tmp_path / f"model{suffix}", change(vggt_state_dict)
+    save_file(tensors, file) if suffix == ".safetensors" else write_torch_file(file, tensors)
+    monkeypatch.setattr(LazyTensors, "__getitem__", lambda _, name: pytest.fail(f"reads {name}"))
+    for check in (read_config, from_pretrained, lambda path: convert(path, tmp_path / "model")):
+        with pytest.raises(InputError, match=rf"^\S+model{suffix}: .*{words}"):
+            check(file)
+
+
+def test_a_sound_checkpoint_tells_its_sizes_without_a_tensor_read(vggt_file, vggt_config, monkeypatch):
+    monkeypatch.setattr(LazyTensors, "__getitem__", lambda _, name: pytest.fail(f"reads {name}"))
+    assert read_config(vggt_file, point_head=True) == vggt_config
 
 
 def test_conversion_checks_the_destination_before_it_reads(tmp_path, vggt_file, saved, monkeypatch):
