@@ -67,7 +67,7 @@ def _reconstruct(options: argparse.Namespace) -> int:
     check_masks(source, method)
     settings = _settings(options, method)
     decides = what_decides(source, config, method, settings, longer_edge, point_filter, calibration)
-    check_leftovers(target, decides, overwrite=options.overwrite)
+    check_leftovers(target, decides, source, overwrite=options.overwrite)
     needs = describe(source, target, config if options.dry_run else None, method, settings, longer_edge, point_filter)
     if provenance.longer_edge not in (None, longer_edge):
         source.notes.append(f"these weights were trained at {provenance.longer_edge} pixels, not {longer_edge}")

@@ -20,6 +20,7 @@ from logvggt_jax.reconstruction.frame_writer import FrameWriter, Picture
 from logvggt_jax.reconstruction.masking import mask_at, without_masked
 from logvggt_jax.reconstruction.points.selection import PointSelection
 from logvggt_jax.reconstruction.result import Reconstruction
+from logvggt_jax.reconstruction.saved_source import check_source, source_facts
 from logvggt_jax.reconstruction.sources import SkippedFrame, Source, SourceFrame
 from logvggt_jax.reconstruction.sources.record import record_source
 from logvggt_jax.reconstruction.watching import Watcher
@@ -195,12 +196,10 @@ class Run:
         arrays |= {f"health/{name}": array for name, array in self._frames.health.arrays().items()}
         arrays |= {f"images/{index}": image for index, image in self._frames.images.items()}
         facts = {
-            "source": self._source.fingerprint(self.num_taken),
-            "num_taken": self.num_taken,
+            **source_facts(self._source, self.num_taken, self._frames.names),
             "names": self._frames.names,
             "timestamps": self._frames.timestamps,
             "masked": self._frames.masked,
-            "masks": None if self._source.masks is None else self._source.masks.fingerprint(self._frames.names),
             "skipped": self._source.skipped,
             "focal_lengths": self._frames.focal_lengths,
             "size": None if self._frames.transform is None else self._frames.transform.original_size,
@@ -214,17 +213,7 @@ class Run:
     def _restore(self, saved: State) -> None:
         facts = saved.facts
         self.num_taken = facts["num_taken"]
-        if self._source.fingerprint(self.num_taken) != facts["source"]:
-            raise InputError(
-                f"{self._source.path} has changed since {self._work.path} was left unfinished: frames that were read "
-                "are other ones, or are taken otherwise; pass --overwrite to start anew"
-            )
-        masks = self._source.masks
-        if (None if masks is None else masks.fingerprint(facts["names"])) != facts.get("masks"):
-            raise InputError(
-                f"the masks of frames that were read have changed since {self._work.path} was left unfinished; pass "
-                "--overwrite to start anew"
-            )
+        check_source(self._source, facts, self._work.found_at)
         self._frames.masked = facts.get("masked", [])  # of earlier versions
         self._frames.focal_lengths = facts.get("focal_lengths", [])
         self._frames.names, self._frames.timestamps = facts["names"], facts["timestamps"]

@@ -12,6 +12,8 @@ from types import TracebackType
 from logvggt_jax.errors import InputError, OutputExists, disk_errors, one_line
 from logvggt_jax.files import FolderLock, atomic_file, check_output, move_folder, to_disk, write_text
 from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE, is_complete
+from logvggt_jax.reconstruction.saved_source import check_source
+from logvggt_jax.reconstruction.sources import Source
 from logvggt_jax.streaming.state_file import State, read_state, write_state
 
 _PROGRESS = ".progress"
@@ -82,19 +84,18 @@ class WorkFolder:
             (self._progress / _STATE).unlink(missing_ok=True)
         write_text(stored, json.dumps(self._request, indent=1))
 
+    @property
+    def found_at(self) -> Path:
+        """Where what can be taken up lay, and lies again where it is not taken up."""
+        return self._output if self._unchanged_result else self.path
+
     def go_on(self) -> None:
         """To be called once the saved state is taken over: what is in the folder changes from here on."""
         self._unchanged_result = False
 
     def saved(self) -> State | None:
         """Where the last `save` was; None for a new run. InputError where the file is damaged."""
-        file = self._progress / _STATE
-        if not file.is_file():
-            return None
-        try:
-            return read_state(file)
-        except InputError as error:
-            raise InputError(f"{error}; {_MEND}") from error
+        return _saved(self.path)
 
     def save(self, state: State, files: Iterable[Path]) -> None:
         """Stores where the run is, once what it rests on, `files`, is on the disk."""
@@ -129,9 +130,9 @@ def is_unfinished(folder: Path) -> bool:
         return (folder / _PROGRESS / _STATE).is_file() and not is_complete(folder / CAMERAS_FILE)
 
 
-def check_leftovers(output: Path, request: Mapping[str, str], *, overwrite: bool) -> None:
-    """Raises what a `WorkFolder` would for what another run has left or is at work on, as far as that can be known
-    without the weights: `request` lacks them and their precision; nothing is taken over."""
+def check_leftovers(output: Path, request: Mapping[str, str], source: Source, *, overwrite: bool) -> None:
+    """Raises what a `WorkFolder` and a run over `source` would for what another run has left or is at work on, as far
+    as that can be known without the weights: `request` lacks them and their precision; nothing is taken over."""
     path = work_path(output)
     with disk_errors(path):
         _check_ours(path)
@@ -140,6 +141,18 @@ def check_leftovers(output: Path, request: Mapping[str, str], *, overwrite: bool
         unfinished = path if path.exists() else output
         if not overwrite and (unfinished / _PROGRESS / _REQUEST).exists():
             _check_request(unfinished, request, unknown=("weights", "precision"))
+            if (saved := _saved(unfinished)) is not None:
+                check_source(source, saved.facts, unfinished)
+
+
+def _saved(folder: Path) -> State | None:
+    file = folder / _PROGRESS / _STATE
+    if not file.is_file():
+        return None
+    try:
+        return read_state(file)
+    except InputError as error:
+        raise InputError(f"{error}; {_MEND}") from error
 
 
 def _check_ours(path: Path) -> None:

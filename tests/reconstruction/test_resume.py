@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -20,6 +21,7 @@ from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.errors import DiskError, InputError, OutputExists
 from logvggt_jax.interruption import Interrupted
 from logvggt_jax.reconstruction import PointFilter, Reconstruction, open_source, reconstruct
+from logvggt_jax.reconstruction.saved_source import source_facts
 from logvggt_jax.reconstruction.work_folder import WorkFolder, check_leftovers
 from logvggt_jax.streaming import ChunkPlan
 from logvggt_jax.streaming.chunks import ChunkSession
@@ -306,25 +308,56 @@ def test_a_folder_of_somebody_else_is_left_alone(tmp_path: Path) -> None:
     assert (tmp_path / "out.partial" / "thesis.tex").read_text() == "x"
 
 
-def test_leftovers_are_known_before_the_weights(tmp_path: Path) -> None:
-    output, request = tmp_path / "out", {"method": "windows", "weights": "1f"}
+def test_leftovers_are_known_before_the_weights(walk: Path, tmp_path: Path) -> None:
+    output, request, source = tmp_path / "out", {"method": "windows", "weights": "1f"}, open_source(walk)
     known, other = {"method": "windows"}, {"method": "chunks"}
-    check_leftovers(output, other, overwrite=False)
+    check_leftovers(output, other, source, overwrite=False)
     with WorkFolder(output, request, overwrite=False) as work:
-        work.save(State({}, {}), [])
+        work.save(State({}, {"names": [], **source_facts(source, 5, [])}), [])
         with pytest.raises(InputError, match="another run is using this folder"):
-            check_leftovers(output, known, overwrite=True)
-    check_leftovers(output, known, overwrite=False)
-    check_leftovers(output, other, overwrite=True)
+            check_leftovers(output, known, source, overwrite=True)
+    check_leftovers(output, known, source, overwrite=False)
+    check_leftovers(output, other, source, overwrite=True)
     with pytest.raises(OutputExists, match=r"out\.partial holds an unfinished.*differs in method;"):
-        check_leftovers(output, other, overwrite=False)
+        check_leftovers(output, other, source, overwrite=False)
     work.path.rename(output)  # as Ctrl-C leaves it
     with pytest.raises(OutputExists, match=r"out holds an unfinished.*differs in method;"):
-        check_leftovers(output, other, overwrite=False)
+        check_leftovers(output, other, source, overwrite=False)
     work.path.mkdir()
     (work.path / "thesis.tex").write_text("x")
     with pytest.raises(OutputExists, match="was not made by this program"):
-        check_leftovers(output, known, overwrite=True)
+        check_leftovers(output, known, source, overwrite=True)
+
+
+def test_leftovers_of_another_source_or_other_frames_are_known_before_the_weights(walk: Path, tmp_path: Path) -> None:
+    plain = shutil.copytree(walk, tmp_path / "plain")
+    output, request, source = tmp_path / "out", {"method": "windows"}, open_source(walk, stride=2)
+    with WorkFolder(output, request, overwrite=False) as work:
+        work.save(State({}, {"names": [], **source_facts(source, 5, [])}), [])
+    others = {
+        r"plain \(stride=2\)": open_source(plain, stride=2),
+        "walk": open_source(walk),
+        r"walk \(stride=2, max_frames=4\)": open_source(walk, stride=2, max_frames=4),
+    }
+    for name, other in others.items():
+        words = rf"out\.partial holds an unfinished.* of \S+/walk \(stride=2\), not of \S+/{name}; give its source"
+        with pytest.raises(OutputExists, match=words):
+            check_leftovers(output, request, other, overwrite=False)
+    # More frames of the same are no other ones.
+    check_leftovers(output, request, open_source(walk, stride=2, max_frames=6), overwrite=False)
+    work.path.rename(output)  # as Ctrl-C leaves it
+    with pytest.raises(OutputExists, match="out holds an unfinished"):
+        check_leftovers(output, request, open_source(plain), overwrite=False)
+
+
+def test_leftovers_that_do_not_name_their_source_are_taken_up_or_refused(walk: Path, tmp_path: Path) -> None:
+    output, request, source = tmp_path / "out", {"method": "windows"}, open_source(walk)
+    facts = {name: fact for name, fact in source_facts(source, 5, []).items() if name != "frames_of"}
+    with WorkFolder(output, request, overwrite=False) as work:
+        work.save(State({}, {"names": [], **facts}), [])
+    check_leftovers(output, request, source, overwrite=False)
+    with pytest.raises(InputError, match=r"walk has changed since .*or are taken otherwise; pass --overwrite"):
+        check_leftovers(output, request, open_source(walk, stride=2), overwrite=False)
 
 
 def test_a_partial_result_that_cannot_be_taken_up_stays_where_it_is(walk: Path, tmp_path: Path) -> None:
@@ -332,8 +365,10 @@ def test_a_partial_result_that_cannot_be_taken_up_stays_where_it_is(walk: Path, 
     run(Recorder(send_at(6, signal.SIGINT)), walk, output)
     before = contents(output)
     Image.new("RGB", (42, 28)).save(walk / "002.png")
-    with pytest.raises(InputError, match=r"walk has changed.*--overwrite"):
+    with pytest.raises(InputError, match=r"walk has changed since \S+/out was left.*--overwrite"):
         run(Recorder(), walk, output)
+    with pytest.raises(OutputExists, match=r"/out holds an unfinished reconstruction of \S+/walk, not of .*stride=2"):
+        run(Recorder(), open_source(walk, stride=2), output)  # type: ignore[arg-type]
     assert contents(output) == before and not (tmp_path / "out.partial").exists()
 
 
