@@ -68,7 +68,8 @@ def _reconstruct(options: argparse.Namespace) -> int:
     settings = _settings(options, method)
     decides = what_decides(source, config, method, settings, longer_edge, point_filter, calibration)
     check_leftovers(target, decides, source, overwrite=options.overwrite)
-    needs = describe(source, target, config if options.dry_run else None, method, settings, longer_edge, point_filter)
+    compiled = config if options.dry_run else None
+    needs = describe(source, target, compiled, method, settings, longer_edge, point_filter, options.export)
     if provenance.longer_edge not in (None, longer_edge):
         source.notes.append(f"these weights were trained at {provenance.longer_edge} pixels, not {longer_edge}")
     if options.precision and options.dry_run:

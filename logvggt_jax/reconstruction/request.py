@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib.metadata
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.operations import matmul_flops_per_second
 from logvggt_jax.reconstruction.calibration import Calibration
 from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE
+from logvggt_jax.reconstruction.exporters import frame_bytes
 from logvggt_jax.reconstruction.points.cloud_file import VERTEX
 from logvggt_jax.reconstruction.points.point_filter import PointFilter
 from logvggt_jax.reconstruction.sources import Source
@@ -130,8 +132,10 @@ def describe(
     settings: Any,
     longer_edge: int,
     point_filter: PointFilter,
+    formats: Sequence[str] = (),
 ) -> list[str]:
-    """Frames, size and disk of a run in a few lines; with the model's sizes also memory and time on the device at hand.
+    """Frames, size and disk of a run and the exports of its result in a few lines; with the model's sizes also memory
+    and time on the device at hand.
 
     Raises:
       InputError: the disk is too small.
@@ -142,7 +146,11 @@ def describe(
         return [f"{count} frames of a size that is known with the first one; method {method}"]
     size = resized_size(source.image_size, longer_edge)
     frame, whole = disk_bytes(frames, size, point_filter)
-    space = check_space(output, whole, "make room, choose another output, or take fewer (--stride) or smaller frames")
+    exported = frame_bytes(formats, source.image_size, source.image_size)
+    frame, whole = frame + exported, whole + (frames or 1) * exported
+    fewer = " or fewer formats (--export)" if exported else ""
+    mend = f"make room, choose another output, or take fewer (--stride) or smaller frames{fewer}"
+    space = check_space(output, whole, mend)
     a_frame = "" if frames is not None else f"; {frame / 1e6:.2f} MB a frame"
     original = "x".join(map(str, source.image_size[::-1]))
     lines = [

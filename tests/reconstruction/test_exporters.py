@@ -9,6 +9,7 @@ import shutil
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -18,10 +19,11 @@ from PIL import Image
 from room_result import write_room_result
 
 from logvggt_jax.data import open_dataset
-from logvggt_jax.errors import InputError, MissingPackage, OutputExists
+from logvggt_jax.errors import DiskError, InputError, MissingPackage, OutputExists
 from logvggt_jax.geometry import camera_centres, invert, project, unproject_pixels
 from logvggt_jax.reconstruction import EXPORTERS, PointFilter, Reconstruction, export
 from logvggt_jax.reconstruction.depth_files import write_depth
+from logvggt_jax.reconstruction.exporters import frame_bytes
 from logvggt_jax.reconstruction.exporters.frame_names import file_stems
 from logvggt_jax.reconstruction.exporters.glb import _times
 from logvggt_jax.reconstruction.exporters.original_depth import depth_at
@@ -469,6 +471,34 @@ def test_without_its_source_a_result_gives_its_own_pictures_and_says_so(tmp_path
     shutil.rmtree(tmp_path / "source")
     with pytest.warns(UserWarning, match=r"source.*does not exist"):
         export(result, ["nerfstudio"], point_filter=FEW_POINTS, overwrite=True, progress=False)
+
+
+def test_too_small_a_disk_is_refused_before_anything_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    result, out = write_room_result(tmp_path, count=2), tmp_path / "out"
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=20_000))
+    for names in (["tum", "depth-png"], ["tum", "nerfstudio"]):
+        with pytest.raises(DiskError, match=r"out: needs about 0\.0 MB, 0\.0 MB are free.*fewer formats"):
+            export(result, names, out, point_filter=FEW_POINTS, progress=False)
+    assert not out.exists()
+    export(result, ["tum"], out, progress=False)
+    # The pictures that a result keeps are smaller than those of its source.
+    shutil.rmtree(tmp_path / "source")
+    with pytest.warns(UserWarning, match="the result's own"):
+        export(result, ["nerfstudio"], out, point_filter=FEW_POINTS, progress=False)
+
+
+@pytest.mark.parametrize("name", ["nerfstudio", "depth-png", "depth-exr", "depth-npz", "rosbag2"])
+def test_pictures_and_depth_take_what_is_estimated(tmp_path: Path, name: str) -> None:
+    if (needs := EXPORTERS[name].needs) is not None:
+        pytest.importorskip(needs, reason=f"{needs} is not installed")
+    result = write_room_result(tmp_path, count=1, size=(168, 224), image_size=(360, 480))
+    (path,) = export(result, [name], tmp_path / "out", point_filter=FEW_POINTS, progress=False)
+    written = sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
+    # A bag is a data base, and smooth rooms compress better than photographs.
+    assert 0.2 * frame_bytes([name], result.image_size, result.image_size) < written
+    assert written < 1.2 * frame_bytes([name], result.image_size, result.image_size) + 150_000
 
 
 def test_what_exists_is_refused_before_anything_is_written(result: Reconstruction, tmp_path: Path) -> None:

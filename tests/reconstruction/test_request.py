@@ -53,6 +53,16 @@ def test_a_disk_that_is_too_small_is_refused(walk: Path, tmp_path: Path, monkeyp
         describe(*arguments)
 
 
+def test_exports_are_part_of_the_estimate(walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    arguments = (open_source(walk), tmp_path / "out", None, "windows", None, LONGER_EDGE, PointFilter())
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=650_000))
+    for formats in ([], ["tum", "euroc"], ["nerfstudio", "nerfstudio"]):
+        describe(*arguments, formats)
+    for formats in (["depth-npz"], ["nerfstudio", "depth-png"]):
+        with pytest.raises(DiskError, match=r"out: needs about .*fewer formats \(--export\)"):
+            describe(*arguments, formats)
+
+
 def test_an_output_that_cannot_be_made_is_refused(walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("x")
     source = open_source(walk)

@@ -8,13 +8,14 @@ it uses what its format holds. It reads the reconstruction through its handle an
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Protocol
 
 from logvggt_jax.data.formats.nerfstudio_transforms import TRANSFORMS_FILE
 from logvggt_jax.errors import InputError, OutputExists, disk_errors
-from logvggt_jax.files import atomic_folder, check_output, check_writable, user_path
+from logvggt_jax.files import atomic_folder, check_output, check_space, check_writable, user_path
 from logvggt_jax.reconstruction.exporters.colmap import export_colmap, export_colmap_text
 from logvggt_jax.reconstruction.exporters.depth_exr import export_depth_exr
 from logvggt_jax.reconstruction.exporters.depth_npz import export_depth_npz
@@ -25,6 +26,7 @@ from logvggt_jax.reconstruction.exporters.kitti import export_kitti
 from logvggt_jax.reconstruction.exporters.libraries import check_library
 from logvggt_jax.reconstruction.exporters.nerfstudio import export_nerfstudio
 from logvggt_jax.reconstruction.exporters.original_depth import DEPTH_INDEX
+from logvggt_jax.reconstruction.exporters.pictures import picture_size
 from logvggt_jax.reconstruction.exporters.ply import export_ply
 from logvggt_jax.reconstruction.exporters.rosbag import export_rosbag
 from logvggt_jax.reconstruction.exporters.splats import export_splats
@@ -51,28 +53,36 @@ class Format:
       file: name of the file or folder that an export makes.
       marker: a file that every such folder holds; None where a format is one file.
       needs: the library that it is written with; None for this package's own means.
+      picture_bytes: of the pictures that it writes, about, for each pixel of theirs.
+      depth_bytes: of its depth, about, for each pixel of the original images, on which it lies, as measured on smooth
+        surfaces in single precision.
     """
 
     write: Exporter
     file: str
     marker: str | None = None
     needs: str | None = None
+    picture_bytes: float = 0.0
+    depth_bytes: float = 0.0
 
+
+# At the quality that pictures are written at.
+_JPEG = 1.0
 
 EXPORTERS: dict[str, Format] = {
-    "colmap": Format(export_colmap, "colmap", "sparse/0/cameras.bin", "pycolmap"),
-    "colmap-text": Format(export_colmap_text, "colmap-text", "sparse/0/cameras.txt", "pycolmap"),
-    "nerfstudio": Format(export_nerfstudio, "nerfstudio", TRANSFORMS_FILE),
+    "colmap": Format(export_colmap, "colmap", "sparse/0/cameras.bin", "pycolmap", _JPEG),
+    "colmap-text": Format(export_colmap_text, "colmap-text", "sparse/0/cameras.txt", "pycolmap", _JPEG),
+    "nerfstudio": Format(export_nerfstudio, "nerfstudio", TRANSFORMS_FILE, picture_bytes=_JPEG),
     "glb": Format(export_glb, "scene.glb", needs="trimesh"),
     "ply": Format(export_ply, "points.ply"),
     "splats": Format(export_splats, "splats.ply"),
     "tum": Format(export_tum, "tum.txt"),
     "kitti": Format(export_kitti, "kitti.txt"),
     "euroc": Format(export_euroc, "euroc.csv"),
-    "depth-png": Format(export_depth_png, "depth-png", DEPTH_INDEX),
-    "depth-exr": Format(export_depth_exr, "depth-exr", DEPTH_INDEX, "OpenEXR"),
-    "depth-npz": Format(export_depth_npz, "depth-npz", DEPTH_INDEX),
-    "rosbag2": Format(export_rosbag, "rosbag2", "metadata.yaml", "rosbags"),
+    "depth-png": Format(export_depth_png, "depth-png", DEPTH_INDEX, depth_bytes=1.5),
+    "depth-exr": Format(export_depth_exr, "depth-exr", DEPTH_INDEX, "OpenEXR", depth_bytes=3.9),
+    "depth-npz": Format(export_depth_npz, "depth-npz", DEPTH_INDEX, depth_bytes=3.6),
+    "rosbag2": Format(export_rosbag, "rosbag2", "metadata.yaml", "rosbags", _JPEG, depth_bytes=4.0),
 }
 """Formats by name."""
 
@@ -84,6 +94,13 @@ def check_formats(names: Sequence[str]) -> None:
             raise InputError(f"there is no format {name!r}: choose among {', '.join(EXPORTERS)}")
         if (library := EXPORTERS[name].needs) is not None:
             check_library(library)
+
+
+def frame_bytes(names: Iterable[str], pictures: tuple[int, int], depth: tuple[int, int]) -> int:
+    """Bytes of disk, about, that a frame takes in these formats, with pictures and depth of these sizes (H, W)."""
+    formats = [EXPORTERS[name] for name in set(names)]
+    of_pictures = math.prod(pictures) * sum(kind.picture_bytes for kind in formats)
+    return int(of_pictures + math.prod(depth) * sum(kind.depth_bytes for kind in formats))
 
 
 def export(
@@ -114,6 +131,7 @@ def export(
       InputError: no such format, the output is the result's own folder, or a file of the result is damaged.
       MissingPackage: the library of a format is not installed.
       OutputExists: something is at a place where a format has to go.
+      DiskError: the disk has too little room for pictures and depth, or cannot be written.
     """
     check_formats(names)
     names = list(dict.fromkeys(names))
@@ -121,6 +139,10 @@ def export(
     if folder.resolve() == result.folder.resolve():
         raise InputError(f"{folder} is the result itself, whose files exports would replace: choose another output")
     targets = [_checked(folder / EXPORTERS[name].file, EXPORTERS[name], overwrite) for name in names]
+    drawn = any(EXPORTERS[name].picture_bytes for name in names)
+    pictures = picture_size(result) if drawn else result.depth_size
+    mend = "make room, choose another output, or fewer formats"
+    check_space(folder.absolute(), result.num_frames * frame_bytes(names, pictures, result.image_size), mend)
     with disk_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
     for name, target in zip(names, targets, strict=True):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -16,6 +17,15 @@ from logvggt_jax.reconstruction.frame_pool import FramePool
 from logvggt_jax.reconstruction.result import Reconstruction
 from logvggt_jax.reconstruction.sources import Source, SourceFrame
 from logvggt_jax.reconstruction.sources.record import reopen
+
+
+def picture_size(result: Reconstruction) -> tuple[int, int]:
+    """(H, W) of the pictures that `Pictures.of` would give."""
+    if result.source is not None:
+        with contextlib.suppress(InputError):
+            reopen(result.source)
+            return result.image_size
+    return result.depth_size
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from logvggt_jax.files import check_space
 from logvggt_jax.geometry import invert, matrix_to_quaternion
 from logvggt_jax.reconstruction.depth_files import encode_picture
 from logvggt_jax.reconstruction.exporters.cloud import tracked
@@ -44,14 +43,10 @@ def export_rosbag(
     pixel centres at integers, and the pose of `camera_optical_frame` in `map` (x forward, y left, z up) as PoseStamped,
     Odometry and TF. Stamps are the frames' own.
 
-    Raises:
-      MissingPackage: rosbags is not installed.
-      DiskError: depth would not fit on the disk.
+    Raises MissingPackage without rosbags.
     """
     writing = library("rosbags", "rosbags.rosbag2")
     typesystem = library("rosbags", "rosbags.typesys")
-    height, width = result.image_size
-    check_space(path, 4 * height * width * result.num_frames)
     store = typesystem.get_typestore(typesystem.Stores.ROS2_HUMBLE)
     pictures = Pictures.of(result)
     # The library names its files after the folder.
