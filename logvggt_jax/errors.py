@@ -50,6 +50,15 @@ def disk_errors(path: str | Path) -> Iterator[None]:
         raise kind(f"{path}: {error.strerror or error}") from error
 
 
+def too_little_memory(path: str | Path, size: tuple[int, int] | None, error: MemoryError) -> InputError:
+    """The error of a file whose pictures, of this size (H, W) where it is known, do not fit the memory of the host."""
+    of_size = "" if size is None else f" of {size[1]} x {size[0]} pixels"
+    return InputError(
+        f"{path}: too little memory for a picture{of_size} ({one_line(error)}); close other programs, or give smaller "
+        "pictures"
+    )
+
+
 def printable(text: str) -> str:
     """A user's text with control characters shown as escapes, so that it stays on its line and moves no cursor.
 

@@ -302,6 +302,8 @@ def test_bad_input_is_one_line_and_exit_code_2(
     assert_fails(capsys, ["view", str(empty)], str(empty))
     assert_fails(capsys, ["render-room", "--output", str(room)], str(room), "--overwrite")
     assert_fails(capsys, ["render-room", "--output", str(output), "--frames", "0"], "num_frames")
+    vast = ["render-room", "--output", str(output), "--size", "99999x99999"]
+    assert_fails(capsys, vast, "99999x99999", "at most 16,777,216 pixels")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["empty", "truncated"]
 
 

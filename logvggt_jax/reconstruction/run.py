@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -12,7 +13,7 @@ import numpy as np
 
 from logvggt_jax.compile import out_of_device_memory
 from logvggt_jax.data.feeding.transforms import ResizeTransform, resize
-from logvggt_jax.errors import InputError, one_line
+from logvggt_jax.errors import InputError, one_line, too_little_memory
 from logvggt_jax.interruption import Interrupted, StopRequest
 from logvggt_jax.reconstruction.calibration import Calibration
 from logvggt_jax.reconstruction.frame_pool import FramePool
@@ -78,6 +79,8 @@ class Run:
         # Written since the last save.
         self._files: list[Path] = []
         self.num_taken = 0
+        # Frames of the method that the saved state holds.
+        self._num_saved = 0
         if (saved := work.saved()) is not None:
             self._restore(saved)
         work.go_on()
@@ -138,14 +141,18 @@ class Run:
         """The rest of the source, read ahead; where it breaks off, what is done is saved."""
         try:
             yield from self._pool.map(self._prepare, self._source.loaders(self.num_taken))
-        except InputError:
+        except (InputError, MemoryError) as error:
             if self._predictor.num_frames:
-                self._save()
+                with contextlib.suppress(MemoryError):  # what was saved before is kept then
+                    self._save()
+            if self._num_saved:
                 warnings.warn(
-                    f"{self._predictor.num_frames} frames are kept in {self._work.path}; when the reason is mended, "
-                    "the same command goes on from there",
+                    f"{self._num_saved} frames are kept in {self._work.path}; when the reason is mended, the same "
+                    "command goes on from there",
                     stacklevel=2,
                 )
+            if isinstance(error, MemoryError):
+                raise too_little_memory(self._source.name, self._source.image_size, error) from error
             raise
 
     def _prepare(self, load: Callable[[], SourceFrame | None]) -> Picture | None:
@@ -206,6 +213,7 @@ class Run:
             "model_size": None if self._frames.transform is None else self._frames.transform.size,
         }
         self._work.save(State(arrays, facts), self._files)
+        self._num_saved = self._predictor.num_frames
         self._files = []
         self._last_save = time.monotonic()
         self._saving = self._last_save - started
@@ -226,6 +234,7 @@ class Run:
             return {name.removeprefix(prefix): array for name, array in found.items()}
 
         self._predictor.restore(part("predictor/"))
+        self._num_saved = self._predictor.num_frames
         self.selection.restore(part("points/"))
         self._frames.health.restore(part("health/"))
         self._frames.images = {int(index): image for index, image in part("images/").items()}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pkgutil
 import resource
 import shutil
 import signal
@@ -244,6 +245,67 @@ def test_a_source_that_breaks_off_keeps_its_frames(walk: Path, tmp_path: Path) -
         run(Recorder(damage), open_source(walk, strict=True), output, workers=1)  # type: ignore[arg-type]
     file.write_bytes(whole)
     assert run(Recorder(), open_source(walk, strict=True), output).num_frames == COUNT  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("failing", "words"),
+    [
+        ("sources.image_folder.read_picture", r"walk/007\.png: too little memory for a picture of 42 x 28 pixels"),
+        ("run.resize", r"walk: too little memory for a picture of 42 x 28 pixels"),
+    ],
+)
+def test_too_little_memory_is_a_line_and_keeps_the_frames(
+    walk: Path, tmp_path: Path, straight: dict[str, bytes], failing: str, words: str
+) -> None:
+    output, asked = tmp_path / "out", []
+
+    def refuse(*arguments: object, **options: object) -> object:
+        asked.append(arguments)
+        if len(asked) == 8:
+            np.empty((1 << 30, 1 << 30), np.uint8)
+        return whole(*arguments, **options)
+
+    with pytest.MonkeyPatch.context() as patch:
+        name = f"logvggt_jax.reconstruction.{failing}"
+        whole = pkgutil.resolve_name(name)
+        patch.setattr(name, refuse)
+        with (
+            pytest.warns(UserWarning, match=r"6 frames are kept.*the same command goes on"),
+            pytest.raises(InputError, match=rf"{words} \(Unable to allocate .*smaller pictures"),
+        ):
+            run(Recorder(), walk, output, workers=1, save_seconds=1e9)
+    last = Recorder()
+    run(last, walk, output)
+    assert last.num_pushed == COUNT - 7
+    assert contents(output) == straight
+
+
+def test_where_memory_does_not_suffice_to_save_what_was_saved_before_is_kept(walk: Path, tmp_path: Path) -> None:
+    output, refusing = tmp_path / "out", []
+    whole = Recorder.snapshot
+
+    def refuse(*_: object, **__: object) -> None:
+        refusing.append(True)
+        raise MemoryError
+
+    def snapshot(predictor: Recorder) -> tuple:
+        return refuse() if refusing else whole(predictor)
+
+    def on_push(count: int) -> None:
+        if count == 5:
+            patch.setattr("logvggt_jax.reconstruction.run.resize", refuse)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Recorder, "snapshot", snapshot)
+        patch.setattr("logvggt_jax.reconstruction.frame_pool.FramePool.map", lambda _, *arguments: map(*arguments))
+        with (
+            pytest.warns(UserWarning, match=r"4 frames are kept.*the same command goes on"),
+            pytest.raises(InputError, match=r"walk: too little memory .*\(MemoryError\)"),
+        ):
+            run(Recorder(on_push), walk, output)
+    last = Recorder()
+    assert run(last, walk, output).num_frames == COUNT
+    assert last.num_pushed == COUNT - 5
 
 
 def test_one_run_at_a_time(tmp_path: Path) -> None:

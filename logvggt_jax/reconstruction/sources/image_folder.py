@@ -15,7 +15,7 @@ from pathlib import Path
 
 from logvggt_jax.data.errors import BrokenPicture
 from logvggt_jax.data.formats.ordering import natural_order, time_stamps
-from logvggt_jax.errors import InputError, MissingInput, MissingPackage, disk_errors
+from logvggt_jax.errors import InputError, MissingInput, MissingPackage, disk_errors, too_little_memory
 from logvggt_jax.frames import evenly_spaced
 from logvggt_jax.reconstruction.sources.headers import PictureHeader, read_header
 from logvggt_jax.reconstruction.sources.listing import is_glob, list_pictures, some, stem
@@ -57,7 +57,7 @@ class FolderSource(Source):
       MissingInput: no image, or one that has gone; an image without a mask, where there are masks.
       MissingPackage: all images are HEIC, or one is and `strict` is set, and pillow-heif is not installed.
       InputError: names or pictures that cannot be used; two sizes; too many broken pictures, or one with `strict`.
-        While frames are loaded: too many broken ones.
+        While frames are loaded: too many broken ones, or too little memory for one.
     """
 
     def __init__(self, path: Path, options: SourceOptions, masks: Masks | None = None) -> None:
@@ -135,6 +135,8 @@ class FolderSource(Source):
             return None
         except MissingInput as error:
             raise MissingInput(f"{picture.file} was there when the source was opened and has gone since") from error
+        except MemoryError as error:
+            raise too_little_memory(picture.file, header.size, error) from error
         (height, width), (above, left) = self._size, _margins(header.size, self._size)
         part = slice(above, above + height), slice(left, left + width)
         mask = None if self.masks is None else self.masks.read(_masked(picture))[part]
