@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import jax
@@ -212,6 +213,25 @@ def test_eight_bits_are_announced_before_the_weights_are_read(
     assert len(said) == 2 and "int8" in said[0] and "(cpu)" in said[0] and "without --precision" in said[1]
     monkeypatch.setitem(sys.modules, "qwix", None)
     assert_fails(capsys, arguments, "qwix", 'pip install "logvggt-jax[lowprecision]"')
+
+
+def test_a_page_that_cannot_be_served_is_refused_before_the_model(
+    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("viser", reason="extra `viewer` is not installed")
+    absent = str(tmp_path / "no-model")
+    arguments = ["reconstruct", str(room), "--checkpoint", absent, "--output", str(tmp_path / "out"), "--dry-run"]
+    assert_fails(capsys, [*arguments, "--port", "70000"], "no-model")
+    assert_fails(capsys, [*arguments, "--view"], "no-model")
+    assert_fails(capsys, [*arguments, "--view", "--port", "70000"], "port must be 1 to 65535, got 70000")
+    assert_fails(capsys, [*arguments, "--view", "--host", "203.0.113.7"], "cannot be served at '203.0.113.7'")
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert_fails(capsys, [*arguments, "--view"], "viser", 'pip install "logvggt-jax[viewer]"')
+    live = ["live", "0", "--checkpoint", absent, "--view"]
+    monkeypatch.setattr(
+        "logvggt_jax.reconstruction.sources.open_source", lambda *_, **__: SimpleNamespace(address=None)
+    )
+    assert_fails(capsys, live, "viser", 'pip install "logvggt-jax[viewer]"')
 
 
 def test_info_counts_parameters(

@@ -17,7 +17,7 @@ from logvggt_jax.cli.command import (
     overwrite_option,
 )
 from logvggt_jax.cli.exit_codes import BAD_INPUT
-from logvggt_jax.cli.viewing import stay_open, watch_options, watched
+from logvggt_jax.cli.viewing import check_watch, stay_open, watch_options, watched
 from logvggt_jax.errors import InputError, one_line
 
 
@@ -41,6 +41,7 @@ def _live(options: argparse.Namespace) -> int:
         raise InputError(f"{source.name} ends where it ends, and there is nothing to wait for: leave --reconnect out")
     if options.queue is not None and options.queue < 1:
         raise InputError(f"--queue must be at least 1 frame, got {options.queue}")
+    check_watch(options)
     recording = None
     if options.output is not None:
         check_request(source, options.output, longer_edge=options.longer_edge, overwrite=options.overwrite)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from logvggt_jax.cli.choices import FORMATS, METHOD_NAMES
 from logvggt_jax.cli.command import add_command, execution_options, loaded_model, longer_edge_option, output_option
 from logvggt_jax.cli.exit_codes import BAD_INPUT
-from logvggt_jax.cli.viewing import stay_open, watch_options, watched
+from logvggt_jax.cli.viewing import check_watch, stay_open, watch_options, watched
 from logvggt_jax.errors import InputError, one_line, printable
 from logvggt_jax.interruption import INTERRUPTED
 
@@ -46,6 +46,7 @@ def _reconstruct(options: argparse.Namespace) -> int:
         max_points=options.max_points or None,
     )
     check_formats(options.export)
+    check_watch(options)
     calibration = Calibration(options.intrinsics, options.shared_intrinsics)
     target = check_request(
         source,

@@ -44,6 +44,14 @@ def say_access(server: Any, host: str) -> None:
         print(f"logvggt: {note}", file=sys.stderr)
 
 
+def check_watch(options: argparse.Namespace) -> None:
+    """InputError where the command is to be watched and its page cannot be served."""
+    if options.view:
+        from logvggt_jax.reconstruction.viewer import check_viewer
+
+        check_viewer(options.host, options.port)
+
+
 @contextmanager
 def watched(options: argparse.Namespace) -> Iterator[RunWindow | None]:
     """The page of the command's run while the block lasts; None where it is not asked for."""

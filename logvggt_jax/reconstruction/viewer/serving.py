@@ -43,15 +43,15 @@ def watch_run(*, host: str = HOST, port: int = 8080) -> RunWindow:
     return RunWindow(open_server(host, port))
 
 
+def check_viewer(host: str, port: int) -> None:
+    """Raises what `open_viewer` would for this address, or without viser; nothing is served."""
+    _free_port(host, port)
+    _viser()
+
+
 def open_server(host: str, port: int) -> Any:
     """A server (viser) of an empty page; arguments and errors as of `open_viewer`."""
-    port = _free_port(host, port)
-    try:
-        import viser
-    except ImportError as error:
-        raise MissingPackage(
-            f"the viewer needs viser: {install_line('viewer')}; a page that needs nothing is written with --save"
-        ) from error
+    port, viser = _free_port(host, port), _viser()
     # Browsers open connections ahead and close them unused, which is no error.
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
     with contextlib.redirect_stdout(io.StringIO()):  # a box of its own, where standard output may be data
@@ -67,6 +67,16 @@ def access_note(host: str, port: int) -> str:
         f"leave --host out and open a tunnel from the machine with the browser: ssh -N -L {port}:localhost:{port} "
         "USER@THIS_MACHINE"
     )
+
+
+def _viser() -> Any:
+    try:
+        import viser
+    except ImportError as error:
+        raise MissingPackage(
+            f"the viewer needs viser: {install_line('viewer')}; a page that needs nothing is written with --save"
+        ) from error
+    return viser
 
 
 def _free_port(host: str, port: int) -> int:
