@@ -80,9 +80,9 @@ def main(arguments: Sequence[str]) -> None:
     """Settings, devices, training."""
     if len(arguments) > 1:
         sys.exit(f"train.py: unknown argument {arguments[1]!r}; settings are given as --config.NAME=VALUE")
-    enable_compilation_cache(_CACHE.value)
     watched: Lifeline | None = None
     try:
+        enable_compilation_cache(_CACHE.value)
         config = TrainConfig.from_dict(with_sources(_CONFIG.value.to_dict(), _SOURCES.value, _VALIDATION_SOURCE.value))
         profile = ProfiledSteps.parse(_PROFILE.value) if _PROFILE.value else None
         use_cpu_cores(config, num_processes=_NUM_PROCESSES.value or 1)

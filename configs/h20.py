@@ -49,6 +49,7 @@ def get_config(data_root: str = "data") -> ConfigDict:
     Raises InputError for a stage that it does not have.
     """
     data_root, _, stage = data_root.partition(",")
+    data_root = data_root or "data"
     config = ConfigDict()
     config.seed = 0
     config.initial_weights = "facebook/VGGT-1B"

@@ -158,7 +158,7 @@ def enable_compilation_cache(folder: str | None = None) -> Path | None:
     The default is JAX's own `JAX_COMPILATION_CACHE_DIR` if set, else `default_cache_folder`, or none for a user without
     a home. Raises InputError where a file has the folder's name.
     """
-    folder = folder or os.environ.get("JAX_COMPILATION_CACHE_DIR")
+    folder = folder or os.environ.get("JAX_COMPILATION_CACHE_DIR") or None
     if folder is None:
         with contextlib.suppress(InputError):
             folder = str(default_cache_folder())

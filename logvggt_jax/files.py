@@ -17,6 +17,7 @@ from filelock import FileLock, Timeout
 from logvggt_jax.errors import DiskError, InputError, OutputExists, disk_errors, one_line
 
 EMPTY_PATH = "the path is empty (a variable without a value?)"
+_LONGEST_NAME, _LONGEST_SUFFIX = 255, 32  # bytes
 
 
 @contextmanager
@@ -61,8 +62,7 @@ def atomic_file(path: str | Path) -> Iterator[Path]:
     MissingInput where the file cannot be written, whatever the operating system's reason.
     """
     path = Path(path)
-    # Not longer for long names, which a file system bounds.
-    temporary = path.with_name(f".{_unique()}{path.suffix}")
+    temporary = path.with_name(_temporary_name(path))
     with disk_errors(path):
         try:
             yield temporary
@@ -220,6 +220,14 @@ def user_cache_folder(kind: str) -> Path:
     except RuntimeError as error:
         raise InputError(f"there is no home for what is kept between runs ({error}): set XDG_CACHE_HOME") from error
     return caches / "logvggt" / kind
+
+
+def _temporary_name(path: Path) -> str:
+    """Of this run alone, with the beginning of the name and its suffix; no longer than file systems allow."""
+    suffix = path.suffix if len(path.suffix) <= _LONGEST_SUFFIX else ""
+    rest = f".{_unique()}{suffix}"
+    room = _LONGEST_NAME - len(f".{rest}".encode())
+    return f".{path.stem.encode(errors='ignore')[:room].decode(errors='ignore')}{rest}"
 
 
 def _unique() -> str:

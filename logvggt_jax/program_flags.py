@@ -16,17 +16,26 @@ def flags_parser(program: str) -> Callable[[list[str]], list[str]]:
     def parse(arguments: list[str]) -> list[str]:
         try:
             rest = flags.FLAGS(arguments)
-            flags.FLAGS["config"].value.to_dict()  # a file that cannot be loaded says so only now
+            config = flags.FLAGS["config"].value
+            is_mapping = hasattr(config, "to_dict")  # a file that cannot be loaded says so only now
         except (AttributeError, KeyError) as error:
             # The library wraps one error in the other, with quotes around quotes.
             reason = error.args[0] if error.args else error
             reason = reason.args[0] if isinstance(reason, KeyError) else reason
             sys.exit(f"{program}: --config has no such field: {' '.join(str(reason).split())}")
         except (flags.Error, OSError) as error:
-            sys.exit(f"{program}: {one_line(error)}")
+            sys.exit(f"{program}: {_reason(error)}")
+        if not is_mapping:
+            sys.exit(f"{program}: get_config of the --config file gives a {type(config).__name__}, not a ConfigDict")
         if flags.FLAGS["verbosity"].using_default_value:
             # Orbax reports every file at the level that absl's app would choose.
             flags.FLAGS.verbosity = logging.WARNING
         return list(rest)
 
     return parse
+
+
+def _reason(error: Exception) -> str:
+    """An error in one line; of one that holds the traceback of a configuration file, what that ended with."""
+    before, traceback, after = str(error).partition("Traceback (most recent call last):")
+    return one_line(error) if not traceback else f"{before.split(chr(10))[0].strip()} {after.strip().splitlines()[-1]}"

@@ -428,6 +428,7 @@ def test_view_saves_a_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     [
         (["reconstruct", "walk", "--output", "", "--checkpoint", "rooms"], "argument --output: the path is empty"),
         (["export", "", "--format", "ply"], "argument result: the path is empty"),
+        (["info", "rooms", "n" * 300], "unrecognized arguments: nnn"),
         (["reconstruct", "1.jpg", "2.jpg", "--output", "o", "--checkpoint", "rooms"], r"put a pattern in quotes"),
         (
             ["reconstruct", "1.jpg", "3.jpg", "--output", "o", "--checkpoint", "rooms"],

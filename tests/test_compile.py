@@ -107,6 +107,16 @@ def test_a_user_without_a_home_has_no_cache(monkeypatch: pytest.MonkeyPatch) -> 
         jax.config.update("jax_enable_compilation_cache", before)
 
 
+def test_an_empty_variable_is_no_folder_for_the_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    before = jax.config.jax_compilation_cache_dir
+    try:
+        assert module.enable_compilation_cache() == tmp_path / "logvggt" / "xla"
+    finally:
+        jax.config.update("jax_compilation_cache_dir", before)
+
+
 def test_a_cache_that_is_a_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "cache").touch()
     with pytest.raises(InputError, match=r"cache is no folder: give another --compilation_cache"):

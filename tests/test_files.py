@@ -167,8 +167,12 @@ def test_of_two_runs_the_second_to_end_leaves_the_first_result(tmp_path: Path) -
 
 
 def test_a_name_of_the_longest_kind_can_be_written(tmp_path: Path) -> None:
-    write_text(tmp_path / f"{'n' * 251}.txt", "whole")
-    assert [path.read_text() for path in tmp_path.iterdir()] == ["whole"]
+    for name in (f"{'n' * 251}.txt", f"{'é' * 125}.json", f"x.{'y' * 248}"):
+        with atomic_file(tmp_path / name) as temporary:
+            temporary.write_text("whole")
+            assert temporary.name.startswith(f".{name[:1]}") and len(temporary.name.encode()) <= 255
+        assert (tmp_path / name).read_text() == "whole"
+    assert len(list(tmp_path.iterdir())) == 3
 
 
 @pytest.mark.parametrize("resolved", [False, True])

@@ -72,9 +72,16 @@ def command_parser() -> argparse.ArgumentParser:
 
 def _unquoted(unknown: Sequence[str]) -> str:
     """A remark where a shell has made files of a pattern."""
-    if any(argument.startswith("-") or not Path(argument).exists() for argument in unknown):
+    if any(argument.startswith("-") or not _exists(argument) for argument in unknown):
         return ""
     return "; one source is taken: put a pattern in quotes ('walk/*.jpg'), or give the folder"
+
+
+def _exists(name: str) -> bool:
+    try:
+        return Path(name).exists()
+    except OSError:  # too long to be a name
+        return False
 
 
 class _Version(argparse.Action):

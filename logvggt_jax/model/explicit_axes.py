@@ -22,10 +22,12 @@ def splits_as_its_batch(method: Method) -> Method:
 
     @functools.wraps(method)
     def call(self: Any, *arrays: Any, **options: Any) -> Any:
-        sharding = _explicit_batch((arrays[1:], options)) or _whole(arrays[:1])
+        batch = {name: value for name, value in options.items() if name != "variables"}
+        others = arrays if "variables" in options else arrays[1:]
+        sharding = _explicit_batch((others, batch)) or _whole((arrays, options))
         if sharding is None:
             return method(self, *arrays, **options)
-        named = {name: value for name, value in options.items() if hasattr(value, "dtype")}
+        named = {name: value for name, value in options.items() if _holds_arrays(value)}
         rest = {name: value for name, value in options.items() if name not in named}
 
         def inside(arrays: tuple[Any, ...], named: dict[str, Any]) -> Any:
@@ -34,6 +36,10 @@ def splits_as_its_batch(method: Method) -> Method:
         return auto_axes(inside, out_sharding=sharding)(arrays, named)
 
     return call  # type: ignore[return-value]
+
+
+def _holds_arrays(value: Any) -> bool:
+    return any(hasattr(leaf, "dtype") for leaf in jax.tree.leaves(value))
 
 
 def _explicit_batch(tree: Any) -> NamedSharding | None:

@@ -42,6 +42,7 @@ def write_cameras(
     depth_scale: np.ndarray | None = None,
     loops: np.ndarray | None = None,
     masked: Sequence[float] | None = None,
+    timed: bool | None = None,
     point_filter: PointFilter | None = None,
 ) -> None:
     """Writes all cameras as one JSON file.
@@ -64,6 +65,7 @@ def write_cameras(
       depth_scale: [N], by which the depth files' depth has to be multiplied to fit the cameras; None where it fits.
       loops: int [L, 2], the frames at which the sequence came back to a place; None where nobody looked for them.
       masked: [N], the share of the depth maps' pixels that a mask drops; None where there were no masks.
+      timed: whether time stamps are seconds, and not positions; None where that is not known.
       point_filter: which pixels became points; None for `PointFilter`'s defaults.
     """
     frames: list[dict[str, Any]] = [
@@ -88,6 +90,7 @@ def write_cameras(
         "image_size": list(image_size),
         "depth_size": list(model_size),
         "metric": metric,
+        **({} if timed is None else {"timed": timed}),
         "complete": complete,
         "noted_focal_length": noted_focal_length,
         "source": None if source is None else source._asdict(),
@@ -152,7 +155,8 @@ def _checked(document: Any) -> dict[str, Any]:
     document["source"] = _source(document.get("source"))
     document["points"] = _point_filter(document.get("points", {}))
     _require(noted is None or bool(_numbers(noted, (), "noted_focal_length") > 0), "noted_focal_length must be above 0")
-    for key, value in (("complete", complete), ("metric", metric)):
+    timed = document.setdefault("timed", None)
+    for key, value in (("complete", complete), ("metric", metric), ("timed", timed or False)):
         _require(type(value) is bool, f"{key} must be true or false, got {shown(value)}")
     _require(
         isinstance(skipped, list)

@@ -116,6 +116,7 @@ class FrameWriter:
         complete: bool,
         skipped: Sequence[tuple[str, str]] = (),
         source: SourceRecord | None = None,
+        timed: bool = True,
     ) -> None:
         """Writes the cameras of all frames, as far as they are known by the calibration; all numbers are finite.
 
@@ -150,6 +151,7 @@ class FrameWriter:
             depth_scale=cameras.depth_scale,
             loops=cameras.loops,
             masked=self.masked or None,
+            timed=timed,
             point_filter=self._selection.point_filter,
         )
 

@@ -50,6 +50,7 @@ class Reconstruction:
       loops: pairs of frames at which the sequence came back to a place; None where nobody looked for them.
       masked: [N] float64, the share of the depth maps' pixels that a mask has dropped, which have depth and confidence
         0; zeros where there were no masks.
+      timed: whether time stamps are seconds, and not positions; None where that is not known.
       point_filter: which pixels became points.
       seconds: from the first frame to the last depth map, compilation included; None for a folder opened later.
     """
@@ -70,6 +71,7 @@ class Reconstruction:
     noted_focal_length: float | None = None
     source: SourceRecord | None = None
     masked: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
+    timed: bool | None = None
     point_filter: PointFilter = PointFilter()
     seconds: float | None = None
 
@@ -120,6 +122,7 @@ class Reconstruction:
             skipped=tuple(frame["name"] for frame in document["skipped"]),
             source=document["source"],
             masked=np.array([frame["masked"] for frame in frames], np.float64),
+            timed=document["timed"],
             point_filter=document["points"],
         )
 

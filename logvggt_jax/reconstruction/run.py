@@ -131,6 +131,7 @@ class Run:
             complete=complete,
             skipped=self._source.skipped,
             source=record_source(self._source, self.num_taken),
+            timed=self._source.is_timed,
         )
 
     def write_health(self, result: Reconstruction) -> None:

@@ -98,7 +98,7 @@ def read_state(path: str | Path) -> State:
             described = stored.metadata()
             arrays = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118
         if described["digest"] != _digest(described["facts"], arrays):
-            raise ValueError("its digest differs")
+            raise ValueError("its digest differs; or an earlier version wrote it")
     except (SafetensorError, ValueError, KeyError, TypeError) as error:
         if isinstance(error, InputError):
             raise

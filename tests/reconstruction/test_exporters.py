@@ -413,13 +413,21 @@ def test_masks_go_with_the_pictures_of_nerfstudio(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("timestamps", "times"),
-    [([0, 3, 6], [0, 0.1, 0.2]), ([2, 3, 5], [0, 0.1, 0.2]), ([1.5, 1.75, 2.5], [0, 0.25, 1]), ([4], [0])],
+    ("timestamps", "timed", "times"),
+    [
+        ([0, 3, 6], False, [0, 0.1, 0.2]),
+        ([2, 3, 5], False, [0, 0.1, 0.2]),
+        ([10, 11, 13], True, [0, 1, 3]),
+        ([1.5, 1.75, 2.5], True, [0, 0.25, 1]),
+        ([0, 1, 2], None, [0, 0.1, 0.2]),
+        ([0, 2, 4], None, [0, 2, 4]),
+        ([4], False, [0]),
+    ],
 )
 def test_frames_that_have_positions_for_times_are_a_tenth_of_a_second_apart(
-    timestamps: list[float], times: list[float]
+    timestamps: list[float], timed: bool | None, times: list[float]
 ) -> None:
-    np.testing.assert_allclose(_times(np.array(timestamps, np.float64)), times)
+    np.testing.assert_allclose(_times(np.array(timestamps, np.float64), timed), times)
 
 
 def masked_result(folder: Path) -> Reconstruction:

@@ -222,6 +222,8 @@ def test_names_that_match_no_frame_are_shown(truth: Reconstruction, disordered: 
         (["a_0000.jpg", "b_0000.jpg"], ["a/0000.jpg", "b/0000.jpg"]),
         (["0000.jpg", "0000.png"], ["images/0000.jpg", "images/0000.png"]),
         (["0000", "0001"], ["left/0000.jpg", "left/0001.jpg"]),
+        # One agrees in an earlier form, all in a later one.
+        (["1", "2", "3"], ["1", "2.jpg", "3.jpg"]),
     ],
 )
 def test_a_picture_is_its_frame_whatever_made_the_frames_name(
@@ -230,7 +232,7 @@ def test_a_picture_is_its_frame_whatever_made_the_frames_name(
     named = dataclasses.replace(truth, names=tuple(frames))
     poses = [ExternalPose(name, None, np.eye(4)) for name in reversed(pictures)]
     matched = match_poses(named, poses, "poses")
-    assert [matched[index].name for index in range(2)] == pictures
+    assert [matched[index].name for index in range(len(frames))] == pictures
 
 
 def test_poses_of_several_cameras_under_one_name_are_refused(

@@ -87,6 +87,7 @@ def test_depth_is_found_beside_colour(truth: Reconstruction, result: Reconstruct
     for index in range(COUNT):
         write_picture(tmp_path / f"view {index}.color.png", truth.image(index))
         write_picture(tmp_path / f"view {index}.depth.png", np.rint(truth.depth(index) * 1000).astype(np.uint16))
+    (tmp_path / "others.png").mkdir()
     made, notes = rescale(result, tmp_path / "a", depth=tmp_path, progress=False)
     assert_true(made, truth, 2e-3)
     assert "sensor depth of 4 of 4 frames" in notes[0]

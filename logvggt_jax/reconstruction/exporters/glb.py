@@ -113,7 +113,7 @@ def _add_camera(
     number = len(tree["nodes"])
     tree["nodes"].append(node)
     tree["scenes"][tree.get("scene", 0)]["nodes"].append(number)
-    times = _accessor(buffers, tree, "times", _times(result.timestamps), "SCALAR")
+    times = _accessor(buffers, tree, "times", _times(result.timestamps, result.timed), "SCALAR")
     samplers = [
         {"input": times, "interpolation": "LINEAR", "output": _accessor(buffers, tree, *track)}
         for track in (("translation", poses[:, :3, 3], "VEC3"), ("rotation", quaternions, "VEC4"))
@@ -143,11 +143,12 @@ def _accessor(buffers: dict[str, bytes], tree: dict[str, Any], name: str, values
     return number
 
 
-def _times(timestamps: np.ndarray) -> np.ndarray:
-    """Seconds [N] from the first frame on, increasing."""
+def _times(timestamps: np.ndarray, timed: bool | None) -> np.ndarray:
+    """Seconds [N] from the first frame on, increasing; those of frames that have positions for times are a tenth of a
+    second apart. `timed` as of `Reconstruction`."""
     times = timestamps - timestamps[0]
-    # Frames without a time of their own have their position for one; a stride or a broken file leaves some out.
-    are_positions = (timestamps == np.round(timestamps)).all()
-    if are_positions or (np.diff(times.astype(np.float32)) <= 0).any():
+    if timed is None:  # of earlier versions
+        timed = not (timestamps[0] == 0 and (np.diff(times) == 1).all())
+    if not timed or (np.diff(times.astype(np.float32)) <= 0).any():
         return np.arange(len(times)) / _FRAMES_PER_SECOND
     return times

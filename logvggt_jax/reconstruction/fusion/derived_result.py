@@ -100,6 +100,7 @@ def write_derived(
             source=result.source,
             metric=metric,
             masked=result.masked[list(frames)].tolist() if result.masked.any() else None,
+            timed=result.timed,
             point_filter=result.point_filter,
         )
         made = Reconstruction.with_cameras_of(folder)

@@ -52,8 +52,10 @@ def match_poses(result: Reconstruction, poses: Sequence[ExternalPose], path: str
 
 
 def _match_names(result: Reconstruction, poses: Sequence[ExternalPose], path: str | Path) -> dict[int, ExternalPose]:
-    """By the names of pictures: in the first form in which one is a frame's, or what exports call the frame."""
+    """By the names of pictures, or what exports call the frames, in the form in which most agree."""
     stems = file_stems(result.names)
+    best: dict[int, ExternalPose] = {}
+    of_several: list[str] = []
     for form in _FORMS:
         by_name: dict[str, ExternalPose] = {}
         twice = set()
@@ -66,14 +68,15 @@ def _match_names(result: Reconstruction, poses: Sequence[ExternalPose], path: st
             for index, (name, stem) in enumerate(zip(result.names, stems, strict=True))
         }
         matched = {index: pose for index, pose in found.items() if pose is not None}
-        if not matched:
-            continue
-        if of_two := sorted(name for name in (*result.names, *stems) if name in twice):
-            raise InputError(
-                f"{path}: several of its pictures are named {of_two[0]!r}, as those of several cameras are; keep the "
-                "poses of one camera in it"
-            )
-        return matched
+        if len(matched) > len(best):
+            best, of_several = matched, sorted(name for name in (*result.names, *stems) if name in twice)
+    if of_several:
+        raise InputError(
+            f"{path}: several of its pictures are named {of_several[0]!r}, as those of several cameras are; keep the "
+            "poses of one camera in it"
+        )
+    if best:
+        return best
     raise InputError(
         f"{path}: none of its {len(poses)} pictures ({poses[0].name!r}, …) has the name of one of the "
         f"{result.num_frames} frames ({result.names[0]!r}, …)"

@@ -160,7 +160,7 @@ def _from_depth(result: Reconstruction, folder: Path, unit: float, notes: list[s
 
 def _depth_files(result: Reconstruction, folder: Path) -> dict[int, Path]:
     with disk_errors(folder):
-        pictures = [path for path in sorted(folder.iterdir()) if path.suffix.lower() == ".png" and _is_deep(path)]
+        pictures = [path for path in sorted(folder.iterdir()) if path.suffix.lower() == ".png"]
     names: dict[str, int] = {}
     for choices in (file_stems(result.names), result.names):
         names |= {name: index for index, name in enumerate(choices)}
@@ -170,8 +170,8 @@ def _depth_files(result: Reconstruction, folder: Path) -> dict[int, Path]:
         parts = path.name.split(".")
         starts: Sequence[str] = [".".join(parts[:end]) for end in range(len(parts) - 1, 0, -1)]
         index = next((names[start] for start in starts if start in names), None)
-        if index is not None:
-            found.setdefault(index, path)
+        if index is not None and index not in found and _is_deep(path):
+            found[index] = path
     return found
 
 

@@ -75,6 +75,7 @@ class FolderSource(Source):
         chosen = self._chosen(times, len(files))
         names = _names([files[position] for position in chosen], listing.root)
         stamps = [float(position) for position in range(len(files))] if times is None else times
+        self.is_timed = times is not None
         self._asked_for = len(chosen)
         pictures = self._with_headers(
             [(name, stamps[position], files[position]) for name, position in zip(names, chosen, strict=True)]

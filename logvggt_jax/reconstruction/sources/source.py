@@ -100,6 +100,7 @@ class Source(abc.ABC):
       masks: of the frames; None where all pixels count. They are no part of `fingerprint`, and have one of their own.
       notes: what the user should know before the work begins, one line each: what is left out, and why.
       is_cut: whether frames are parts of larger images.
+      is_timed: whether time stamps are seconds; else they are positions.
       skipped: frames that could not be read, filled when the source is opened and while frames are loaded.
     """
 
@@ -110,6 +111,7 @@ class Source(abc.ABC):
         self.notes: list[str] = []
         self.skipped: list[SkippedFrame] = []
         self.is_cut = False
+        self.is_timed = True
 
     def __iter__(self) -> Iterator[SourceFrame]:
         """The frames that can be read, one at a time."""

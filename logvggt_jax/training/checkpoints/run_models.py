@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,6 @@ from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.weights.checkpoints import check_destination, read_licence, read_provenance, save_model
 from logvggt_jax.weights.folder import is_model_folder
 from logvggt_jax.weights.provenance import Provenance, TrainingRecord
-
-_STARTING_POINTS = ("initial_weights", "teacher")  # of a configuration, whose licences are the model's
 
 
 class RunModels:
@@ -76,7 +75,7 @@ class RunModels:
         earlier = read_provenance(self.newest) if is_model_folder(self.newest) else Provenance()
         started_from = None if earlier.training is None else earlier.training.configuration
         ours = self._config.to_dict()
-        same = started_from is not None and all(started_from.get(part) == ours[part] for part in _STARTING_POINTS)
+        same = started_from is not None and _made_of(started_from) == _made_of(ours)
         return earlier.licence if same else None
 
     def _provenance(self, step: int) -> Provenance:
@@ -88,3 +87,8 @@ class RunModels:
             device=f"{jax.device_count()} x {jax.devices()[0].device_kind}",
         )
         return Provenance("windows", longer_edge, self._licence, self._source, record)
+
+
+def _made_of(configuration: Mapping[str, Any]) -> tuple[Any, Any]:
+    """The weights whose licences are the model's: those that a run starts from, and its teacher's."""
+    return configuration.get("initial_weights"), (configuration.get("teacher") or {}).get("weights")

@@ -1,7 +1,6 @@
 """The use of a cache of labels by many runs at once, and the removal of what killed ones left half-written in it."""
 
 import contextlib
-import fcntl
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,10 +13,13 @@ def cache_in_use(cache: Path) -> Iterator[None]:
 
     One that comes while no other is there removes temporary folders first, which then are of killed ones. All that are
     there hold one lock together, `<cache>/teacher.lock`, which ends with its process, however that ends. Where nothing
-    can be written, or the file system has no locks, nothing is removed: labels are written all the same.
+    can be written, or the file system or the operating system has no such locks, nothing is removed: labels are written
+    all the same.
     """
     with contextlib.ExitStack() as stack:
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError, ImportError):
+            import fcntl
+
             cache.mkdir(parents=True, exist_ok=True)
             # Network file systems ask for a file open for writing to lock it alone, for reading to lock it together.
             lock = stack.enter_context((cache / "teacher.lock").open("a+b"))
@@ -29,6 +31,8 @@ def cache_in_use(cache: Path) -> Iterator[None]:
 
 def _is_alone(lock: BinaryIO) -> bool:
     """Whether nobody else holds the lock; who is alone keeps others waiting until it holds the lock together."""
+    import fcntl
+
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
