@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+import inspect
+from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
 import jax
@@ -20,11 +21,12 @@ def splits_as_its_batch(method: Method) -> Method:
     how it is split.
     """
 
+    signature = inspect.signature(method)
+
     @functools.wraps(method)
     def call(self: Any, *arrays: Any, **options: Any) -> Any:
-        batch = {name: value for name, value in options.items() if name != "variables"}
-        others = arrays if "variables" in options else arrays[1:]
-        sharding = _explicit_batch((others, batch)) or _whole((arrays, options))
+        given = signature.bind(self, *arrays, **options).arguments
+        sharding = _sharding_of_results(given.pop("variables"), given)
         if sharding is None:
             return method(self, *arrays, **options)
         named = {name: value for name, value in options.items() if _holds_arrays(value)}
@@ -42,19 +44,19 @@ def _holds_arrays(value: Any) -> bool:
     return any(hasattr(leaf, "dtype") for leaf in jax.tree.leaves(value))
 
 
-def _explicit_batch(tree: Any) -> NamedSharding | None:
-    """How the first array that is split explicitly along its first axis is split there; None where none is."""
-    for leaf in jax.tree.leaves(tree):
-        sharding = jax.typeof(leaf).sharding if isinstance(leaf, jax.Array) else None
-        if sharding is not None and sharding.mesh.explicit_axes and sharding.spec and sharding.spec[0] is not None:
+def _sharding_of_results(variables: Any, others: Any) -> NamedSharding | None:
+    """That of the first of the other arrays that is split explicitly along its first axis; not split where parameters
+    alone are, and None where nothing is."""
+    for sharding in _explicitly_split(others):
+        if sharding.spec[0] is not None:
             return NamedSharding(sharding.mesh, PartitionSpec(sharding.spec[0]))
-    return None
+    found = next(_explicitly_split((variables, others)), None)
+    return None if found is None else NamedSharding(found.mesh, PartitionSpec())
 
 
-def _whole(tree: Any) -> NamedSharding | None:
-    """Results that are not split, on the mesh of the first array that is split explicitly; None where none is."""
+def _explicitly_split(tree: Any) -> Iterator[NamedSharding]:
+    """Shardings of the arrays that are split over axes which are explicit in types."""
     for leaf in jax.tree.leaves(tree):
         sharding = jax.typeof(leaf).sharding if isinstance(leaf, jax.Array) else None
         if sharding is not None and sharding.mesh.explicit_axes and any(part is not None for part in sharding.spec):
-            return NamedSharding(sharding.mesh, PartitionSpec())
-    return None
+            yield sharding

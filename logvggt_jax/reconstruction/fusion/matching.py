@@ -64,8 +64,8 @@ def _match_names(result: Reconstruction, poses: Sequence[ExternalPose], path: st
             if by_name.setdefault(name, pose) is not pose:
                 twice.add(name)
         found = {
-            index: by_name.get(name, by_name.get(stem))
-            for index, (name, stem) in enumerate(zip(result.names, stems, strict=True))
+            index: by_name.get(name, by_name.get(exported))
+            for index, (name, exported) in enumerate(zip(result.names, stems, strict=True))
         }
         matched = {index: pose for index, pose in found.items() if pose is not None}
         if len(matched) > len(best):
