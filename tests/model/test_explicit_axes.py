@@ -42,8 +42,9 @@ def test_parameters_that_are_split_are_not_taken_for_the_batch(
         given = [jax.device_put(array, NamedSharding(mesh, spec)) for array in (tokens[:, :, 0], tokens[:, :, 1:])]
         mask = jax.device_put(np.ones((batch, frames), bool), NamedSharding(mesh, spec))
         named = dict(zip(("camera_tokens", "register_tokens"), given, strict=True))
-        found = jax.jit(model.refine)(parts, *given, mask, mask)
-        by_name = model.refine(variables=parts, **named, camera_mask=mask, register_mask=mask)
+        refine = jax.jit(model.refine)
+        found = refine(parts, *given, mask, mask)
+        by_name = refine(variables=parts, **named, camera_mask=mask, register_mask=mask)
         np.testing.assert_allclose(by_name, found, rtol=1e-5, atol=1e-6)
         assert tuple(found.sharding.spec)[:1] == (tuple(spec) or (None,))
         everyone = np.ones((batch, frames), bool)
