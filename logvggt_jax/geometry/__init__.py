@@ -5,6 +5,7 @@ written as multiply-and-sum, so that no accelerator rounds them to bfloat16 or T
 """
 
 from logvggt_jax.geometry.cameras import (
+    LARGEST_ENTRY,
     as_matrix,
     camera_centres,
     compose,
@@ -34,6 +35,7 @@ from logvggt_jax.geometry.similarity_group import (
 )
 
 __all__ = [
+    "LARGEST_ENTRY",
     "NoSimilarity",
     "Similarity",
     "as_matrix",

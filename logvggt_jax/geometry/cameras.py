@@ -6,6 +6,9 @@ import numpy as np
 
 from logvggt_jax.geometry.rotations import namespace
 
+# Of poses and intrinsics in files: squares of larger entries are infinite in float32, in which points are made.
+LARGEST_ENTRY = 1e18
+
 
 def _product(a: Any, b: Any) -> Any:
     return (a[..., :, :, None] * b[..., None, :, :]).sum(-2)

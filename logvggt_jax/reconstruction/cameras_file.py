@@ -13,15 +13,13 @@ import numpy as np
 
 from logvggt_jax.config import from_mapping
 from logvggt_jax.errors import InputError, MissingInput
-from logvggt_jax.files import open_regular, write_text
-from logvggt_jax.geometry import is_rotation
+from logvggt_jax.files import read_json, write_text
+from logvggt_jax.geometry import LARGEST_ENTRY, is_rotation
 from logvggt_jax.reconstruction.points.point_filter import PointFilter
 from logvggt_jax.reconstruction.sources.record import SourceRecord
 
 CAMERAS_FILE = "cameras.json"
 CAMERAS_FORMAT = "logvggt-cameras-1"
-# The squares of larger entries are infinite in float32, in which points are made.
-_LARGEST = 1e18
 
 
 def write_cameras(
@@ -123,14 +121,9 @@ def read_cameras(path: str | Path) -> dict[str, Any]:
     """
     path = Path(path)
     try:
-        with open_regular(path) as stream:
-            document = json.loads(stream.read().decode())
+        document = read_json(path, "so it is not a cameras file of this program, or damaged")
     except MissingInput:
         raise MissingInput(f"{path} does not exist: expected the output of `logvggt reconstruct`") from None
-    except InputError:
-        raise
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is not a cameras file of this program: {error}") from None
     try:
         return _checked(document)
     except _Fault as fault:
@@ -230,6 +223,6 @@ def _numbers(value: object, shape: tuple[int, ...], what: str) -> np.ndarray:
     valid = array.dtype.kind in "iuf" and array.shape == shape
     _require(valid, f"{what} must be {f'numbers {list(shape)}' if shape else 'a number'}, got {shown(value)}")
     array = array.astype(np.float64)
-    largest = _LARGEST if shape else np.inf  # of times there are some in nanoseconds
+    largest = LARGEST_ENTRY if shape else np.inf  # of times there are some in nanoseconds
     _require(bool((np.abs(array) < largest).all()), f"{what} must be finite, and below {largest:g}")
     return array

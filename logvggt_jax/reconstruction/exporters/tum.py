@@ -10,12 +10,19 @@ import numpy as np
 
 from logvggt_jax.errors import InputError
 from logvggt_jax.files import open_regular, write_text
-from logvggt_jax.geometry import as_matrix, camera_centres, invert, matrix_to_quaternion, quaternion_to_matrix
+from logvggt_jax.geometry import (
+    LARGEST_ENTRY,
+    as_matrix,
+    camera_centres,
+    invert,
+    matrix_to_quaternion,
+    quaternion_to_matrix,
+)
 from logvggt_jax.reconstruction.points.point_filter import PointFilter
 from logvggt_jax.reconstruction.result import Reconstruction
 
-# Numbers whose squares are infinite in float32 are no lengths, and what is shorter than this has lost its direction.
-_LARGEST, _SHORTEST_QUATERNION = 1e18, 1e-6
+# What is shorter has lost its direction.
+_SHORTEST_QUATERNION = 1e-6
 
 
 def export_tum(
@@ -69,7 +76,7 @@ def read_trajectory(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
         except ValueError:
             row = []
         # Not a number compares as no smaller.
-        if len(row) != 8 or not math.isfinite(row[0]) or not all(abs(value) < _LARGEST for value in row[1:]):
+        if len(row) != 8 or not math.isfinite(row[0]) or not all(abs(value) < LARGEST_ENTRY for value in row[1:]):
             raise InputError(
                 f"{path}:{number}: expected 8 numbers (timestamp tx ty tz qx qy qz qw), finite ones, got {line!r:.120}"
             )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
@@ -13,11 +12,9 @@ from logvggt_jax.data.formats.colmap_model import read_cameras, read_images
 from logvggt_jax.data.formats.nerfstudio_transforms import CAMERA, TRANSFORMS_FILE, camera_of, is_pinhole
 from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.errors import InputError, MissingInput, disk_errors
-from logvggt_jax.files import open_regular, user_path
+from logvggt_jax.files import read_json, user_path
+from logvggt_jax.geometry import LARGEST_ENTRY
 from logvggt_jax.reconstruction.exporters.tum import read_trajectory
-
-# The squares of larger numbers are infinite in float32.
-_LARGEST = 1e18
 
 
 class ExternalPose(NamedTuple):
@@ -62,7 +59,7 @@ def read_poses(path: str | Path) -> list[ExternalPose]:
     if not poses:
         raise InputError(f"{path} holds no pose")
     for pose in poses:
-        if not (np.abs(pose.extrinsics) < _LARGEST).all():
+        if not (np.abs(pose.extrinsics) < LARGEST_ENTRY).all():
             raise InputError(f"{path}: the pose of {pose.name or pose.timestamp!r} is too large to be one")
         if pose.intrinsics is not None and pose.size is not None:
             check_intrinsics(pose.intrinsics, pose.size, Path(pose.name or ""), path)
@@ -91,14 +88,12 @@ def _colmap(folder: Path) -> list[ExternalPose]:
 
 
 def _nerfstudio(path: Path) -> list[ExternalPose]:
-    with open_regular(path) as stream:
-        content = stream.read()
+    document = read_json(path, "so it is no transforms.json of nerfstudio, or damaged")
     try:
-        document = json.loads(content.decode())
         return [_nerfstudio_frame(document, frame, path) for frame in document["frames"]]
     except InputError:
         raise
-    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         reason = f"no {error}" if isinstance(error, KeyError) else error
         raise InputError(f"{path} is no transforms.json of nerfstudio, or damaged: {reason}") from error
 
@@ -106,7 +101,7 @@ def _nerfstudio(path: Path) -> list[ExternalPose]:
 def _nerfstudio_frame(document: dict[str, Any], frame: dict[str, Any], path: Path) -> ExternalPose:
     name = str(PurePosixPath(frame["file_path"]))
     pose = np.array(frame["transform_matrix"], np.float64)
-    if pose.shape not in ((3, 4), (4, 4)) or not (np.abs(pose) < _LARGEST).all():
+    if pose.shape not in ((3, 4), (4, 4)) or not (np.abs(pose) < LARGEST_ENTRY).all():
         raise InputError(f"{path}: transform_matrix of {name!r} must be [4, 4] finite numbers, got shape {pose.shape}")
     extrinsics = world_to_camera(pose @ OPENGL_AXES, f"{path}, {name!r}", stored="camera_to_world")
     assert extrinsics is not None  # it is finite

@@ -14,7 +14,7 @@ import numpy as np
 
 from logvggt_jax import page
 from logvggt_jax.errors import InputError, one_line, printable
-from logvggt_jax.files import open_regular, write_text
+from logvggt_jax.files import read_json, write_text
 from logvggt_jax.reconstruction.health.measures import NAMES, TITLES, Measures
 from logvggt_jax.reconstruction.health.plot import svg_plot
 from logvggt_jax.reconstruction.health.rules import CAUSES, SIGNS, Stretch, doubtful, stretches
@@ -81,11 +81,10 @@ def read_health(folder: Path) -> Health | None:
     if not file.exists():
         return None
     try:
-        with open_regular(file) as stream:
-            return _parsed(json.loads(stream.read().decode()))
+        return _parsed(read_json(file, "so it is not a health report of this program, or damaged"))
     except InputError:
         raise
-    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
         raise InputError(f"{file} is not a health report of this program, or damaged: {one_line(error)}") from None
 
 
