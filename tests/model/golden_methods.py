@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
+import functools
 import importlib.util
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
+from pieces import in_pieces
 
 from logvggt_jax import ModelConfig
 from logvggt_jax.config import AggregatorConfig, CameraHeadConfig, DPTConfig, EncoderConfig, RefinementConfig
-from logvggt_jax.model import frame_by_frame, parameters, windows
-from logvggt_jax.model.aggregator import Aggregator
-from logvggt_jax.model.dinov2 import DinoV2
 from logvggt_jax.model.frame_by_frame import FrameByFrame
 from logvggt_jax.model.windows import Windows
 from logvggt_jax.streaming.frame_session import StreamMemory
@@ -74,23 +70,7 @@ def load(golden_dir: Path, name: str, model: str = "") -> Golden:
     return Golden(arrays, settings, config, jax.device_put({"params": params}))
 
 
-@contextlib.contextmanager
-def layers_compiled_once() -> Iterator[None]:
-    """Outside of other programs, a block is compiled once and called for all layers, instead of once in the place of
-    each: encoder and aggregator are no programs of their own, their blocks are."""
-
-    def run(module: Any, params: Any, *inputs: Any, **options: Any) -> Any:
-        if isinstance(module, Aggregator | DinoV2):
-            return module.apply({"params": params}, *inputs, **options)
-        return parameters.run(module, params, *inputs, **options)
-
-    with pytest.MonkeyPatch.context() as patch:
-        for module in (windows, frame_by_frame):
-            patch.setattr(module, "run", run)
-        yield
-
-
-@layers_compiled_once()
+@functools.partial(in_pieces, static=1)
 def frame_step(
     config: ModelConfig, variables: dict[str, Any], memory: StreamMemory, image: jax.Array, first: jax.Array
 ) -> tuple[StreamMemory, dict[str, jax.Array]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import functools
 from typing import Any
 
 import golden_methods
@@ -11,7 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from golden_methods import POSES, TOKENS, Golden, assert_depth, layers_compiled_once
+from golden_methods import POSES, TOKENS, Golden, assert_depth
+from pieces import in_pieces
 
 from logvggt_jax.model.aggregator import WindowTokens
 from logvggt_jax.model.frame_by_frame import CausalMask, FrameByFrame
@@ -65,7 +67,7 @@ def _tokens(golden: Golden, form: str, *given: Any) -> tuple[WindowTokens, Windo
     return tokens, tokens._replace(key=tokens.key[:, chosen]), memory
 
 
-@layers_compiled_once()
+@functools.partial(in_pieces, static=1)
 def _step(
     golden: Golden, blocks: Memory, per_round: CameraMemory, single: CameraMemory, image: jax.Array, first: jax.Array
 ) -> tuple[Memory, CameraMemory, CameraMemory, dict[str, jax.Array]]:

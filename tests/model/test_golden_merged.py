@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import struct
-from golden_methods import POSES, TOKENS, Golden, assert_depth, layers_compiled_once
+from golden_methods import POSES, TOKENS, Golden, assert_depth
+from pieces import in_pieces
 
 from logvggt_jax import LogVGGT
 from logvggt_jax.model import merging as merging_module
@@ -94,7 +95,7 @@ def test_golden_values(golden: Golden, name: str) -> None:
     model, params, merging = plain_vggt(LogVGGT(golden.config), len(images)), golden.variables, _merging(golden, name)
     windows, size = model.windows, images.shape[1:3]
 
-    @layers_compiled_once()
+    @in_pieces
     def run_model(params, images, merging):
         patches, mask = windows.encode(params, images[None]), jnp.ones((1, len(images)), bool)
         aggregator = {"params": params["params"]["aggregator"]}

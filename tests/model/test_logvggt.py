@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from golden_methods import layers_compiled_once
+from pieces import in_pieces
 
 from logvggt_jax import DPTConfig, LogVGGT, ModelConfig
 from logvggt_jax.model.logvggt import variable_shapes
@@ -30,8 +30,8 @@ def applied(config: ModelConfig):
     return jax.jit(LogVGGT(config).apply)
 
 
-@layers_compiled_once()
-def streamed_gradient(model: LogVGGT, variables, images: np.ndarray, loss):
+@functools.partial(in_pieces, static=2)
+def streamed_gradient(model: LogVGGT, loss, variables, images: np.ndarray):
     """Gradients by parameters and images of `loss` of the depth and poses of a stream, layer by layer compiled once."""
     overlap, stride = model.config.windows.size - model.config.windows.stride, model.config.windows.stride
 
@@ -68,7 +68,7 @@ def test_gradients_reach_what_is_trained_and_nothing_else(small_config, small_va
     def loss(out, poses):
         return jnp.sin(poses).sum() + (jnp.log(out.depth) + jnp.log(out.depth_confidence)).sum()
 
-    assert_only_the_encoder_is_silent(streamed_gradient(LogVGGT(small_config), small_variables, video(), loss)[0])
+    assert_only_the_encoder_is_silent(streamed_gradient(LogVGGT(small_config), loss, small_variables, video())[0])
 
 
 def assert_only_the_encoder_is_silent(grads):
@@ -153,8 +153,8 @@ def test_parameters_in_the_compute_type_give_the_same_bits(small_config, small_v
 def test_gradients_flow_through_the_cache(small_config, small_variables):
     """A loss on the depth of the last window's frames depends on frame 1, which only the cache connects with them."""
     model = LogVGGT(thawed(small_config))
-    _, images = streamed_gradient(model, small_variables, video(), lambda out, _: jnp.log(out.depth[:, -2:]).sum())
-    assert np.linalg.norm(images[0, 1]) > 0
+    _, images = streamed_gradient(model, lambda out, _: jnp.log(out.depth[:, -2:]).sum(), small_variables, video())
+    assert np.linalg.norm(np.asarray(images)[0, 1]) > 0
 
 
 def test_bfloat16_stays_close_to_float32(small_config, small_variables):

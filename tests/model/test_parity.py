@@ -6,13 +6,15 @@ LayerNorm epsilon or a resampling convention from rounding.
 """
 
 import dataclasses
+import functools
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from golden_methods import layers_compiled_once, weight_maker
+from golden_methods import weight_maker
+from pieces import in_pieces
 
 from logvggt_jax.config import WindowConfig
 from logvggt_jax.geometry import (
@@ -56,20 +58,20 @@ def converted(golden_dir):
     return config, params_from_vggt(state_dict, config)[0]
 
 
-@layers_compiled_once()
+@functools.partial(in_pieces, static=1)
 def one_window(model, variables, images):
     """A sequence of one window, all of whose frames are decoded: the last state, outputs of all frames, the poses."""
     overlap = model.config.windows.size - model.config.windows.stride
     state, out = model.step(variables, model.start(variables, images[:, :overlap]), images[:, overlap:])
     out = jax.tree.map(lambda *x: jnp.concatenate(x, axis=1), out, model.finish(variables, state))
     poses = model.refine(variables, out.camera_tokens, out.register_tokens, out.frame_mask, out.frame_mask)
-    return jax.device_get((state, out, poses))
+    return state, out, poses
 
 
 @pytest.fixture(scope="module")
 def predictions(golden, converted):
     config, params = converted
-    _, out, poses = one_window(LogVGGT(config), {"params": params}, golden["images_u8"][None])
+    _, out, poses = jax.device_get(one_window(LogVGGT(config), {"params": params}, golden["images_u8"][None]))
     return predictions_of(out, poses, SIZE)
 
 
@@ -207,7 +209,7 @@ def test_the_first_window_is_vggt_on_its_frames(golden, converted):
     model = LogVGGT(dataclasses.replace(config, point_head=None, windows=WindowConfig(size=4, stride=2)))
     variables, images = {"params": params}, golden["images_u8"][None]
 
-    state, out, poses = one_window(model, variables, images[:, :4])
+    state, out, poses = jax.device_get(one_window(model, variables, images[:, :4]))
     assert relative_error(out.depth[0], golden["win0_depth"][..., 0]) <= DENSE
     assert relative_error(out.depth_confidence[0], golden["win0_depth_conf"]) <= DENSE
     assert relative_error(out.camera_tokens[0], golden["win0_agg_23"][:, 0]) <= TOKENS
