@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,7 +22,7 @@ from logvggt_jax.model.memory import OwnTokens
 from logvggt_jax.model.parameters import run
 from logvggt_jax.model.pruned_cache import PackedPrunedCache, PrunedCache, empty_packed, scores_of
 from logvggt_jax.model.quantisation import encoded_keys, encoded_values, packed, unpacked
-from logvggt_jax.model.rope import rope_table
+from logvggt_jax.model.rope import RopeTable, rope_table
 from logvggt_jax.streaming.pruned import KeepWanted, PrunedSettings
 
 
@@ -173,22 +174,21 @@ def _assert_scores(golden: Golden, choices: list[list[Choice]]) -> None:
     assert pruned, "the sequence must be long enough to be pruned"
 
 
-def _attention_of(golden: Golden, layer: int, x: np.ndarray) -> tuple[Attention, dict, OwnTokens]:
-    """A global block's attention with its parameters, and its tokens, of normalised tokens [P, C]."""
+def _attention_of(golden: Golden, layer: int, width: int) -> tuple[Attention, dict, RopeTable]:
+    """A global block's attention of tokens of this width, its parameters, and the rotations of a frame's tokens."""
     sizes, images = golden.config.aggregator, golden.arrays["images_u8"]
-    module = Attention(sizes.num_heads, x.shape[-1], True, "float32", "xla")
+    module = Attention(sizes.num_heads, width, True, "float32", "xla")
     params = golden.variables["params"]["aggregator"][f"global_block_{layer}"]["attention"]
-    rope = rope_table(
-        (images.shape[1] // 14, images.shape[2] // 14), 5, x.shape[-1] // sizes.num_heads, sizes.rope_base
-    )
-    normed = jnp.asarray(x[None])
-    query, keys = run(module, params, normed, rope, method=Attention.project)
-    return module, params, OwnTokens(normed, query, keys)
+    grid = (images.shape[1] // 14, images.shape[2] // 14)
+    return module, params, _rope_table(grid, 5, width // sizes.num_heads, sizes.rope_base)
 
 
-def _heads_last(x: np.ndarray) -> jax.Array:
+_rope_table = jax.jit(rope_table, static_argnums=(0, 1, 2, 3))
+
+
+def _heads_last(x: np.ndarray) -> np.ndarray:
     """[heads, N, width] to [1, N, heads, width]."""
-    return jnp.asarray(x.swapaxes(0, 1)[None])
+    return x.swapaxes(0, 1)[None]
 
 
 @struct.dataclass
@@ -211,14 +211,15 @@ def test_golden_steps_of_an_attention(golden: Golden, golden_quantised: Golden, 
         _assert_step(golden, golden_quantised if prefix == "quant" else golden, prefix, name)
 
 
-def _assert_step(golden: Golden, of: Golden, prefix: str, step: str) -> None:
-    stored = {key: golden.arrays[f"{step}_{key}"] for key in ("x", "out", "past_k", "past_v", "new_k", "new_v")}
-    layer = int(step.split("_l")[1].split("_")[0])
-    module, params, own = _attention_of(of, layer, stored["x"])
-    key, value = _heads_last(stored["past_k"]), _heads_last(stored["past_v"])
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _stepped(
+    module: Attention, packs: bool, params: Any, rope: RopeTable, x: jax.Array, key: jax.Array, value: jax.Array
+) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+    """Normalised tokens [1, P, C] through an attention whose cache holds these numbers: its output, and what the cache
+    holds after it."""
     length = jnp.int32(key.shape[1])
-    if prefix == "quant":
-        packed = empty_packed(key.shape, special=5, tokens=len(stored["x"]))
+    if packs:
+        packed = empty_packed(key.shape, special=5, tokens=x.shape[1])
         fields = {field.name: getattr(packed, field.name) for field in dataclasses.fields(packed)}
         cache: PrunedCache = _Given(**{**fields, "length": length}, past_key=key, past_value=value)
     else:
@@ -227,10 +228,19 @@ def _assert_step(golden: Golden, of: Golden, prefix: str, step: str) -> None:
     def attend(query: jax.Array, keys: Any) -> jax.Array:
         return run(module, params, query, keys, method=Attention.attend)
 
+    own = OwnTokens(x, *run(module, params, x, rope, method=Attention.project))
     taken, left = cache.attend(own, attend, lambda tokens: own.keys)
-    out = run(module, params, taken)
+    numbers = PackedPrunedCache.opened(left, "float32") if packs else left.opened("float32")
+    return run(module, params, taken), numbers
+
+
+def _assert_step(golden: Golden, of: Golden, prefix: str, step: str) -> None:
+    stored = {key: golden.arrays[f"{step}_{key}"] for key in ("x", "out", "past_k", "past_v", "new_k", "new_v")}
+    layer = int(step.split("_l")[1].split("_")[0])
+    module, params, rope = _attention_of(of, layer, stored["x"].shape[-1])
+    past = _heads_last(stored["past_k"]), _heads_last(stored["past_v"])
+    out, found = _stepped(module, prefix == "quant", params, rope, stored["x"][None], *past)
     np.testing.assert_allclose(out[0], stored["out"], rtol=0, atol=TOKENS)
-    found = PackedPrunedCache.opened(left, "float32") if prefix == "quant" else left.opened("float32")
     for numbers, name in zip(found, ("new_k", "new_v"), strict=True):
         difference = np.abs(np.asarray(numbers) - _heads_last(stored[name]))
         # In 4 bits a code that differs is a whole step of its group off, far above this: all codes are the same.
@@ -240,10 +250,11 @@ def _assert_step(golden: Golden, of: Golden, prefix: str, step: str) -> None:
 def test_golden_scores(golden: Golden) -> None:
     (name,) = (name[:-2] for name in golden.arrays if name.startswith("mid_step_") and name.endswith("_x"))
     layer, frame = (int(part[1:]) for part in name.split("_")[2:4])
-    _, _, own = _attention_of(golden, layer, golden.arrays[f"{name}_x"])
-    tokens = golden.settings["tokens_per_frame"]
-    past = _heads_last(golden.arrays[f"{name}_past_k"])
-    scores = scores_of(own.query, past[:, tokens:], special=5)[0]
+    x = golden.arrays[f"{name}_x"]
+    module, params, rope = _attention_of(golden, layer, x.shape[-1])
+    query, _ = run(module, params, x[None], rope, method=Attention.project)
+    past = _heads_last(golden.arrays[f"{name}_past_k"])[:, golden.settings["tokens_per_frame"] :]
+    scores = jax.jit(functools.partial(scores_of, special=5))(query, past)[0]
     expected = golden.arrays["mid_scores"][frame, golden.settings["detail_layers"].index(layer)]
     np.testing.assert_allclose(scores, expected[: len(scores)], rtol=0, atol=TOKENS)
 
@@ -254,10 +265,16 @@ def test_golden_codes(golden: Golden) -> None:
     for name, encode in (("k", encoded_keys), ("v", encoded_values)):
         numbers = arrays[f"unit_{name}"]
 
-        def coded(given: jax.Array, encode: Any = encode, shape: tuple[int, ...] = numbers.shape) -> list[np.ndarray]:
+        @jax.jit
+        def codes_of(given: jax.Array, encode: Any = encode) -> tuple[jax.Array, ...]:
             codes = encode(given)
-            wide = (codes.code, codes.scale, codes.zero, codes.numbers())
-            flat = [np.broadcast_to(x, codes.code.shape).reshape(1, -1, shape[0], shape[2]) for x in wide]
+            return codes.code, codes.scale, codes.zero, codes.numbers()
+
+        def coded(
+            given: np.ndarray, codes_of: Any = codes_of, shape: tuple[int, ...] = numbers.shape
+        ) -> list[np.ndarray]:
+            wide = [np.asarray(x) for x in codes_of(given)]
+            flat = [np.broadcast_to(x, wide[0].shape).reshape(1, -1, shape[0], shape[2]) for x in wide]
             return [x[0, : shape[1]].swapaxes(0, 1) for x in flat]
 
         code, scale, zero, out = coded(_heads_last(numbers))
@@ -267,8 +284,9 @@ def test_golden_codes(golden: Golden) -> None:
         np.testing.assert_allclose(out, arrays[f"unit_{name}_out"], rtol=1e-6)
         *_, twice = coded(_heads_last(arrays[f"unit_{name}_out"]))
         np.testing.assert_allclose(twice, arrays[f"unit_{name}_out_twice"], rtol=1e-6)
-        assert packed(jnp.asarray(code)).nbytes == code.size // 2
-        np.testing.assert_array_equal(unpacked(packed(jnp.asarray(code))), code)
+        halves = jax.jit(packed)(code)
+        assert halves.nbytes == code.size // 2
+        np.testing.assert_array_equal(jax.jit(unpacked)(halves), code)
 
 
 def test_coding_again_rounds_ties_as_ieee_arithmetic_does() -> None:
@@ -283,13 +301,18 @@ def test_coding_again_rounds_ties_as_ieee_arithmetic_does() -> None:
     np.testing.assert_array_equal(jax.jit(encoded_keys)(jnp.asarray(numbers)).code[:, 0], expected)
 
 
+@functools.partial(jax.jit, static_argnums=0)
+def _coded_and_back(encode: Any, numbers: jax.Array) -> jax.Array:
+    return encode(numbers).numbers()
+
+
 def test_golden_caches_before_and_after_coding(golden: Golden) -> None:
     names = sorted(name[:-3] for name in golden.arrays if name.startswith("quant_l") and name.endswith("_in"))
     assert names
     for name in names:
         given = _heads_last(golden.arrays[f"{name}_in"])
-        codes = encoded_keys(given) if name.endswith("_k") else encoded_values(given)
-        found = codes.numbers().reshape(1, -1, *given.shape[2:])[:, : given.shape[1]]
+        encode = encoded_keys if name.endswith("_k") else encoded_values
+        found = np.asarray(_coded_and_back(encode, given)).reshape(1, -1, *given.shape[2:])[:, : given.shape[1]]
         expected = _heads_last(golden.arrays[f"{name}_out"])
         # A code that differed would be a whole step of its group off.
         assert np.abs(found - expected).max() <= TOKENS
