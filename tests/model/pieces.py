@@ -8,8 +8,7 @@ from typing import Any
 
 import jax
 import pytest
-from jax.extend.core import Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
-from jax.extend.core import ClosedJaxpr as Closed
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
 
 from logvggt_jax.model import frame_by_frame, parameters, windows
 from logvggt_jax.model.aggregator import Aggregator
@@ -42,7 +41,7 @@ def in_pieces(function: Callable[..., Any], static: int = 0) -> Callable[..., An
     return in_turn
 
 
-def _evaluated(closed: Closed, arguments: Sequence[Any]) -> list[Any]:
+def _evaluated(closed: ClosedJaxpr, arguments: Sequence[Any]) -> list[Any]:
     values = dict(zip([*closed.jaxpr.constvars, *closed.jaxpr.invars], [*closed.consts, *arguments], strict=True))
 
     def value(atom: Any) -> Any:
@@ -66,7 +65,7 @@ def _programs(jaxpr: Jaxpr) -> list[tuple[Any, list[Any], list[Any]]]:
             inputs, outputs = [x for x in read if x not in set(made)], [x for x in made if x in wanted]
             effects = frozenset().union(*(equation.effects for equation in piece))
             between = jaxpr.replace(constvars=[], invars=inputs, outvars=outputs, eqns=piece, effects=effects)
-            found.append((_compiled_once_by_text(Closed(between, []), str(between)), inputs, outputs))
+            found.append((_compiled_once_by_text(ClosedJaxpr(between, []), str(between)), inputs, outputs))
         wanted |= {atom for atom in found[-1][1] if not isinstance(atom, Literal)}
     return found[::-1]
 
@@ -90,13 +89,13 @@ def _is_call(equation: JaxprEqn) -> bool:
 
 
 @functools.lru_cache(maxsize=256)
-def _compiled_once(closed: Closed) -> Callable[..., Any]:
+def _compiled_once(closed: ClosedJaxpr) -> Callable[..., Any]:
     return jax.jit(jaxpr_as_fun(closed))
 
 
 _by_text: dict[str, Callable[..., Any]] = {}
 
 
-def _compiled_once_by_text(closed: Closed, text: str) -> Callable[..., Any]:
+def _compiled_once_by_text(closed: ClosedJaxpr, text: str) -> Callable[..., Any]:
     """What lies between two blocks is traced anew for every layer, and reads the same."""
     return _by_text.setdefault(text, jax.jit(jaxpr_as_fun(closed)))

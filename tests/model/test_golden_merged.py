@@ -84,7 +84,21 @@ def _merging(golden: Golden, name: str) -> TokenMerging | None:
     for key, tokens in published.items():
         assert sorted(getattr(merging, key).tolist()) == sorted(tokens.tolist())
     np.testing.assert_array_equal(merging.protected, golden.arrays["protected_tokens"])
-    return dataclasses.replace(merging, **{key: jnp.asarray(tokens) for key, tokens in published.items()})
+    return dataclasses.replace(merging, **{key: tokens.astype(np.int32) for key, tokens in published.items()})
+
+
+@jax.jit
+def _steps(merging: TokenMerging, own: OwnTokens, result: jax.Array) -> Any:
+    """What `nearest` gives, the rows of queries, keys and values that attention is given, and what `result`, the
+    attention's, is spread to."""
+    given = []
+
+    def attention(query: jax.Array, keys: Keys) -> jax.Array:
+        given.append((query, keys.key, keys.value))
+        return result
+
+    taken, _ = merging.attend(own, attention, lambda _: own.keys)
+    return merging.nearest(own.normed[0]), given[0], taken
 
 
 @pytest.mark.parametrize(
@@ -92,7 +106,7 @@ def _merging(golden: Golden, name: str) -> TokenMerging | None:
 )
 def test_golden_values(golden: Golden, name: str) -> None:
     arrays, images = golden.arrays, golden.arrays["images_u8"]
-    model, params, merging = plain_vggt(LogVGGT(golden.config), len(images)), golden.variables, _merging(golden, name)
+    model, params, plain = plain_vggt(LogVGGT(golden.config), len(images)), golden.variables, _merging(golden, name)
     windows, size = model.windows, images.shape[1:3]
 
     @in_pieces
@@ -104,13 +118,14 @@ def test_golden_values(golden: Golden, name: str) -> None:
         return tokens.key[0], model.refinement.decode_cameras(params, out.camera_tokens, mask)[0], out
 
     notes: dict[int, dict[str, np.ndarray]] = {}
-    if merging is not None:
-        fields = {field.name: getattr(merging, field.name) for field in dataclasses.fields(merging)}
+    merging = None
+    if plain is not None:
+        fields = {field.name: getattr(plain, field.name) for field in dataclasses.fields(plain)}
         merging = Recorded(**fields, notes=lambda layer, **arrays: notes.update({int(layer): arrays}))
     key, poses, out = jax.device_get(run_model(params, images, merging))
     jax.effects_barrier()
-    if merging is not None:
-        _assert_assignments(golden, name, merging, jax.tree.map(np.asarray, notes))
+    if plain is not None:
+        _assert_assignments(golden, name, plain, jax.tree.map(np.asarray, notes))
     for i, layer in enumerate(golden.settings["layers"]):
         expected = arrays[f"{name}_tokens_{layer:02d}"]
         found = key[i] if expected.shape[1] == key.shape[2] else key[i][:, arrays["token_index"]]
@@ -121,7 +136,9 @@ def test_golden_values(golden: Golden, name: str) -> None:
         assert_depth(found[0, :, ::every, ::every], arrays[f"{name}_{expected}"])
 
 
-def _assert_assignments(golden: Golden, name: str, merging: Recorded, notes: dict[int, dict[str, np.ndarray]]) -> None:
+def _assert_assignments(
+    golden: Golden, name: str, merging: TokenMerging, notes: dict[int, dict[str, np.ndarray]]
+) -> None:
     """Each source's destination, its cosine, what is merged and how far the second best lies, in all layers; merged
     queries, keys and values of some, and what these layers spread to all tokens."""
     arrays, heads = golden.arrays, golden.config.aggregator.num_heads
@@ -146,14 +163,12 @@ def _assert_assignments(golden: Golden, name: str, merging: Recorded, notes: dic
         np.testing.assert_array_equal(note["kept"], arrays[f"{stem}_unmerged_sources"])
         for rows in ("q_merged", "k_merged", "v_merged"):
             np.testing.assert_allclose(note[rows], arrays[f"{stem}_{rows}"], rtol=0, atol=TOKENS)
-        given = jnp.asarray(arrays[f"{stem}_attn_projected"])
-        nothing = jnp.zeros((1, len(note["normed"]), heads, given.shape[1] // heads))
-        own = OwnTokens(jnp.asarray(note["normed"][None]), nothing, Keys(nothing, nothing, None))
-        spread, _ = TokenMerging.attend(
-            merging, own, lambda *_, given=given: given.reshape(1, len(given), heads, -1), lambda _, own=own: own.keys
-        )
+        given = arrays[f"{stem}_attn_projected"]
+        nothing = np.zeros((1, len(note["normed"]), heads, given.shape[1] // heads), np.float32)
+        own = OwnTokens(note["normed"][None], nothing, Keys(nothing, nothing, None))
+        *_, spread = _steps(merging, own, given.reshape(1, len(given), heads, -1))
         expected = arrays[f"{stem}_attn_unmerged"]
-        np.testing.assert_array_equal(spread[0].reshape(expected.shape), expected)
+        np.testing.assert_array_equal(np.asarray(spread).reshape(expected.shape), expected)
 
 
 def test_the_draws_are_the_originals(golden: Golden) -> None:
@@ -176,25 +191,18 @@ def test_golden_steps_of_a_layer(golden: Golden, index: int) -> None:
     def stored(key: str) -> np.ndarray:
         return arrays[f"default_l{layer:02d}_{key}"]
 
-    def split(x: np.ndarray) -> jax.Array:
-        return jnp.asarray(x.reshape(1, len(x), golden.config.aggregator.num_heads, -1))
+    def split(x: np.ndarray) -> np.ndarray:
+        return x.reshape(1, len(x), golden.config.aggregator.num_heads, -1)
 
-    place, cosine = merging.nearest(jnp.asarray(stored("metric")))
+    keys = Keys(split(stored("k_in")), split(stored("v_in")), None)
+    own = OwnTokens(stored("metric")[None], split(stored("q_in")), keys)
+    (place, cosine), given, taken = jax.device_get(_steps(merging, own, split(stored("attn_projected"))))
     free = ~np.isin(arrays["source_tokens"], arrays["protected_tokens"])
     np.testing.assert_array_equal(place, arrays["default_best_destination"][layer][free])
     np.testing.assert_allclose(cosine, arrays["default_best_similarity"][layer][free], rtol=0, atol=SIMILARITIES)
 
-    def attention(query: jax.Array, keys: Keys) -> jax.Array:
-        for found, key in ((query, "q"), (keys.key, "k"), (keys.value, "v")):
-            expected = stored(f"{key}_merged")
-            np.testing.assert_allclose(found[0].reshape(expected.shape), expected, rtol=0, atol=2e-6)
-        return split(stored("attn_projected"))
-
-    own = OwnTokens(
-        jnp.asarray(stored("metric")[None]),
-        split(stored("q_in")),
-        Keys(split(stored("k_in")), split(stored("v_in")), None),
-    )
-    taken, _ = merging.attend(own, attention, lambda tokens: own.keys)
+    for found, key in zip(given, "qkv", strict=True):
+        expected = stored(f"{key}_merged")
+        np.testing.assert_allclose(found[0].reshape(expected.shape), expected, rtol=0, atol=2e-6)
     expected = stored("attn_unmerged")
     np.testing.assert_array_equal(taken[0].reshape(expected.shape), expected)

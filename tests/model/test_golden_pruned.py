@@ -78,7 +78,7 @@ def _streamed(golden: Golden, settings: PrunedSettings) -> Any:
     for index, image in enumerate(images):
         memory = keeping.make_room(memory, tokens, index)
         _choices.clear()
-        memory, found = frame_step(config, golden.variables, memory, image, jnp.array([index == 0]))
+        memory, found = frame_step(config, golden.variables, memory, image, np.array([index == 0]))
         numbers.append(jax.device_get(found))
         kept.append(jax.device_get(memory))
         jax.effects_barrier()

@@ -37,17 +37,17 @@ class Stream:
             jax.debug.callback(lambda *x: self.evictions.append(x), kept[0], scores[0], length, ordered=True)
             return kept, mean
 
-        def step(memory: StreamMemory, image: jax.Array, first: jax.Array) -> tuple[StreamMemory, dict[str, Any]]:
+        def step(memory: StreamMemory, image: np.ndarray, first: np.ndarray) -> tuple[StreamMemory, dict[str, Any]]:
             after, numbers = frame_step(golden.config, golden.variables, memory, image, first)
             layers, entries = after.blocks.layers, after.camera.trunk.shared.layers
-            return after, {
-                **numbers,
-                "budget": jnp.stack([layer.budget for layer in layers])[None],
-                "cache_len": jnp.stack([layer.length for layer in layers])[None],
-                "score_before": memory.blocks.scores[None],
-                "score_after": after.blocks.scores[None],
-                "camera_cache_len": jnp.stack([cache.length for cache in entries])[None],
+            scalars = {
+                "budget": [layer.budget for layer in layers],
+                "cache_len": [layer.length for layer in layers],
+                "score_before": memory.blocks.scores,
+                "score_after": after.blocks.scores,
+                "camera_cache_len": [cache.length for cache in entries],
             }
+            return after, jax.device_get(numbers) | {name: np.asarray(x)[None] for name, x in scalars.items()}
 
         self.step, self.recorded = step, recorded
 
@@ -62,8 +62,8 @@ class Stream:
         for index, image in enumerate(images):
             memory = keeping.make_room(memory, tokens, index)
             self.evictions.clear()
-            memory, numbers = self.step(memory, image, jnp.array([index == 0]))
-            found.append(jax.device_get(numbers))
+            memory, numbers = self.step(memory, image, np.array([index == 0]))
+            found.append(numbers)
             jax.effects_barrier()
             records, layer_scores = iter(self.evictions), {}
             for layer, budget in enumerate(found[-1]["budget"][0]):
@@ -102,10 +102,11 @@ def test_budgets_scores_and_lengths(golden: Golden, evicting: dict[str, Any]) ->
     np.testing.assert_array_equal(anchors, golden["evict_anchor_len"])
     # Of the original's own scores, whose products with the budget are stored before they are truncated.
     total, temperature = golden.settings["total_budget"], golden.settings["temperature"]
+    budgets = jax.jit(rolling_cache.budgets)
     for scores, budget, product in zip(
         golden["evict_score_before"], golden["evict_budget"], golden["evict_budget_product"], strict=True
     ):
-        np.testing.assert_array_equal(rolling_cache.budgets(scores, total, temperature), budget)
+        np.testing.assert_array_equal(budgets(scores, total, temperature), budget)
         np.testing.assert_array_equal(np.floor(product), budget)
 
 
