@@ -20,9 +20,14 @@ def inputs(queries=37, keys=53, batch=2, heads=4, head_dim=8, dtype=np.float32):
     generator = np.random.default_rng(0)
 
     def tensor(count):
-        return jnp.asarray(generator.standard_normal((batch, count, heads, head_dim)), dtype)
+        return generator.standard_normal((batch, count, heads, head_dim)).astype(dtype)
 
     return tensor(queries), tensor(keys), tensor(keys)
+
+
+def attended(*arguments, **options):
+    """As one program, traced anew: forms are chosen while it is."""
+    return jax.jit(functools.partial(attention, **options))(*arguments)
 
 
 def textbook(query, key, value, valid=None):
@@ -48,22 +53,24 @@ def form(request, monkeypatch):
 def test_equals_the_textbook(form, masked):
     query, key, value = inputs()
     valid = np.random.default_rng(1).random((2, 53)) < 0.6 if masked else None
-    out = jax.jit(attention)(query, key, value, valid)
+    out = attended(query, key, value, valid)
     np.testing.assert_allclose(out, textbook(query, key, value, valid), atol=2e-6)
 
 
 def test_invalid_keys_have_no_influence_at_all(form):
     query, key, value = inputs()
     valid = np.arange(53)[None].repeat(2, 0) < 20
-    before = jax.jit(attention)(query, key, value, valid)
-    after = jax.jit(attention)(query, key.at[:, 20:].set(1e3), value.at[:, 20:].set(1e3), valid)
+    compiled = jax.jit(functools.partial(attention))  # traced anew
+    before = compiled(query, key, value, valid)
+    key, value = (np.where(valid[..., None, None], x, np.float32(1e3)) for x in (key, value))
+    after = compiled(query, key, value, valid)
     np.testing.assert_array_equal(before, after)
 
 
 def test_a_row_without_valid_keys_is_finite(form):
     query, key, value = inputs()
     valid = np.array([[True] * 53, [False] * 53])
-    out, gradient = jax.value_and_grad(lambda q: attention(q, key, value, valid).sum())(query)
+    out, gradient = jax.jit(jax.value_and_grad(lambda q: attention(q, key, value, valid).sum()))(query)
     assert np.isfinite(out)
     assert np.isfinite(gradient).all()
 
@@ -72,7 +79,7 @@ def test_gradients_agree_between_forms(monkeypatch):
     arguments = inputs()
 
     def gradients():
-        return jax.grad(lambda args: (attention(*args) ** 2).sum())(arguments)
+        return jax.jit(jax.grad(lambda args: (attention(*args) ** 2).sum()))(arguments)
 
     batched = gradients()
     monkeypatch.setattr(module, "_SMALL_SCORES", 0)
@@ -90,7 +97,7 @@ def test_long_sequences_do_not_materialise_scores():
 
 def test_bfloat16_softmax_is_float32(form):
     query, key, value = inputs(dtype=jnp.bfloat16)
-    out = attention(query, key, value)
+    out = attended(query, key, value)
     assert out.dtype == jnp.bfloat16
     np.testing.assert_allclose(np.asarray(out, np.float32), textbook(query, key, value), atol=2e-2)
 
@@ -98,7 +105,7 @@ def test_bfloat16_softmax_is_float32(form):
 @pytest.mark.parametrize("implementation", ["cudnn", "tpu_flash"])
 def test_float32_never_takes_a_kernel_that_rounds(implementation):
     query, key, value = inputs(keys=520)
-    out = attention(query, key, value, implementation=implementation)
+    out = attended(query, key, value, implementation=implementation)
     np.testing.assert_allclose(out, textbook(query, key, value), atol=2e-6)
 
 
@@ -108,8 +115,8 @@ def test_float32_never_takes_a_kernel_that_rounds(implementation):
 def test_sizes_without_a_kernel_take_the_general_form(implementation, sizes):
     """Head sizes that cuDNN refuses; fewer keys than a block of the TPU's kernel."""
     query, key, value = inputs(dtype=jnp.bfloat16, **sizes)
-    out = attention(query, key, value, implementation=implementation)
-    np.testing.assert_array_equal(out, attention(query, key, value, implementation="xla"))
+    out = attended(query, key, value, implementation=implementation)
+    np.testing.assert_array_equal(out, attended(query, key, value, implementation="xla"))
 
 
 @pytest.mark.parametrize("masked", [False, True])
@@ -123,8 +130,8 @@ def test_validity_as_a_length_equals_validity_as_a_mask(monkeypatch, masked):
 
     monkeypatch.setattr(jax.nn, "dot_product_attention", answer)
     query, key, value = inputs(dtype=jnp.bfloat16)
-    valid = jnp.asarray(np.random.default_rng(1).random((2, 53)) < 0.6) if masked else None
-    out = attention(query, key, value, valid, implementation="cudnn")
+    valid = np.random.default_rng(1).random((2, 53)) < 0.6 if masked else None
+    out = attended(query, key, value, valid, implementation="cudnn")
     assert out.dtype == jnp.bfloat16
     np.testing.assert_allclose(np.asarray(out, np.float32), textbook(query, key, value, valid), atol=2e-2)
 
@@ -133,9 +140,9 @@ def test_validity_as_a_length_equals_validity_as_a_mask(monkeypatch, masked):
 def test_the_tpu_kernel_computes_the_textbook(masked):
     """Interpreted on this device; neither queries nor keys are whole blocks."""
     query, key, value = inputs(queries=530, keys=600, heads=1, dtype=jnp.bfloat16)
-    valid = jnp.asarray(np.random.default_rng(1).random((2, 600)) < 0.6) if masked else None
+    valid = np.random.default_rng(1).random((2, 600)) < 0.6 if masked else None
     with pallas_tpu.force_tpu_interpret_mode():
-        out = attention(query, key, value, valid, implementation="tpu_flash")
+        out = attended(query, key, value, valid, implementation="tpu_flash")
     assert out.shape == query.shape
     assert out.dtype == jnp.bfloat16
     np.testing.assert_allclose(np.asarray(out, np.float32), textbook(query, key, value, valid), atol=2e-2)
@@ -180,22 +187,24 @@ def test_padding_to_even_lengths_changes_no_gradient(monkeypatch, masked):
 
     monkeypatch.setattr(jax.nn, "dot_product_attention", answer)
     arguments = inputs(queries=37, keys=53, dtype=jnp.bfloat16)
-    valid = jnp.asarray(np.random.default_rng(1).random((2, 53)) < 0.6) if masked else None
-    found = gradients_of(*arguments, valid, implementation="cudnn")
+    valid = np.random.default_rng(1).random((2, 53)) < 0.6 if masked else None
+    found, expected = (
+        jax.jit(functools.partial(gradients_of, implementation=form))(*arguments, valid) for form in ("cudnn", "xla")
+    )
     assert lengths == {38, 54}
-    for a, b in zip(found, gradients_of(*arguments, valid, implementation="xla"), strict=True):
+    for a, b in zip(found, expected, strict=True):
         np.testing.assert_allclose(np.asarray(a, np.float32), np.asarray(b, np.float32), atol=2e-2)
 
 
 def test_each_fall_back_is_said_once(caplog, monkeypatch):
-    attention(*inputs(), implementation="cudnn")
+    attended(*inputs(), implementation="cudnn")
     assert not caplog.records, "what is small is not slower"
     monkeypatch.setattr(module, "_SMALL_SCORES", 0)
     logging.use_python_logging(quiet=True)
     module._warn_once.cache_clear()
     for _ in range(2):
-        attention(*inputs(), implementation="cudnn")
-        attention(*inputs(dtype=jnp.bfloat16), implementation="tpu_flash")
+        attended(*inputs(), implementation="cudnn")
+        attended(*inputs(dtype=jnp.bfloat16), implementation="tpu_flash")
     messages = [record.message for record in caplog.records]
     assert len(messages) == 2
     assert "from cudnn" in messages[0] and "not float32" in messages[0]
