@@ -65,8 +65,8 @@ def stream(model: LogVGGT, variables, images: np.ndarray):
         np.pad(x, padding + [(0, 0)] * (x.ndim - 2))
         for x in (joined.camera_tokens, joined.register_tokens, joined.frame_mask)
     )
-    poses = refine(model)(variables, camera, register, mask, mask)[:, :num_frames]
-    return jax.tree.map(lambda x: x[:, :num_frames], joined), poses
+    poses = np.asarray(refine(model)(variables, camera, register, mask, mask))
+    return jax.tree.map(lambda x: x[:, :num_frames], joined), poses[:, :num_frames]
 
 
 @functools.lru_cache
@@ -96,7 +96,7 @@ def test_streaming_equals_batch(small_config, small_variables, size, stride):
     model = with_windows(small_config, size, stride)
     images = video(MAX_FRAMES, MAX_FRAMES)
     lengths = np.arange(1, MAX_FRAMES + 1)
-    batch = jax.jit(model.apply)(small_variables, images, np.arange(MAX_FRAMES) < lengths[:, None])
+    batch = jax.device_get(jax.jit(model.apply)(small_variables, images, np.arange(MAX_FRAMES) < lengths[:, None]))
     for item, length in enumerate(lengths):
         out, poses = stream(model, small_variables, images[item : item + 1, :length])
         for name in ("depth", "depth_confidence", "camera_tokens", "register_tokens"):
@@ -106,7 +106,11 @@ def test_streaming_equals_batch(small_config, small_variables, size, stride):
 
 def test_unequal_lengths_equal_items_one_by_one(small_config, small_variables):
     model, lengths = with_windows(small_config, 4, 3), (7, 2)
-    apply = jax.jit(model.apply)
+    compiled = jax.jit(model.apply)
+
+    def apply(*given):
+        return jax.device_get(compiled(*given))
+
     images = video(max(lengths), len(lengths))
     mask = np.arange(max(lengths)) < np.array(lengths)[:, None]
     batch = apply(small_variables, images, mask)
