@@ -52,11 +52,16 @@ def test_half_turns_and_the_identity_keep_their_accuracy(axis, angle: float) -> 
     np.testing.assert_allclose(quaternion_to_matrix(matrix_to_quaternion(matrix)), matrix, atol=2e-6)
 
 
+@jax.jit
+def rotation_gradients(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Gradients by a matrix of its quaternion's sum and of its angle; one program for all matrices."""
+    quaternion = jax.grad(lambda m: matrix_to_quaternion(m).sum())(matrix)
+    return quaternion, jax.grad(lambda m: rotation_angle(m, jnp.eye(3)))(matrix)
+
+
 @pytest.mark.parametrize("angle", [0.0, np.pi])
 def test_gradients_are_finite_at_the_identity_and_at_half_turns(angle: float) -> None:
-    matrix = jnp.asarray(axis_angle([0, 0, 1], angle), jnp.float32)
-    quaternion = jax.grad(lambda m: matrix_to_quaternion(m).sum())(matrix)
-    rotation = jax.grad(lambda m: rotation_angle(m, jnp.eye(3)))(matrix)
+    quaternion, rotation = rotation_gradients(axis_angle([0, 0, 1], angle).astype(np.float32))
     assert np.isfinite(quaternion).all() and np.isfinite(rotation).all()
 
 
@@ -69,14 +74,14 @@ def test_angle_between_two_rotations(angle: float) -> None:
     assert single == pytest.approx(angle, abs=1e-6), "the arccosine of a trace would be off by 1e-4 here"
 
 
-@pytest.mark.parametrize("convert", [np.asarray, jnp.asarray], ids=["numpy", "jax"])
-def test_nearest_rotation(convert) -> None:
+@pytest.mark.parametrize("nearest", [nearest_rotation, jax.jit(nearest_rotation)], ids=["numpy", "jax"])
+def test_nearest_rotation(nearest) -> None:
     rotation = axis_angle([1, 2, 3], 0.8)
     noise = 1e-3 * np.random.default_rng(1).normal(size=(3, 3))
-    found = np.asarray(nearest_rotation(convert(1.7 * rotation + noise)))
+    found = np.asarray(nearest(1.7 * rotation + noise))
     np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-6)
     np.testing.assert_allclose(found, rotation, atol=2e-3)
-    mirrored = np.asarray(nearest_rotation(convert(rotation @ np.diag([1.0, 1.0, -0.1]))))
+    mirrored = np.asarray(nearest(rotation @ np.diag([1.0, 1.0, -0.1])))
     assert np.linalg.det(mirrored) == pytest.approx(1.0, abs=1e-5)
     np.testing.assert_allclose(mirrored, rotation, atol=1e-5)
 
