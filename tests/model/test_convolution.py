@@ -28,15 +28,29 @@ def test_values_and_gradients(size, strides, height, width):
     generator = np.random.default_rng(0)
     x = generator.standard_normal((2, height, width, 3)).astype(np.float32)
     layer = Convolution(6, size, "float32", strides=strides)
-    params = layer.init(jax.random.key(0), x)["params"]
-    params["bias"] = jnp.asarray(generator.standard_normal(6), jnp.float32)
-    expected = reference(x, params["kernel"], params["bias"], strides)
-    np.testing.assert_allclose(layer.apply({"params": params}, x), expected, atol=1e-5)
+    params = jax.device_get(layer.init(jax.random.key(0), x)["params"])
+    params["bias"] = generator.standard_normal(6).astype(np.float32)
+    shape = jax.eval_shape(layer.apply, {"params": params}, x).shape
+    weights = generator.standard_normal(shape).astype(np.float32)
 
-    weights = generator.standard_normal(expected.shape).astype(np.float32)
-    ours = jax.grad(lambda p, x: (layer.apply({"params": p}, x) * weights).sum(), argnums=(0, 1))
-    theirs = jax.grad(lambda p, x: (reference(x, p["kernel"], p["bias"], strides) * weights).sum(), argnums=(0, 1))
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4), ours(params, x), theirs(params, x))
+    def ours(params, x):
+        return layer.apply({"params": params}, x)
+
+    def theirs(params, x):
+        return reference(x, params["kernel"], params["bias"], strides)
+
+    def value_and_gradients(function):
+        def weighted(params, x):
+            value = function(params, x)
+            return (value * weights).sum(), value
+
+        gradients, value = jax.jit(jax.grad(weighted, argnums=(0, 1), has_aux=True))(params, x)
+        return value, gradients
+
+    value, gradients = value_and_gradients(ours)
+    expected, others = value_and_gradients(theirs)
+    np.testing.assert_allclose(value, expected, atol=1e-5)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4), gradients, others)
 
 
 def test_bfloat16_computes_in_bfloat16():

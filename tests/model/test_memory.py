@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import struct
+from pieces import in_pieces
 
 from logvggt_jax import ModelConfig
 from logvggt_jax.model.aggregator import Aggregator
@@ -15,6 +16,7 @@ from logvggt_jax.model.memory import Attend, Keys, LayerMemory, OwnTokens, Proje
 
 GRID, WIDTH, FRAMES = (2, 3), 32, 3
 TOKENS = 5 + GRID[0] * GRID[1]
+NOTHING = CrossWindowMemory(np.zeros((1, 0), np.float32), np.zeros(1, np.int32), ())
 
 
 @struct.dataclass
@@ -49,56 +51,53 @@ class CausalCache:
 
 def empty_cache(config: ModelConfig) -> CausalCache:
     heads = config.aggregator.num_heads
-    zeros = jnp.zeros((1, FRAMES * TOKENS, heads, WIDTH // heads))
-    return CausalCache(tuple(LayerCache(zeros, zeros, jnp.zeros(1, jnp.int32)) for _ in range(config.aggregator.depth)))
+    zeros = np.zeros((1, FRAMES * TOKENS, heads, WIDTH // heads), np.float32)
+    return CausalCache(tuple(LayerCache(zeros, zeros, np.zeros(1, np.int32)) for _ in range(config.aggregator.depth)))
 
 
 @pytest.fixture(scope="module")
-def patch_tokens() -> jax.Array:
-    return jnp.asarray(np.random.default_rng(0).standard_normal((1, FRAMES, GRID[0] * GRID[1], WIDTH)), jnp.float32)
+def patch_tokens() -> np.ndarray:
+    return np.random.default_rng(0).standard_normal((1, FRAMES, GRID[0] * GRID[1], WIDTH)).astype(np.float32)
 
 
 def test_a_causal_cache_stands_where_cross_window_attention_does(
-    small_config: ModelConfig, small_variables: dict, patch_tokens: jax.Array
+    small_config: ModelConfig, small_variables: dict, patch_tokens: np.ndarray
 ) -> None:
     """Frame by frame through the cache: the past moves a frame, the future does not, and one frame is VGGT."""
     params = {"params": small_variables["params"]["aggregator"]}
 
-    @jax.jit
-    def frame(tokens: jax.Array, first: jax.Array, memory: CausalCache):
+    @in_pieces
+    def frame(tokens: jax.Array, first: jax.Array, memory: CausalCache | CrossWindowMemory):
         return Aggregator(small_config).apply(params, tokens, jnp.ones(1, jnp.int32), first, memory, grid=GRID)
 
-    def stream(tokens: jax.Array) -> list[np.ndarray]:
+    def stream(tokens: np.ndarray) -> list[np.ndarray]:
         memory, outputs = empty_cache(small_config), []
         for index in range(FRAMES):
-            out, memory = frame(tokens[:, index : index + 1], jnp.array([index == 0]), memory)
-            outputs.append(np.asarray(out.special[0, 0]))
-        assert [int(layer.length[0]) for layer in memory.layers] == [FRAMES * TOKENS] * len(memory.layers)
+            out, memory = frame(tokens[:, index : index + 1], np.array([index == 0]), memory)
+            outputs.append(np.asarray(out.special)[0, 0])
+        assert [int(np.asarray(layer.length)[0]) for layer in memory.layers] == [FRAMES * TOKENS] * len(memory.layers)
         return outputs
 
     before = stream(patch_tokens)
-    after = stream(patch_tokens.at[:, 1].multiply(-1.0))
+    after = stream(patch_tokens * np.float32([1, -1, 1])[:, None, None])
     np.testing.assert_array_equal(before[0], after[0])
     assert np.abs(before[1] - after[1]).max() > 1e-3
     assert np.abs(before[2] - after[2]).max() > 1e-4, "frame 2 sees frame 1 through the cache alone"
 
-    nothing = CrossWindowMemory(jnp.zeros((1, 0)), jnp.zeros(1, jnp.int32), ())
-    alone, _ = Aggregator(small_config).apply(
-        params, patch_tokens[:, :1], jnp.ones(1, jnp.int32), jnp.array([True]), nothing, grid=GRID
-    )
-    np.testing.assert_allclose(before[0], alone.special[0, 0], rtol=1e-5, atol=1e-5)
+    alone, _ = frame(patch_tokens[:, :1], np.array([True]), NOTHING)
+    np.testing.assert_allclose(before[0], np.asarray(alone.special)[0, 0], rtol=1e-5, atol=1e-5)
 
 
 def test_a_full_causal_cache_is_full_attention_over_the_last_frame(
-    small_config: ModelConfig, small_variables: dict, patch_tokens: jax.Array
+    small_config: ModelConfig, small_variables: dict, patch_tokens: np.ndarray
 ) -> None:
     """All frames at once through an empty cache: every frame sees every other, as in one window."""
     params = {"params": small_variables["params"]["aggregator"]}
-    nothing = CrossWindowMemory(jnp.zeros((1, 0)), jnp.zeros(1, jnp.int32), ())
-    outputs = [
-        Aggregator(small_config)
-        .apply(params, patch_tokens, jnp.full(1, FRAMES), jnp.array([True]), memory, grid=GRID)[0]
-        .key
-        for memory in (empty_cache(small_config), nothing)
-    ]
+
+    @in_pieces
+    def window(memory: CausalCache | CrossWindowMemory) -> jax.Array:
+        lengths, first = jnp.full(1, FRAMES), jnp.array([True])
+        return Aggregator(small_config).apply(params, patch_tokens, lengths, first, memory, grid=GRID)[0].key
+
+    outputs = [window(memory) for memory in (empty_cache(small_config), NOTHING)]
     np.testing.assert_allclose(outputs[0], outputs[1], rtol=2e-5, atol=2e-5)
