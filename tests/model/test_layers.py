@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import re
 from typing import Any
@@ -22,6 +23,9 @@ from logvggt_jax.operations import count_flops
 FRAMES = jax.ShapeDtypeStruct((1, 2, 28, 42, 3), jnp.uint8)
 
 
+_in_compute_type = jax.jit(in_compute_type, static_argnums=1)
+
+
 def exact(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """x Φ(x) and its slope, float64."""
     below = 0.5 * (1 + erf(x * math.sqrt(0.5)))
@@ -32,30 +36,37 @@ def exact(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def test_gelu_is_exact_before_it_is_rounded(dtype: str) -> None:
     x = np.concatenate([np.linspace(-12, 12, 20_001), [0.0, -0.0]]).astype(np.float32)
     value, slope = exact(x.astype(np.float64))
-    assert np.abs(_gelu(x, dtype) - value).max() < 1e-6
-    assert np.abs(jax.vmap(jax.grad(lambda x: _gelu(x, dtype)))(x) - slope).max() < 1e-6
+
+    @jax.jit
+    def gelu(x: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return _gelu(x, dtype), jax.vmap(jax.grad(lambda x: _gelu(x, dtype)))(x)
+
+    found, found_slope = jax.device_get(gelu(x))
+    assert np.abs(found - value).max() < 1e-6
+    assert np.abs(found_slope - slope).max() < 1e-6
     # A sixteenth of what bfloat16 rounds off, where that is more than nothing at all.
     tail = (x > -4) & (x < 0)
-    assert (np.abs(_gelu(x, dtype) - value)[tail] < 2**-8 / 16 * np.abs(value[tail]) + 1e-6).all()
+    assert (np.abs(found - value)[tail] < 2**-8 / 16 * np.abs(value[tail]) + 1e-6).all()
 
 
 def test_biases_are_added_to_sums_in_16_bits_without_another_rounding() -> None:
     layer = dense(4, "layer", "bfloat16", sums="bfloat16")
-    x = jnp.ones((1, 8), jnp.bfloat16)
-    params = {"kernel": jnp.full((8, 4), 2.0), "bias": jnp.full(4, 2.0**-7)}
-    found = layer.apply({"params": params}, x)
+    x = np.ones((1, 8), jnp.bfloat16)
+    params = {"kernel": np.full((8, 4), 2.0, np.float32), "bias": np.full(4, 2.0**-7, np.float32)}
+    found = np.asarray(jax.jit(layer.apply)({"params": params}, x))
     # 16 + 1/128 has more digits than bfloat16.
     assert found.dtype == jnp.float32 and (found == 16 + 2.0**-7).all()
-    params["bias"] = jnp.arange(4.0)
-    first, second = layer.apply({"params": params}, x, columns=slice(1, None), cuts=(2,))
+    params["bias"] = np.arange(4, dtype=np.float32)
+    some = functools.partial(layer.apply, columns=slice(1, None), cuts=(2,))
+    first, second = jax.jit(some)({"params": params}, x)
     np.testing.assert_array_equal(first, [[17.0, 18.0]])
     np.testing.assert_array_equal(second, [[19.0]])
 
 
 def test_float16_hands_on_what_it_cannot_hold() -> None:
     layer = dense(1, "layer", "float16", sums=sums_of("float16"))
-    params = {"kernel": jnp.full((4, 1), 2.0**15), "bias": jnp.zeros(1)}
-    assert layer.apply({"params": params}, jnp.ones((1, 4))) == 2.0**17
+    params = {"kernel": np.full((4, 1), 2.0**15, np.float32), "bias": np.zeros(1, np.float32)}
+    assert np.asarray(jax.jit(layer.apply)({"params": params}, np.ones((1, 4), np.float32))) == 2.0**17
     assert sums_of("bfloat16") == "bfloat16"
 
 
@@ -65,7 +76,7 @@ def test_operations_are_the_same_in_the_form_of_streams(model: LogVGGT, small_va
     state = jax.eval_shape(plain.start, small_variables, FRAMES)
     given, streamed = (
         count_flops(plain.step, variables, state, FRAMES)
-        for variables in (small_variables, in_compute_type(small_variables, model.config))
+        for variables in (small_variables, _in_compute_type(small_variables, model.config))
     )
     assert streamed == given
 
@@ -86,7 +97,7 @@ def model(small_config: ModelConfig) -> LogVGGT:
 
 def test_streams_have_queries_keys_and_values_side_by_side(model: LogVGGT, small_variables: Any) -> None:
     given = small_variables["params"]["aggregator"]["global_block_0"]["attention"]
-    streamed = in_compute_type(small_variables, model.config)
+    streamed = _in_compute_type(small_variables, model.config)
     found = streamed["params"]["aggregator"]["global_block_0"]["attention"]
     assert found.keys() == given.keys() - {"query", "key_value"} | {"query_key_value"}
     for name in ("kernel", "bias"):
@@ -98,13 +109,15 @@ def test_streams_have_queries_keys_and_values_side_by_side(model: LogVGGT, small
     )
     again = in_compute_type(streamed, model.config)
     jax.tree.map(np.testing.assert_array_equal, again, streamed)
-    stacked = in_compute_type(stack_layers(small_variables), model.config)
-    jax.tree.map(np.testing.assert_array_equal, stacked, stack_layers(streamed))
+    stacked, expected = jax.jit(
+        lambda given, streamed: (_in_compute_type(stack_layers(given), model.config), stack_layers(streamed))
+    )(small_variables, streamed)
+    jax.tree.map(np.testing.assert_array_equal, stacked, expected)
 
 
 def test_a_step_of_real_frames_selects_and_sorts_no_keys(model: LogVGGT, small_variables: Any) -> None:
     model = LogVGGT(dataclasses.replace(model.config, attention="cudnn"))
-    variables = in_compute_type(small_variables, model.config)
+    variables = _in_compute_type(small_variables, model.config)
 
     def lowered(frame_mask: Any = None, masks: Any = None) -> str:
         held = None if masks is None else jax.ShapeDtypeStruct((1, 2, 28, 42), bool)

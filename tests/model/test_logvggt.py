@@ -133,8 +133,8 @@ def test_layers_as_a_loop_are_the_layers_one_by_one(small_config, small_variable
     }
     variables = {"params": {**params, "aggregator": {**aggregator, **extra}}}
     one_by_one = jax.jit(model.windows.scan)(variables, video())
-    stacks = stack_layers(variables)
-    jax.tree.map(np.testing.assert_array_equal, unstack_layers(stacks, model.config), variables)
+    stacks = jax.jit(stack_layers)(variables)
+    jax.tree.map(np.testing.assert_array_equal, unstack_layers(jax.device_get(stacks), model.config), variables)
     assert stack_layers(stacks)["params"].keys() == stacks["params"].keys()
     loop = jax.jit(model.windows.scan)(stacks, video())
     jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=2e-5, atol=2e-5), loop, one_by_one)

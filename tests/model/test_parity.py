@@ -124,10 +124,8 @@ def layers(modules, converted):
 
 def _stages(module, params, *args, **kwargs):
     """Outputs of all of a module's layers, by path, the module's own under ""."""
-
-    out, state = module.apply(
-        {"params": params}, *args, capture_intermediates=True, mutable=["intermediates"], **kwargs
-    )
+    apply = functools.partial(module.apply, capture_intermediates=True, mutable=["intermediates"], **kwargs)
+    out, state = jax.jit(apply)({"params": params}, *args)
     stages = {"": out}
     for path, leaf in jax.tree_util.tree_leaves_with_path(state["intermediates"]):
         names = [key.key for key in path if hasattr(key, "key")]
@@ -276,11 +274,11 @@ NORMS = {
 def test_layer_norms(layers, golden, name):
     source, path = NORMS[name]
     module, params = layers[path]
-    found = module.apply({"params": params}, golden[source])
+    found = jax.jit(module.apply)({"params": params}, golden[source])
     np.testing.assert_allclose(found, golden[name], rtol=0, atol=2e-6)
     # The inputs are so small that the other epsilon would show.
     other = module.clone(epsilon=1e-5 if module.epsilon == 1e-6 else 1e-6)
-    assert np.abs(other.apply({"params": params}, golden[source]) - golden[name]).max() > 1e-3
+    assert np.abs(jax.jit(other.apply)({"params": params}, golden[source]) - golden[name]).max() > 1e-3
 
 
 @pytest.mark.parametrize(
@@ -293,17 +291,23 @@ def test_layer_norms(layers, golden, name):
 )
 def test_blocks(layers, golden, converted, name, source, path):
     module, params = layers[path]
-    options = {}
-    if "frame" in path:
-        options["rope"] = rope_table(GRID, 5, 16, converted[0].aggregator.rope_base)
-    found, _ = module.apply({"params": params}, golden[source], **options)
+
+    @jax.jit
+    def applied(params, tokens):
+        rope = rope_table(GRID, 5, 16, converted[0].aggregator.rope_base) if "frame" in path else None
+        return module.apply({"params": params}, tokens, rope=rope)[0]
+
+    found = applied(params, golden[source])
     np.testing.assert_allclose(found, golden[name], rtol=0, atol=2e-6)
     assert relative_error(found, golden[name]) <= TOKENS
 
 
 def test_rotary_embedding(golden, converted):
-    table = rope_table(GRID, 5, 16, converted[0].aggregator.rope_base)
-    found = apply_rope(jnp.swapaxes(golden["rope_in"], 1, 2), table)
+    @jax.jit
+    def rotated(tokens):
+        return apply_rope(tokens, rope_table(GRID, 5, 16, converted[0].aggregator.rope_base))
+
+    found = rotated(np.swapaxes(golden["rope_in"], 1, 2))
     np.testing.assert_allclose(np.swapaxes(found, 1, 2), golden["rope_out"], rtol=0, atol=2e-6)
 
 
