@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import functools
 import importlib.util
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +70,15 @@ def load(golden_dir: Path, name: str, model: str = "") -> Golden:
     )
     params, _ = params_from_vggt(state_dict, config)
     return Golden(arrays, settings, config, jax.device_put({"params": params}))
+
+
+def with_key_layers(config: ModelConfig, layers: Iterable[int], depth: int | None = None) -> ModelConfig:
+    """The model whose aggregator gives the tokens of these layers, and has the first `depth` alone, if given. A
+    configuration has the four that the depth head reads; the aggregator gives as many as it is asked for."""
+    sizes = copy.copy(config.aggregator)
+    object.__setattr__(sizes, "key_layers", tuple(layers))
+    object.__setattr__(sizes, "depth", depth or sizes.depth)
+    return dataclasses.replace(config, aggregator=sizes)
 
 
 @functools.partial(in_pieces, static=1)

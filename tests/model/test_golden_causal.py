@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-import dataclasses
 import functools
 from typing import Any
 
@@ -12,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from golden_methods import POSES, TOKENS, Golden, assert_depth
+from golden_methods import POSES, TOKENS, Golden, assert_depth, with_key_layers
 from pieces import in_pieces
 
 from logvggt_jax.model.aggregator import WindowTokens
@@ -58,10 +56,8 @@ def _stored_layers(golden: Golden, form: str) -> list[int]:
 
 def _tokens(golden: Golden, form: str, *given: Any) -> tuple[WindowTokens, WindowTokens, Any]:
     """Tokens at all stored layers, those of the depth head's layers, and the memory."""
-    layers, sizes = _stored_layers(golden, form), copy.copy(golden.config.aggregator)
-    # A configuration has the four that the depth head reads; the aggregator gives as many as it is asked for.
-    object.__setattr__(sizes, "key_layers", tuple(layers))
-    parts = FrameByFrame(dataclasses.replace(golden.config, aggregator=sizes))
+    layers = _stored_layers(golden, form)
+    parts = FrameByFrame(with_key_layers(golden.config, layers))
     tokens, memory = parts.tokens(golden.variables, *given)
     chosen = np.array([layers.index(layer) for layer in golden.config.aggregator.key_layers])
     return tokens, tokens._replace(key=tokens.key[:, chosen]), memory
