@@ -251,7 +251,7 @@ def variable_shapes(config: ModelConfig) -> Variables:
     """{"params": …} of a model as `jax.ShapeDtypeStruct`s; traced once for each configuration, nothing is allocated."""
     # Shapes do not depend on the form of attention, and tracing cuDNN's asks for a GPU.
     model, patch = LogVGGT(dataclasses.replace(shallow(config), attention="xla")), config.encoder.patch_size
-    key = jax.random.key(0)
+    key = jax.eval_shape(jax.random.key, 0)
     params = {
         name: jax.eval_shape(functools.partial(call.module.init, **call.static), key, *call.inputs)["params"]
         for name, call in model.calls((patch, patch)).items()
