@@ -62,7 +62,7 @@ def test_the_table_fills_the_model_but_for_its_new_parameters():
 
 
 def test_layouts(converted, shallow):
-    params, _ = converted
+    params = jax.device_get(converted[0])
     config, state_dict = shallow
     attention = params["aggregator"]["global_block_3"]["attention"]
     fused, bias = (state_dict[f"aggregator.global_blocks.3.attn.qkv.{leaf}"] for leaf in ("weight", "bias"))
