@@ -3,11 +3,13 @@
 import ctypes
 import gc
 import inspect
+import multiprocessing
 import os
 import resource
 import sys
 import time
 from collections.abc import Iterator
+from multiprocessing import forkserver
 from pathlib import Path
 
 import jax
@@ -74,6 +76,9 @@ DEAREST = (
     "evaluation/test_run.py",
 )
 
+# What processes that tests spawn import, see `forked_workers`.
+SPAWNED = ("data.feeding.batches", "data.registry", "evaluation.records", "reconstruction.result")
+
 # Bytes of a test process at its peak: laptops of 8 GB run two.
 MOST_MEMORY = 2_500_000_000
 # Bytes held after a file at which what is compiled is dropped; dropping it after every file took half a minute.
@@ -127,6 +132,23 @@ def programs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RootPrograms]
         with loaded(folder, "pytest", *(f"logvggt_jax.{name}" for name in libraries)) as programs:
             patch.undo()
             yield programs
+
+
+@pytest.fixture(scope="session")
+def _imported_once() -> Iterator[None]:
+    """The interpreter that `forked_workers` forks, started by the first of them."""
+    multiprocessing.set_forkserver_preload(["pytest", *(f"logvggt_jax.{name}" for name in SPAWNED)])
+    yield
+    forkserver._forkserver._stop()
+
+
+@pytest.fixture
+def forked_workers(_imported_once: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Processes that would be spawned are forks of one interpreter that has imported their libraries. They get what
+    they work on as spawned ones do, pickled; what takes each of those more than a second is imported once."""
+    if "forkserver" in multiprocessing.get_all_start_methods():
+        context = multiprocessing.get_context("forkserver")
+        monkeypatch.setattr(multiprocessing, "get_context", lambda _: context)
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -67,6 +67,8 @@ def read_nothing(root: Path, output: Path) -> None:
     raise ValueError("never reads")
 
 
+pytestmark = pytest.mark.usefixtures("forked_workers")
+
 READERS = {
     "message": read_without_file,
     "two lines": read_on_two_lines,

@@ -20,6 +20,7 @@ def batches(**changes: object) -> BatchIterator:
     return training_batches({"rooms": SCENES}, **options)
 
 
+@pytest.mark.usefixtures("forked_workers")
 def test_workers_describe_the_same_clips() -> None:
     with batches() as here, batches(worker_count=1, max_broken=0.1) as elsewhere:
         for _ in range(3):

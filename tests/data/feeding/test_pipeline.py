@@ -206,6 +206,7 @@ def test_worker_processes_give_the_same_batches_and_resume_with_another_number()
         assert clips(iterator, 3) == expected[12:]
 
 
+@pytest.mark.usefixtures("forked_workers")
 def test_workers_that_are_killed_are_started_again_a_few_times(monkeypatch):
     warnings = []
     monkeypatch.setattr(logging, "warning", lambda text, *values: warnings.append(text % values))
@@ -271,6 +272,7 @@ def test_weights_hold_across_sizes():
     assert sum(sequence in (0, 3) for sequence in sequences) / 320 == pytest.approx(0.25, abs=0.01)
 
 
+@pytest.mark.usefixtures("forked_workers")
 def test_batches_of_several_sizes_resume_exactly_and_are_shared_by_processes():
     options = {"datasets": {"shaped": Shaped(12)}, "sizes": [(14, 28), (28, 14)]}
 
@@ -313,6 +315,7 @@ def test_a_broken_clip_is_replaced_by_the_next_of_its_set(caplog: pytest.LogCapt
     assert caplog.text.count("broken clip, replaced") == broken.count
 
 
+@pytest.mark.usefixtures("forked_workers")
 def test_replaced_clips_are_the_same_after_resuming_and_for_any_number_of_workers():
     options = {"datasets": {"flaky": Flaky(8)}, "stride": (1, 1), "max_broken": 0.5}
     with batches(**options) as iterator:
