@@ -149,8 +149,14 @@ def optimizer_config() -> OptimizerConfig:
 
 
 @pytest.fixture(scope="session")
-def run_config(small_config: ModelConfig, loss_config: LossConfig, optimizer_config: OptimizerConfig) -> TrainConfig:
-    """Six steps on rooms: four of two frames, two of three."""
+def run_config(
+    small_config: ModelConfig,
+    loss_config: LossConfig,
+    optimizer_config: OptimizerConfig,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> TrainConfig:
+    """Six steps on rooms: four of two frames, two of three. The rooms are rendered by the first run and kept: there
+    are more than a hundred runs, and rendering took longer than all steps of one."""
 
     def stage(name: str, steps: int, clip_length: int) -> StageConfig:
         return StageConfig(
@@ -167,7 +173,7 @@ def run_config(small_config: ModelConfig, loss_config: LossConfig, optimizer_con
             reverse=0.5,
             worker_count=0,
             num_threads=0,
-            cache_dir=None,
+            cache_dir=str(tmp_path_factory.mktemp("rooms")),
         ),
         validation=None,
         seed=0,

@@ -250,8 +250,9 @@ def test_objective_and_teacher_belong_together(run_config: TrainConfig, tmp_path
     loss = dataclasses.replace(run_config.loss, name="distillation")
     with pytest.raises(InputError, match="belong together"):
         dataclasses.replace(run_config, loss=loss)
+    nowhere = dataclasses.replace(run_config.data, cache_dir=None)
     with pytest.raises(InputError, match=r"give data\.cache_dir a folder"):
-        dataclasses.replace(run_config, loss=loss, teacher=TEACHER)
+        dataclasses.replace(run_config, loss=loss, data=nowhere, teacher=TEACHER)
     data = dataclasses.replace(run_config.data, cache_dir=str(tmp_path))
     with pytest.raises(InputError, match=r"stages second: clips are longer than the teacher's"):
         dataclasses.replace(run_config, loss=loss, data=data, teacher=dataclasses.replace(TEACHER, clip_length=2))

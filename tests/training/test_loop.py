@@ -176,15 +176,15 @@ def test_data_that_do_not_fit_the_last_stage_are_an_error_before_the_first(
     *stages, last = run_config.stages
     longer = dataclasses.replace(last, clip_length=9)  # than the rooms' eight frames
     with pytest.raises(ValueError, match="rooms: none of 8 sequences has"):
-        train(dataclasses.replace(run_config, stages=(*stages, longer)), tmp_path, mesh=data_mesh(1))
+        train(dataclasses.replace(run_config, stages=(*stages, longer)), tmp_path, mesh=data_mesh(2))
     assert not _numbers(tmp_path)
 
 
 def test_time_limit_ends_the_run_with_a_checkpoint(run_config: TrainConfig, tmp_path: Path) -> None:
     limited = dataclasses.replace(run_config, max_minutes=1e-9)
     # The limit belongs to a session, not to the run: each one gets a step further.
-    assert int(train(limited, tmp_path, mesh=data_mesh(1)).step) == 1
-    assert int(train(limited, tmp_path, mesh=data_mesh(1)).step) == 2
+    assert int(train(limited, tmp_path, mesh=data_mesh(2)).step) == 1
+    assert int(train(limited, tmp_path, mesh=data_mesh(2)).step) == 2
 
 
 def test_finished_run_is_left_alone(run_config: TrainConfig, straight: tuple[TrainState, Path], finished: Path) -> None:
@@ -206,7 +206,7 @@ def at_constant_rate(run_config: TrainConfig, pixel_model: Any, pixel_params: An
     with pytest.MonkeyPatch.context() as patch:
         _use(patch, pixel_model, pixel_params)
         patch.setattr(loop, "make_program", _program)
-        train(_at_constant_rate(run_config, *run_config.stages), workdir, mesh=data_mesh(1))
+        train(_at_constant_rate(run_config, *run_config.stages), workdir, mesh=data_mesh(2))
     return workdir
 
 
@@ -218,15 +218,15 @@ def test_a_finished_run_that_is_to_go_further_trains_the_new_steps_and_no_others
     first, last = run_config.stages
     more = (last, dataclasses.replace(last, name="third")) if added else (dataclasses.replace(last, steps=4),)
     config = _at_constant_rate(run_config, first, *more)
-    state = train(config, workdir, mesh=data_mesh(1))
+    state = train(config, workdir, mesh=data_mesh(2))
     # Times and all.
     assert read_metrics(workdir / "metrics.jsonl")[:6] == read_metrics(at_constant_rate / "metrics.jsonl")
-    _same(state, train(config, tmp_path / "whole", mesh=data_mesh(1)))
+    _same(state, train(config, tmp_path / "whole", mesh=data_mesh(2)))
     assert _numbers(workdir) == _numbers(tmp_path / "whole")
     training = read_provenance(workdir / "model").training
     assert training is not None and training.steps == 8
     # And is finished again.
-    _same(train(config, workdir, mesh=data_mesh(1)), state)
+    _same(train(config, workdir, mesh=data_mesh(2)), state)
 
 
 def test_other_changes_of_stages_are_refused(run_config: TrainConfig, finished: Path) -> None:
@@ -243,7 +243,7 @@ def test_other_changes_of_stages_are_refused(run_config: TrainConfig, finished: 
     ):
         config = dataclasses.replace(run_config, stages=stages)
         with pytest.raises(InputError, match=rf"other settings: {named}.*\(a finished run may get stages after"):
-            train(config, finished, mesh=data_mesh(1), resume_step=step)
+            train(config, finished, mesh=data_mesh(2), resume_step=step)
 
 
 @pytest.mark.usefixtures("abandoned_reads")
@@ -276,7 +276,7 @@ def test_changed_leaf_is_refused_by_its_digest(
 def test_checkpoint_of_another_configuration_is_refused(run_config: TrainConfig, finished: Path) -> None:
     other = dataclasses.replace(run_config, loss=dataclasses.replace(run_config.loss, alpha=0.5), seed=1)
     with pytest.raises(ValueError, match=r"other settings: loss\.alpha=0\.2, now 0\.5; seed=0, now 1\. Set them back"):
-        train(other, finished, mesh=data_mesh(1))
+        train(other, finished, mesh=data_mesh(2))
 
 
 def test_a_run_does_not_go_on_with_sequences_that_grew(
@@ -291,7 +291,7 @@ def test_a_run_does_not_go_on_with_sequences_that_grew(
 
 def test_resume_step_that_does_not_exist_is_refused(run_config: TrainConfig, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="no checkpoint of step 5; there are none"):
-        train(run_config, tmp_path, mesh=data_mesh(1), resume_step=5)
+        train(run_config, tmp_path, mesh=data_mesh(2), resume_step=5)
 
 
 def test_endless_non_finite_updates_stop_the_run(
@@ -300,7 +300,7 @@ def test_endless_non_finite_updates_stop_the_run(
     broken = {**pixel_params, "depth_head": jax.tree.map(lambda x: x * np.nan, pixel_params["depth_head"])}
     monkeypatch.setattr(loop, "initial_parameters", lambda *_, **__: jax.tree.map(jnp.array, broken))
     with pytest.raises(NonFiniteTraining, match="step 2: 2 updates in a row had a non-finite loss or gradient"):
-        train(run_config, tmp_path, mesh=data_mesh(1))
+        train(run_config, tmp_path, mesh=data_mesh(2))
 
 
 def test_a_work_folder_that_is_a_file_is_refused_before_data_are_read(
@@ -309,7 +309,7 @@ def test_a_work_folder_that_is_a_file_is_refused_before_data_are_read(
     monkeypatch.setattr(loop, "open_data", lambda _: pytest.fail("not yet"))
     (tmp_path / "run").write_text("notes")
     with pytest.raises(InputError, match=r"run is no folder; choose another output"):
-        train(run_config, tmp_path / "run", mesh=data_mesh(1))
+        train(run_config, tmp_path / "run", mesh=data_mesh(2))
 
 
 def test_data_that_fail_leave_a_checkpoint(
@@ -326,7 +326,7 @@ def test_data_that_fail_leave_a_checkpoint(
 
     monkeypatch.setattr(DeviceBatches, "__next__", fail)
     with pytest.raises(InputError, match="the disk is gone"):
-        train(run_config, tmp_path, mesh=data_mesh(1))
+        train(run_config, tmp_path, mesh=data_mesh(2))
     assert RunCheckpoints(tmp_path, run_config).steps[-1] == 2
 
 
@@ -346,9 +346,9 @@ def test_a_line_shows_the_mean_of_its_interval(
 def test_goodput_counts_earlier_sessions(
     run_config: TrainConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    train(dataclasses.replace(run_config, max_minutes=1e-9), tmp_path, mesh=data_mesh(1))
+    train(dataclasses.replace(run_config, max_minutes=1e-9), tmp_path, mesh=data_mesh(2))
     first = read_metrics(tmp_path / "times.jsonl")
-    train(run_config, tmp_path, mesh=data_mesh(1))
+    train(run_config, tmp_path, mesh=data_mesh(2))
     entries = read_metrics(tmp_path / "times.jsonl")
     assert entries[: len(first)] == first and [entry["step"] for entry in first] == [0, 1]
     productive = [entry["productive_seconds"] for entry in entries]
@@ -358,7 +358,7 @@ def test_goodput_counts_earlier_sessions(
 
 
 def test_a_trace_of_some_steps_is_written(run_config: TrainConfig, tmp_path: Path) -> None:
-    train(run_config, tmp_path, mesh=data_mesh(1), profile=ProfiledSteps.parse("3:4"))
+    train(run_config, tmp_path, mesh=data_mesh(2), profile=ProfiledSteps.parse("3:4"))
     assert list((tmp_path / "profile").rglob("*.xplane.pb"))
     with pytest.raises(InputError, match=r"--profile=4:3: expected the first and the last step, such as 20:25"):
         ProfiledSteps.parse("4:3")
@@ -372,15 +372,17 @@ def test_a_trace_that_cannot_be_written_ends_no_run(
     caplog: pytest.LogCaptureFixture,
     failing: str,
 ) -> None:
+    stop = jax.profiler.stop_trace
+
     def full(*_: object) -> None:
+        # What has begun is ended here: every later call of a function would be noted as well.
+        if failing == "stop_trace":
+            stop()
         raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: profile/vm.xplane.pb; No space left on device")
 
     with monkeypatch.context() as patch:
-        stop = jax.profiler.stop_trace
         patch.setattr(jax.profiler, failing, full)
-        train(run_config, tmp_path, mesh=data_mesh(1), profile=ProfiledSteps.parse("3:4"))
-    if failing == "stop_trace":
-        stop()
+        train(run_config, tmp_path, mesh=data_mesh(2), profile=ProfiledSteps.parse("3:4"))
     assert "No space left on device" in caplog.text
     assert read_metrics(tmp_path / "metrics.jsonl")[-1]["step"] == run_config.total_steps
 
@@ -392,7 +394,7 @@ def test_the_data_are_looked_for_before_the_weights_are_read(
     source = SourceConfig(name="scannet", root=str(tmp_path / "none"), split="train")
     data = dataclasses.replace(run_config.data, sources=(source,))
     with pytest.raises(InputError, match="scannet"):
-        train(dataclasses.replace(run_config, data=data), tmp_path / "run", mesh=data_mesh(1))
+        train(dataclasses.replace(run_config, data=data), tmp_path / "run", mesh=data_mesh(2))
 
 
 def test_the_watchdog_sleeps_while_the_data_are_opened(
@@ -407,7 +409,7 @@ def test_the_watchdog_sleeps_while_the_data_are_opened(
 
     monkeypatch.setattr(loop, "open_data", opened)
     with pytest.raises(InputError, match="watched: False"):
-        train(run_config, tmp_path, mesh=data_mesh(1), watchdog=30.0)
+        train(run_config, tmp_path, mesh=data_mesh(2), watchdog=30.0)
 
 
 @pytest.mark.parametrize("reason", ["RESOURCE_EXHAUSTED: Out of memory while trying to allocate", "INTERNAL: broken"])
@@ -462,7 +464,7 @@ def test_a_validation_that_does_not_fit_names_what_lowers_it(
         r"validation\.size=\(28, 42\) or validation\.clip_length=3 \(RESOURCE_EXHAUSTED"
     )
     with pytest.raises(InputError, match=message):
-        train(_validated(run_config), tmp_path, mesh=data_mesh(1))
+        train(_validated(run_config), tmp_path, mesh=data_mesh(2))
 
 
 def test_validation_reports_held_out_clips(run_config: TrainConfig, tmp_path: Path) -> None:
@@ -501,7 +503,7 @@ def test_the_best_model_by_the_named_metric_is_kept(
         patch.setattr(
             loop, "Validation", lambda *_: lambda _: Judgement({**values, f"validation/{metric}": next(judged)}, {})
         )
-        train(_validated(run_config, best=metric), tmp_path, mesh=data_mesh(1))
+        train(_validated(run_config, best=metric), tmp_path, mesh=data_mesh(2))
     training = read_provenance(tmp_path / "best").training
     assert training is not None and training.steps == kept
     last = read_provenance(tmp_path / "model").training
@@ -536,7 +538,7 @@ def test_the_best_model_is_compared_on_the_same_clips_alone(
     )
 
     def kept(config: TrainConfig) -> int | None:
-        train(config, tmp_path, mesh=data_mesh(1))
+        train(config, tmp_path, mesh=data_mesh(2))
         training = read_provenance(tmp_path / "best").training
         return None if training is None else training.steps
 
@@ -545,7 +547,7 @@ def test_the_best_model_is_compared_on_the_same_clips_alone(
     assert easy.validation is not None
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyError, match="crash"):
         _at_step(patch, 4, _crash)
-        train(easy, tmp_path, mesh=data_mesh(1))
+        train(easy, tmp_path, mesh=data_mesh(2))
     # Of other clips 0.5 is the first that is known; how often they are judged does not make them others.
     hard = dataclasses.replace(easy, validation=dataclasses.replace(easy.validation, stride=1))
     assert kept(hard) == 6
@@ -572,10 +574,10 @@ def test_a_run_that_is_killed_between_its_best_model_and_the_line_about_it_shows
     config = _validated(run_config, best="abs_rel")
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyError, match="crash"):
         patch.setattr(MetricsLog, "show", show)
-        train(config, tmp_path, mesh=data_mesh(1))
+        train(config, tmp_path, mesh=data_mesh(2))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(MetricsLog, "show", show)
-        train(config, tmp_path, mesh=data_mesh(1))
+        train(config, tmp_path, mesh=data_mesh(2))
     assert shown == [0, 3, 3, 6]
     lines = [entry for entry in _numbers(tmp_path) if "validation/abs_rel" in entry]
     errors = {entry["step"]: entry["validation/abs_rel"] for entry in lines}
@@ -627,15 +629,15 @@ def test_a_save_or_a_validation_that_fails_says_so_before_the_first_step(
         monkeypatch.setattr(loop.Validation, "__call__", fail)
     monkeypatch.setattr(loop._Run, "_compile", lambda *_: pytest.fail("no step is to be compiled"))
     with pytest.raises(OSError, match="cannot be done"):
-        train(_validated(run_config), tmp_path, mesh=data_mesh(1))
+        train(_validated(run_config), tmp_path, mesh=data_mesh(2))
 
 
 def test_settings_may_change_until_a_step_is_done(run_config: TrainConfig, tmp_path: Path) -> None:
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyError, match="crash"):
         patch.setattr(loop._Run, "_compile", lambda *_: _crash())
-        train(run_config, tmp_path, mesh=data_mesh(1))
+        train(run_config, tmp_path, mesh=data_mesh(2))
     other = dataclasses.replace(run_config, loss=dataclasses.replace(run_config.loss, alpha=0.5))
-    assert int(train(other, tmp_path, mesh=data_mesh(1)).step) == 6
+    assert int(train(other, tmp_path, mesh=data_mesh(2)).step) == 6
 
 
 @pytest.mark.parametrize("best", [0, 3])
@@ -654,13 +656,13 @@ def test_a_run_that_begins_anew_keeps_no_validation_of_the_start_before(
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyError, match="crash"):
         judge(patch, 0.2, 0.1 if best else 0.3)
         _at_step(patch, 4, _crash)
-        train(config, tmp_path, mesh=data_mesh(1))
+        train(config, tmp_path, mesh=data_mesh(2))
     kept = read_provenance(tmp_path / "best").training
     assert kept is not None and kept.steps == best
     other = dataclasses.replace(_validated(run_config), loss=dataclasses.replace(run_config.loss, alpha=0.5))
     with pytest.MonkeyPatch.context() as patch:
         judge(patch, 0.9, 0.8, 0.7)
-        train(other, tmp_path, mesh=data_mesh(1))
+        train(other, tmp_path, mesh=data_mesh(2))
     errors = [entry["validation/abs_rel"] for entry in _numbers(tmp_path) if "validation/abs_rel" in entry]
     assert errors == [0.9, 0.8, 0.7]
     # What had learned something is not thrown away.
@@ -769,8 +771,8 @@ def test_updates_left_out_before_a_start_do_not_end_it(
     monkeypatch.setattr(ClipReader, "__call__", reading)
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyError, match="crash"):
         _at_step(patch, 5, _crash)
-        train(run_config, tmp_path, mesh=data_mesh(1))
-    state = train(dataclasses.replace(run_config, max_skipped_in_a_row=1), tmp_path, mesh=data_mesh(1))
+        train(run_config, tmp_path, mesh=data_mesh(2))
+    state = train(dataclasses.replace(run_config, max_skipped_in_a_row=1), tmp_path, mesh=data_mesh(2))
     assert int(state.skipped) == 1 and int(state.step) == run_config.total_steps
 
 
@@ -780,7 +782,7 @@ def test_useless_restarts_do_not_push_good_checkpoints_out(
     config = dataclasses.replace(run_config, max_skipped_in_a_row=1)
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyError, match="crash"):
         _at_step(patch, 4, _crash)
-        train(config, tmp_path, mesh=data_mesh(1))
+        train(config, tmp_path, mesh=data_mesh(2))
     monkeypatch.setattr(loop, "LogVGGT", lambda _: DazzledModel(pixel_model.config, pixel_model))
     read = ClipReader.__call__
     monkeypatch.setattr(
@@ -790,7 +792,7 @@ def test_useless_restarts_do_not_push_good_checkpoints_out(
     )
     for step in (4, 5, 6):
         with pytest.raises(NonFiniteTraining, match=f"step {step}: 1 updates in a row"):
-            train(config, tmp_path, mesh=data_mesh(1))
+            train(config, tmp_path, mesh=data_mesh(2))
         with RunCheckpoints(tmp_path, config) as checkpoints:
             # Of the same parameters one is kept, the newest.
             assert checkpoints.steps == [0, step]
@@ -815,6 +817,6 @@ def test_a_save_that_is_under_way_when_updates_fail_gives_place_to_the_next(
     monkeypatch.setattr(run_checkpoints, "write_checkpoint", slow)
     config = dataclasses.replace(run_config, max_skipped_in_a_row=1)
     with pytest.raises(NonFiniteTraining, match="step 4: 1 updates in a row"):
-        train(config, tmp_path, mesh=data_mesh(1))
+        train(config, tmp_path, mesh=data_mesh(2))
     # The step that was left out changed nothing of what was saved after the third.
     assert RunCheckpoints(tmp_path, config).steps == [0, 4]
