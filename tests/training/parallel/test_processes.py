@@ -50,7 +50,12 @@ PIXEL_SETTINGS = (
     "--config.stages.stage_1.steps=100000",
     "--config.stages.stage_1.batch_size=2",
     "--config.stages.stage_2.batch_size=2",
-    *SETTINGS[5:9],
+    # Each process renders its rooms, which otherwise takes as long as all else that it does.
+    "--config.data.sources.rooms.options.num_rooms=2",
+    "--config.data.sources.rooms.options.num_frames=24",
+    "--config.validation.num_clips=2",
+    "--config.validation.sources.rooms.options.num_rooms=2",
+    "--config.validation.sources.rooms.options.num_frames=24",
     "--config.validation.every=100000",
     "--config.log_every=10",
     "--config.save_every=100000",
