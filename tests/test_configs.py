@@ -173,7 +173,7 @@ def _abstract_run(config: TrainConfig, num_devices: int) -> tuple[TrainState, ja
     """A run's first state without values, and its step."""
     params = abstract_parameters(config.model)
     program = make_program(LogVGGT(config.model), config, params, data_mesh(num_devices))
-    return program.abstract_state(params), program.step
+    return program.abstract_state, program.step
 
 
 def _shallow(config: TrainConfig) -> TrainConfig:

@@ -139,7 +139,7 @@ class _Run:
             self.checkpoints.begin_anew()
             self.state = self.program.initial_state(params)
             return 0, None
-        like = self.program.abstract_state(self.shapes)
+        like = self.program.abstract_state
         self.state, position = self.checkpoints.restore(like, step=resume_step)
         return int(self.state.step), position
 

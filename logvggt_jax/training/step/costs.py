@@ -89,7 +89,7 @@ def step_costs(
     )
     started = time.perf_counter()
     try:
-        compiled = program.step.lower(program.abstract_state(params), batch).compile()
+        compiled = program.step.lower(program.abstract_state, batch).compile()
     except jax.errors.JaxRuntimeError as error:
         if out_of_device_memory(error):
             return None

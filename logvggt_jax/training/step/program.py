@@ -29,24 +29,14 @@ class Program(NamedTuple):
     layout: Layout
     optimizer: optax.GradientTransformation
     step: jax.stages.Wrapped  # of `make_train_step`
-    averaged: tuple[str, ...]  # modules of which a moving average is kept
+    abstract_state: TrainState  # shapes and places
+    beside: jax.stages.Wrapped  # what the first state has beside parameters, of these
 
     def initial_state(self, params: Any) -> TrainState:
         """The state before the first step, of parameters on the host, in its place: no device holds a second copy."""
         placed = self.layout.put(params)
-        made = functools.partial(initial_state, optimizer=self.optimizer, averaged=self.averaged)
-        shardings = self.layout.shardings(jax.eval_shape(made, placed))
-
-        def rest(params: Any) -> TrainState:
-            return made(params)._replace(params=None)
-
-        return jax.jit(rest, out_shardings=shardings._replace(params=None))(placed)._replace(params=placed)
-
-    def abstract_state(self, params: Any) -> TrainState:
-        """Shapes and places of the state for parameters of these shapes."""
-        made = functools.partial(initial_state, optimizer=self.optimizer, averaged=self.averaged)
-        state: TrainState = self.layout.abstract(jax.eval_shape(made, params))
-        return state
+        state: TrainState = self.beside(placed)
+        return state._replace(params=placed)
 
 
 def make_program(model: LogVGGT, config: TrainConfig, params: Any, mesh: Mesh) -> Program:
@@ -66,4 +56,9 @@ def make_program(model: LogVGGT, config: TrainConfig, params: Any, mesh: Mesh) -
     )
     still = {module: all(jax.tree.leaves(tree)) for module, tree in frozen_leaves(params, frozen).items()}
     averaged = () if config.average is None else tuple(module for module in params if not still[module])
-    return Program(layout, optimizer, step, averaged)
+    made = functools.partial(initial_state, optimizer=optimizer, averaged=averaged)
+    shapes = jax.eval_shape(made, params)
+    beside = jax.jit(
+        lambda params: made(params)._replace(params=None), out_shardings=layout.shardings(shapes)._replace(params=None)
+    )
+    return Program(layout, optimizer, step, layout.abstract(shapes), beside)

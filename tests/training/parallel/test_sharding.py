@@ -29,6 +29,7 @@ from logvggt_jax.training.parallel.sharding import (
 )
 from logvggt_jax.training.parallel.watchdog import Watchdog
 from logvggt_jax.training.step.program import make_program
+from logvggt_jax.training.step.state import TrainState
 
 Clips = dict[str, np.ndarray]
 
@@ -181,7 +182,7 @@ def test_the_state_lies_in_its_place_from_the_start(run_config: TrainConfig, lay
     assert len(like) == 4, "the parameter, two moments, the average"
     assert {leaf.sharding for leaf in like} == {kernel.sharding}
     jax.tree.map(np.testing.assert_array_equal, jax.device_get(state.params), layered_params)
-    for leaf, expected in zip(*map(jax.tree.leaves, (state, program.abstract_state(shapes))), strict=True):
+    for leaf, expected in zip(*map(jax.tree.leaves, (state, program.abstract_state)), strict=True):
         assert (leaf.shape, leaf.dtype, leaf.sharding.spec) == (expected.shape, expected.dtype, expected.sharding.spec)
     # No two of them share memory, which a step is given to overwrite.
     places = [
@@ -242,44 +243,54 @@ def test_no_device_ever_holds_a_second_copy_when_a_run_starts_or_goes_on(
         before, held[:] = {id(x) for x in jax.live_arrays()}, []
 
 
+Steps = list[tuple[TrainState, dict[str, float], np.ndarray]]
+
+
+def _three_steps(config: TrainConfig, model: Any, params: Any, clips: Clips, devices: int) -> Steps:
+    """What three steps that keep an average return, on the host."""
+    mesh, averaging = data_mesh(devices), dataclasses.replace(config, average=0.5)
+    program = make_program(model, averaging, jax.eval_shape(lambda: params), mesh)
+    state, batch = program.initial_state(params), put_batch(clips, mesh)
+    compiled, found = program.step.lower(state, batch).compile(), []
+    for _ in range(3):
+        returned = compiled(state, batch)
+        state = returned[0]
+        found.append(jax.device_get(returned))
+    return found
+
+
+@pytest.fixture(scope="module")
+def steps_alone(run_config: TrainConfig, layered: Any, layered_params: Any, sixteen: Clips) -> Steps:
+    """Those of one device with whole parameters."""
+    return _three_steps(run_config, layered, layered_params, sixteen, 1)
+
+
 def test_steps_in_parts_are_those_of_whole_parameters(
-    run_config: TrainConfig, layered: Any, layered_params: Any, sixteen: Clips
+    run_config: TrainConfig, layered: Any, layered_params: Any, sixteen: Clips, steps_alone: Steps
 ) -> None:
-    states = []
-    for devices, shard, accumulate in ((1, False, 1), (4, True, 2)):
-        config = dataclasses.replace(run_config, shard_parameters=shard, accumulate=accumulate, average=0.5)
-        mesh = data_mesh(devices)
-        program = make_program(layered, config, jax.eval_shape(lambda: layered_params), mesh)
-        state, batch = program.initial_state(layered_params), put_batch(sixteen, mesh)
-        compiled = program.step.lower(state, batch).compile()
-        for _ in range(3):
-            state, metrics, finite = compiled(state, batch)
-        assert finite.shape == (16,) and np.asarray(finite).all()
+    split = dataclasses.replace(run_config, shard_parameters=True, accumulate=2)
+    steps_in_parts = _three_steps(split, layered, layered_params, sixteen, 4)
+    for _, metrics, finite in (steps_alone[-1], steps_in_parts[-1]):
+        assert finite.shape == (16,) and finite.all()
         # Clipping by module has to know the whole gradient.
-        assert float(metrics["gradient_norm/aggregator"]) > config.optimizer.clip_norm / 100
-        states.append(jax.device_get(state))
-    one, many = states
+        assert float(metrics["gradient_norm/aggregator"]) > run_config.optimizer.clip_norm / 100
+    one, many = steps_alone[-1][0], steps_in_parts[-1][0]
     for name in ("params", "average"):
         jax.tree.map(
             lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=2e-5), getattr(one, name), getattr(many, name)
         )
 
 
-def test_the_average_follows_the_parameters(
-    run_config: TrainConfig, layered: Any, layered_params: Any, sixteen: Clips
-) -> None:
-    config, mesh = dataclasses.replace(run_config, average=0.75), data_mesh(1)
-    program = make_program(layered, config, jax.eval_shape(lambda: layered_params), mesh)
-    state, batch = program.initial_state(layered_params), put_batch(sixteen, mesh)
+def test_the_average_follows_the_parameters(layered_params: Any, steps_alone: Steps) -> None:
+    state = steps_alone[-1][0]
     assert set(state.average) == set(layered_params) - {"encoder"}, "what is frozen is its own average"
     expected = {name: tree for name, tree in layered_params.items() if name != "encoder"}
-    for _ in range(3):
-        state, *_ = program.step(state, batch)
+    for after, *_ in steps_alone:
         expected = jax.tree.map(
-            lambda a, p: 0.75 * a + 0.25 * p, expected, {name: jax.device_get(state.params[name]) for name in expected}
+            lambda a, p: 0.5 * a + 0.5 * p, expected, {name: after.params[name] for name in expected}
         )
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7), state.average, expected)
-    moved = np.abs(np.asarray(state.averaged["camera_head"]["bias"] - state.params["camera_head"]["bias"])).max()
+    moved = np.abs(state.averaged["camera_head"]["bias"] - state.params["camera_head"]["bias"]).max()
     assert moved > 1e-4
 
 

@@ -49,7 +49,7 @@ def test_steps_are_compiled_with_the_devices_options(
     program = make_program(pixel_model, run_config, jax.eval_shape(lambda: pixel_params), mesh)
     assert asked == [mesh.devices.flat[0]]
     with pytest.raises(jax.errors.JaxRuntimeError, match="xla_no_such"):
-        next(compiled_steps(program, program.abstract_state(pixel_params), run_config.stages[0], SIZES[:1]))
+        next(compiled_steps(program, program.abstract_state, run_config.stages[0], SIZES[:1]))
 
 
 def test_the_step_of_a_distillation_takes_clips_with_the_teachers_confidence(
@@ -62,7 +62,7 @@ def test_the_step_of_a_distillation_takes_clips_with_the_teachers_confidence(
         teacher=TeacherConfig("anything", clip_length=4),
     )
     taught = make_program(pixel_model, config, jax.eval_shape(lambda: pixel_params), data_mesh(1))
-    state = taught.abstract_state(pixel_params)
+    state = taught.abstract_state
     (step,) = compiled_steps(taught, state, config.stages[0], SIZES[:1], taught=True)
     assert step.run.in_avals[0][1]["confidence"].shape == step.clips[:4]
     with pytest.raises(InputError, match="a teacher's confidence, which these clips lack"):
@@ -83,7 +83,7 @@ def test_sizes_are_compiled_at_the_same_time(
             together.wait()
 
     met = program._replace(step=Meeting())
-    state = program.abstract_state(pixel_params)
+    state = program.abstract_state
     assert len(list(compiled_steps(met, state, run_config.stages[0], SIZES))) == 3
 
 
