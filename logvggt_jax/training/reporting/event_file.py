@@ -6,11 +6,13 @@ import contextlib
 import os
 import platform
 import time
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 from tensorboardX import summary
 from tensorboardX.proto.event_pb2 import Event, SessionLog
+from tensorboardX.proto.summary_pb2 import Summary
 from tensorboardX.record_writer import RecordWriter
 
 from logvggt_jax.errors import disk_errors
@@ -36,9 +38,10 @@ class EventFile:
         self._write(Event(step=purge_step, file_version="brain.Event:2"))
         self._write(Event(step=purge_step, session_log=SessionLog(status=SessionLog.START)))
 
-    def add_scalar(self, step: int, name: str, value: float) -> None:
-        """A number of `step`."""
-        self._write(Event(step=step, summary=summary.scalar(name, value)))
+    def add_scalars(self, step: int, values: Mapping[str, float]) -> None:
+        """Numbers of `step` by name, all of them one event: the checksum of each is made in Python."""
+        scalars = [Summary.Value(tag=name, simple_value=float(value)) for name, value in values.items()]
+        self._write(Event(step=step, summary=Summary(value=scalars)))
 
     def add_picture(self, step: int, name: str, picture: np.ndarray) -> None:
         """A picture of `step`, [h, w, 3] uint8 RGB."""

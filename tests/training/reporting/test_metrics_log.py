@@ -21,10 +21,15 @@ def _log(workdir: Path, first_step: int) -> MetricsLog:
 
 def test_lines_hold_what_was_written(tmp_path: Path) -> None:
     with _log(tmp_path, 0) as log:
-        log.write(1, {"loss": 0.5, "bad": float("nan")})
+        log.write(1, {"loss": 0.5, "bad": float("nan"), "rate": 0.25})
     (entry,) = read_metrics(tmp_path / FILE_NAME)
     assert entry["step"] == 1 and entry["loss"] == 0.5 and entry["bad"] is None
-    assert list((tmp_path / "tensorboard").iterdir())
+    (file,) = (tmp_path / "tensorboard").iterdir()
+    drawn = [event for event in _events(file.read_bytes()) if event.step == 1 and event.HasField("summary")]
+    assert {value.tag: value.simple_value for event in drawn for value in event.summary.value} == {
+        "loss": 0.5,
+        "rate": 0.25,
+    }
 
 
 def test_pictures_are_shown_by_tensorboard(tmp_path: Path) -> None:
