@@ -1,6 +1,7 @@
 """The package's layering: who may import whom, read from the source (CONTRIBUTING states the same rule)."""
 
 import ast
+import functools
 import re
 from pathlib import Path
 
@@ -49,6 +50,7 @@ TRAINING: dict[str, set[str]] = {
 ENTRY_POINTS = {"__init__", "__main__", "cli", "doctor"}
 
 
+@functools.cache
 def imported_modules(path: Path) -> set[str]:
     """Modules of this package that a file imports, wherever in the file."""
     modules = set()

@@ -58,8 +58,18 @@ def demo(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def test_the_page_holds_pictures_numbers_and_the_viewers_command(demo: Path) -> None:
-    text = demo_page.write_page(demo).read_text()
+@pytest.fixture(scope="module")
+def written(made: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder with its page."""
+    folder = shutil.copytree(made, tmp_path_factory.mktemp("written") / "demo")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Reconstruction, "open", lambda _: Scaled(folder / "room"))
+        assert demo_page.write_page(folder) == folder / "index.html"
+    return folder
+
+
+def test_the_page_holds_pictures_numbers_and_the_viewers_command(written: Path) -> None:
+    text = (written / "index.html").read_text()
     assert len(re.findall(r'<img [^>]*src="data:image/png;base64,', text)) == 5 and 'src="http' not in text
     assert text.index("<img") < text.index("<table"), "pictures first"
     row = re.search(r"<td>LoG-VGGT</td>(.*?)</tr>", text)
@@ -71,11 +81,10 @@ def test_the_page_holds_pictures_numbers_and_the_viewers_command(demo: Path) -> 
     assert text.rindex("logvggt view result") > text.rindex("<img"), "at the end"
 
 
-def test_both_views_look_into_the_room(demo: Path) -> None:
+def test_both_views_look_into_the_room(written: Path) -> None:
     """Prediction and truth, side by side, are the same picture where the reconstruction is right."""
-    demo_page.write_page(demo)
     for number in (1, 2):
-        picture = cv2.imread(str(demo / "figures" / f"points-{number}.png"))
+        picture = cv2.imread(str(written / "figures" / f"points-{number}.png"))
         drawn = picture[60:].min(-1) < 200  # below the titles
         left, right = (half.sum() for half in np.array_split(drawn, 2, axis=1))
         assert left > 500 and abs(left - right) < 0.1 * left
