@@ -37,10 +37,10 @@ def assert_same(rooms: Rooms, indices: list[int]) -> None:
         assert levels[depth <= 1e-4].mean() < 0.01
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
 @pytest.mark.parametrize("options", [{}, {"style": "random"}, HOUSE, EVERYTHING], ids=str)
-def test_the_device_draws_what_the_host_draws(options: dict, seed: int) -> None:
-    assert_same(Rooms("train", **SMALL, **options, seed=seed), [0, 7, 31])
+def test_the_device_draws_what_the_host_draws(options: dict) -> None:
+    """Nine rooms at once, by one program."""
+    assert_same(Rooms("train", **{**SMALL, "num_rooms": 9}, **options, seed=1), [0, 7, 31])
 
 
 def test_frames_at_once_are_frames_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
