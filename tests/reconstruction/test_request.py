@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import os
 import shutil
 from pathlib import Path
@@ -16,6 +17,7 @@ from recorder import LONGER_EDGE, Recorder, reconstruct_recorded
 
 from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.errors import DiskError, InputError
+from logvggt_jax.operations import matmul_flops_per_second
 from logvggt_jax.reconstruction import PointFilter, open_source
 from logvggt_jax.reconstruction.calibration import Calibration
 from logvggt_jax.reconstruction.request import check_request, describe, device_needs, disk_bytes
@@ -77,18 +79,29 @@ def test_an_output_that_cannot_be_made_is_refused(walk: Path, tmp_path: Path, mo
         check_request(source, tmp_path / "new" / "out", **options)
 
 
+@pytest.fixture(scope="module")
+def large_head(small_config: ModelConfig) -> tuple[LogVGGT, int]:
+    """A model with many parameters that the program of a stream does not read, and the number of all of them."""
+    head = dataclasses.replace(small_config.camera_head, depth=8, iterations=1)
+    model = LogVGGT(dataclasses.replace(small_config, camera_head=head))
+    shapes = jax.eval_shape(model.init, jax.random.key(0), np.zeros((1, 1, 28, 42, 3), np.float32))
+    return model, sum(leaf.size for leaf in jax.tree.leaves(shapes))
+
+
 @pytest.mark.parametrize(
     "method",
     [name if name in ("windows", "rolling") else pytest.param(name, marks=pytest.mark.slow) for name in METHODS],
 )
-def test_the_device_needs_its_parameters_and_something_to_work_with(small_config: ModelConfig, method: str) -> None:
-    # Many parameters that the program of a stream does not read.
-    head = dataclasses.replace(small_config.camera_head, depth=8)
-    model = LogVGGT(dataclasses.replace(small_config, camera_head=head))
+def test_the_device_needs_its_parameters_and_something_to_work_with(
+    large_head: tuple[LogVGGT, int], method: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Small products say enough of the rate here.
+    rate = functools.partial(matmul_flops_per_second, size=256)
+    monkeypatch.setattr("logvggt_jax.reconstruction.request.matmul_flops_per_second", rate)
+    model, parameters = large_head
     settings = ChunkPlan(4, 2) if method == "chunks" else None
     needs = device_needs(method, model, settings, (28, 42), 6)
-    shapes = jax.eval_shape(model.init, jax.random.key(0), np.zeros((1, 1, 28, 42, 3), np.float32))
-    assert needs.parameters == 4 * sum(leaf.size for leaf in jax.tree.leaves(shapes))
+    assert needs.parameters == 4 * parameters
     assert needs.working is not None and needs.working > 28 * 42 * 4
     assert 0 < needs.seconds_a_frame < 60
 
