@@ -66,7 +66,7 @@ class Recorder:
 def reconstruct_recorded(
     predictor: Predictor, source: Source | Path, output: Path, *, takes_masks: bool = False, **options: Any
 ) -> Reconstruction:
-    """A reconstruction by a method whose predictor this is."""
+    """A reconstruction by a method whose predictor this is, with one preview: they take most of a small run's time."""
     with pytest.MonkeyPatch.context() as patch:
         facts = ("windows", "records", window_program, takes_masks)
         method = Method("recorder", lambda *_: predictor, WindowSettings, *facts)
@@ -76,5 +76,5 @@ def reconstruct_recorded(
             output,
             model=LogVGGT(),
             method="recorder",
-            **{"longer_edge": LONGER_EDGE, "variables": {}, **options},
+            **{"longer_edge": LONGER_EDGE, "variables": {}, "num_previews": 1, **options},
         )

@@ -176,7 +176,7 @@ def test_the_numbers_are_those_of_a_stream_of_the_frames_that_were_used(
 
 
 def test_an_unplugged_camera_leaves_what_is_final_and_one_line(tmp_path: Path) -> None:
-    live = session(recording=Recording(tmp_path / "out", workers=1))
+    live = session(recording=Recording(tmp_path / "out", num_previews=1, workers=1))
     lost = follow(FakeCamera(5), live)
     assert lost == "camera is lost: no more frames come; is it still connected?"
     result = Reconstruction.open(tmp_path / "out")
@@ -199,7 +199,7 @@ def test_ctrl_c_ends_with_a_whole_result(tmp_path: Path) -> None:
             os.kill(os.getpid(), signal.SIGINT)
             silent.wait(10)  # as a camera may be, for ever
 
-    live = session(recording=Recording(tmp_path / "out", workers=1))
+    live = session(recording=Recording(tmp_path / "out", num_previews=1, workers=1))
     began = time.monotonic()
     assert follow(FakeCamera(9, on_frame=on_frame), live) is None
     assert time.monotonic() - began < 9
@@ -241,7 +241,7 @@ def test_time_goes_on_from_where_a_fast_clock_was_when_the_stream_was_lost(monke
 
 
 def test_a_video_is_played_at_its_own_pace_and_its_end_is_no_loss(tmp_path: Path) -> None:
-    live = session(recording=Recording(tmp_path / "out", workers=1))
+    live = session(recording=Recording(tmp_path / "out", num_previews=1, workers=1))
     began = time.monotonic()
     assert follow(FakeCamera(4, step=0.1), live, realtime=True) is None
     assert time.monotonic() - began >= 0.3
@@ -264,7 +264,7 @@ def test_an_error_in_the_session_reaches_the_caller_and_what_was_final_is_kept(t
         if result.result.index == 3:
             raise RuntimeError("the robot fell over")
 
-    live = session(on_result=broken, recording=Recording(tmp_path / "out", workers=1))
+    live = session(on_result=broken, recording=Recording(tmp_path / "out", num_previews=1, workers=1))
     with (
         pytest.raises(RuntimeError, match="fell over"),
         pytest.warns(match=r"4 frames that were final are kept in .*out"),
@@ -278,7 +278,7 @@ def test_an_error_of_the_source_reaches_the_caller_and_every_frame_before_it_is_
         if number == 5:
             raise RuntimeError("the decoder crashed")
 
-    live = session(recording=Recording(tmp_path / "out", workers=1))
+    live = session(recording=Recording(tmp_path / "out", num_previews=1, workers=1))
     with pytest.raises(RuntimeError, match="decoder crashed"), pytest.warns(match=r"before is kept in .*out"):
         follow(FakeCamera(8, on_frame=broken), live)
     kept(tmp_path, 5)
@@ -286,7 +286,7 @@ def test_an_error_of_the_source_reaches_the_caller_and_every_frame_before_it_is_
 
 def test_of_a_session_that_is_left_by_an_error_what_was_used_is_kept(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt), pytest.warns(match="frames that were final are kept"):  # noqa: SIM117
-        with session(recording=Recording(tmp_path / "out", workers=1)) as live:
+        with session(recording=Recording(tmp_path / "out", num_previews=1, workers=1)) as live:
             for picture in PICTURES[:5]:
                 live.push(picture)
             while live.report().used < 5:
@@ -313,7 +313,7 @@ def test_a_full_disk_leaves_what_was_written_with_the_points_that_fit(
     monkeypatch.setattr(frame_writer, "write_depth", write_depth)
     monkeypatch.setattr(recording.shutil, "disk_usage", disk_usage)
     with pytest.raises(DiskError, match="No space left"), pytest.warns(match="5 frames that were final are kept"):
-        follow(FakeCamera(12), session(recording=Recording(tmp_path / "out", workers=1)))
+        follow(FakeCamera(12), session(recording=Recording(tmp_path / "out", num_previews=1, workers=1)))
     assert 80 <= kept(tmp_path, 5).num_points <= 100
 
 
@@ -330,9 +330,9 @@ def test_who_is_impatient_while_a_recording_is_finished_keeps_it(
 
     monkeypatch.setattr(recording, "finish", interrupted)
     with pytest.raises(KeyboardInterrupt), pytest.warns(match="6 frames that were final are kept"):
-        follow(FakeCamera(6), session(recording=Recording(tmp_path / "out", workers=1)))
+        follow(FakeCamera(6), session(recording=Recording(tmp_path / "out", num_previews=1, workers=1)))
     kept(tmp_path, 6)
-    assert calls == [8, 0]
+    assert calls == [1, 0]
 
 
 def test_an_error_before_anything_was_final_leaves_no_folder(tmp_path: Path) -> None:

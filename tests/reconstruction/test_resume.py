@@ -122,6 +122,7 @@ def test_the_model_goes_on_with_the_same_numbers(
                 settings=ChunkPlan(4, 2) if method == "chunks" else None,
                 longer_edge=LONGER_EDGE,
                 point_filter=THINNED,
+                num_previews=1,
                 progress=False,
                 save_seconds=0.0,
             ).folder
