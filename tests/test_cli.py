@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import shutil
 import subprocess
@@ -15,12 +16,13 @@ import numpy as np
 import pytest
 from result_folder import write_result
 
-from logvggt_jax import LogVGGT, ModelConfig
+from logvggt_jax import ModelConfig
 from logvggt_jax.cli import main
 from logvggt_jax.cli.choices import FORMATS, METHOD_NAMES
 from logvggt_jax.compile import default_cache_folder, enable_compilation_cache
 from logvggt_jax.data import DATASETS
 from logvggt_jax.errors import DiskError
+from logvggt_jax.operations import matmul_flops_per_second
 from logvggt_jax.reconstruction import EXPORTERS, Reconstruction
 from logvggt_jax.reconstruction.exporters import Format
 from logvggt_jax.reconstruction.points.cloud_file import read_points
@@ -192,6 +194,9 @@ def test_a_dry_run_says_what_a_run_needs_and_leaves_nothing(
     checkpoint: Path, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("logvggt_jax.weights.checkpoints.load_model", lambda _: pytest.fail("reads the weights"))
+    # Small products say enough of the rate here.
+    rate = functools.partial(matmul_flops_per_second, size=256)
+    monkeypatch.setattr("logvggt_jax.reconstruction.request.matmul_flops_per_second", rate)
     arguments = ["reconstruct", str(room), "--checkpoint", str(checkpoint), "--output", str(tmp_path / "out")]
     assert main([*arguments, "--dry-run", "--compilation-cache", "none"]) == 0
     shown = capsys.readouterr()
@@ -234,12 +239,9 @@ def test_a_page_that_cannot_be_served_is_refused_before_the_model(
     assert_fails(capsys, live, "viser", 'pip install "logvggt-jax[viewer]"')
 
 
-def test_info_counts_parameters(
-    checkpoint: Path, small_config: ModelConfig, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_info_counts_parameters(checkpoint: Path, small_variables: dict, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["info", str(checkpoint)]) == 0
-    shapes = jax.eval_shape(LogVGGT(small_config).init, jax.random.key(0), np.zeros((1, 1, 28, 42, 3), np.float32))
-    total = sum(leaf.size for leaf in jax.tree.leaves(shapes))
+    total = sum(leaf.size for leaf in jax.tree.leaves(small_variables))
     text = capsys.readouterr().out
     assert f"{total:,}" in text
     for part in ("encoder", "aggregator", "camera_head", "depth_head", "gccr"):
