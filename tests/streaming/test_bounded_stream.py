@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from logvggt_jax import LogVGGT, ModelConfig, RefinementConfig
+from logvggt_jax import LogVGGT, ModelConfig, Predictions, RefinementConfig
 from logvggt_jax.errors import InputError
 from logvggt_jax.model.gccr import RegisterKeys
 from logvggt_jax.streaming import (
@@ -35,6 +35,12 @@ def with_refinement(config: ModelConfig, **settings: int) -> LogVGGT:
 @pytest.fixture(scope="module")
 def frames() -> np.ndarray:
     return np.random.default_rng(2).integers(0, 256, (90, 28, 42, 3), np.uint8)
+
+
+@pytest.fixture(scope="module")
+def whole(small_config: ModelConfig, small_variables: dict, frames: np.ndarray) -> Predictions:
+    """`model.apply` on the first frames; of other modes of refinement the poses alone are other ones."""
+    return jax.device_get(jax.jit(with_refinement(small_config).apply)(small_variables, frames[None, :COUNT]))
 
 
 def stream(session: StreamSession, frames: np.ndarray) -> list[FrameResult]:
@@ -94,6 +100,7 @@ def test_a_long_sequence_is_refined_block_by_block_with_a_limited_context(
     small_config: ModelConfig,
     small_variables: dict,
     frames: np.ndarray,
+    whole: Predictions,
     settings: dict,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -109,9 +116,13 @@ def test_a_long_sequence_is_refined_block_by_block_with_a_limited_context(
         with pytest.warns(UserWarning, match=r"13 frames are more than .* 4 frames .* refinement\.context"):
             session.close(lambda done, count: told.append((done, count)))
     assert told == [(4, 13), (8, 13), (12, 13), (13, 13)]
-    model = with_refinement(small_config, **{**settings, "context": 4})
-    expected = jax.jit(model.apply)(small_variables, frames[None, :COUNT])
-    np.testing.assert_allclose(session.cameras().pose_encoding, expected.pose_encoding[0], rtol=1e-4, atol=2e-5)
+    refinement = with_refinement(small_config, **{**settings, "context": 4}).refinement
+    expected = jax.device_get(
+        jax.jit(refinement.refine_sequence)(
+            small_variables, whole.camera_tokens, whole.register_tokens, np.ones((1, COUNT), bool)
+        )
+    )
+    np.testing.assert_allclose(session.cameras().pose_encoding, expected[0, :, -1], rtol=1e-4, atol=2e-5)
 
 
 @pytest.mark.parametrize("settings", [CONSTANT, {}], ids=["constant", "at the end"])
@@ -141,7 +152,7 @@ def test_newest_frames_are_those_of_a_stream_that_ends_there_and_nothing_is_dist
 
 
 def test_a_stream_tells_how_well_its_windows_agree(
-    small_config: ModelConfig, small_variables: dict, frames: np.ndarray
+    small_config: ModelConfig, small_variables: dict, frames: np.ndarray, whole: Predictions
 ) -> None:
     model = with_refinement(small_config)
     session = StreamSession(model, small_variables, first_capacity=16)
@@ -163,7 +174,6 @@ def test_a_stream_tells_how_well_its_windows_agree(
         assert results[index].overlap_change == pytest.approx(change, rel=1e-3)
     assert [result.overlap_change is None for result in results] == [True] * 2 + [False] * 10 + [True]
     np.testing.assert_array_equal(np.isnan(signals.overlap_change), [r.overlap_change is None for r in results])
-    whole = jax.jit(model.apply)(small_variables, frames[None, :COUNT])
     refined = model.refinement.refine_tokens(
         small_variables, whole.camera_tokens, whole.register_tokens, np.ones((1, COUNT), bool)
     )

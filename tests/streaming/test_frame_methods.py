@@ -75,7 +75,7 @@ def test_causal_on_one_frame_is_vggt_on_one_frame(
 
 
 def test_causal_is_the_mask_form(small_config: ModelConfig, small_variables: dict, causal: list[FrameResult]) -> None:
-    out, encodings = jax.jit(FrameByFrame(small_config).whole)(small_variables, IMAGES[None])
+    out, encodings = jax.device_get(jax.jit(FrameByFrame(small_config).whole)(small_variables, IMAGES[None]))
     for index, result in enumerate(causal):
         np.testing.assert_allclose(result.depth, out.depth[0, index], rtol=2e-4)
         np.testing.assert_allclose(result.pose_encoding, encodings[0, index, -1], rtol=0, atol=2e-5)
@@ -100,9 +100,9 @@ def test_one_camera_cache_is_another_model(
 def test_an_anchored_window_is_causal_until_a_frame_leaves(
     small_config: ModelConfig, small_variables: dict, causal: list[FrameResult]
 ) -> None:
-    found = run("anchored-window", small_config, small_variables)
-    assert_alike(found[:6], causal[:6])
-    assert_differ(found[6], causal[6])
+    found = run("anchored-window", small_config, small_variables, AnchoredWindowSettings(window=2))
+    assert_alike(found[:3], causal[:3])
+    assert_differ(found[3], causal[3])
     whole = run("anchored-window", small_config, small_variables, AnchoredWindowSettings(window=FRAMES))
     assert_alike(whole, causal)
 
@@ -119,9 +119,10 @@ def test_rolling_is_causal_until_it_evicts(
 def test_pruned_is_causal_until_it_prunes(
     small_config: ModelConfig, small_variables: dict, causal: list[FrameResult]
 ) -> None:
-    whole = PrunedSettings(cap=FRAMES * TOKENS, bits=16, first_capacity=5)
+    whole = PrunedSettings(cap=FRAMES * TOKENS, bits=16)
     assert_alike(run("pruned", small_config, small_variables, whole), causal)
-    found = run("pruned", small_config, small_variables, PrunedSettings(SMALL_CAP, 16))
+    # Buffers that grow on the way change nothing.
+    found = run("pruned", small_config, small_variables, PrunedSettings(SMALL_CAP, 16, first_capacity=2))
     assert_alike(found[:3], causal[:3])
     # A frame attends before it is pruned; of the registers it sees as many frames' as fit the cap.
     np.testing.assert_allclose(found[3].depth, causal[3].depth, rtol=2e-4)
@@ -223,7 +224,8 @@ def test_bytes_of_a_pruned_state(small_config: ModelConfig, small_variables: dic
 def test_one_program_serves_all_frames(small_config: ModelConfig, small_variables: dict) -> None:
     """Nothing compiles again but where buffers double: at 3, 5 and 9 frames of a cache that starts with two. Streams
     are three times as long as what the bounded ones keep; small programs of single operations count as well."""
-    # A model of another configuration has compiled nothing yet.
+    # A model of another configuration has compiled nothing yet. The step knows nothing of refinement: it is counted, and
+    # yet read from the cache where another test had it compiled.
     config = dataclasses.replace(small_config, refinement=dataclasses.replace(small_config.refinement, enabled=False))
     for method, settings, compiling in (
         ("causal", CausalSettings(first_capacity=2), {0, 2, 4, 8}),

@@ -8,12 +8,13 @@ import jax
 import numpy as np
 import pytest
 
-from logvggt_jax import LogVGGT, ModelConfig, WindowConfig
+from logvggt_jax import LogVGGT, ModelConfig, Predictions, WindowConfig
 from logvggt_jax.model import windows as module
 from logvggt_jax.streaming.chunks import ChunkChain, ChunkPlan
 from logvggt_jax.streaming.offline import OfflineSession, OfflineSettings, PlainPrediction, plain_vggt, predict_plain
 
-FRAMES = 6
+# As many as in other tests, with which the program of all of them is shared.
+FRAMES = 4
 IMAGES = np.random.default_rng(0).integers(0, 256, (FRAMES, 28, 42, 3), np.uint8)
 
 
@@ -22,13 +23,17 @@ def whole(small_config: ModelConfig, small_variables: dict) -> PlainPrediction:
     return predict_plain(LogVGGT(small_config), small_variables, IMAGES)
 
 
-def test_one_window_over_all_frames_whatever_its_stride(
-    small_config: ModelConfig, small_variables: dict, whole: PlainPrediction
-) -> None:
+@pytest.fixture(scope="module")
+def in_one_window(small_config: ModelConfig, small_variables: dict) -> Predictions:
+    """All frames, and the first one alone, in a window of another stride: sequences of one batch, of one program."""
     model = LogVGGT(dataclasses.replace(small_config, windows=WindowConfig(FRAMES, FRAMES - 1)))
-    predictions = jax.jit(model.apply)(small_variables, IMAGES[None])
-    np.testing.assert_allclose(whole.depth, predictions.depth[0], rtol=2e-4, atol=2e-4)
-    np.testing.assert_allclose(whole.extrinsics, predictions.extrinsics[0], rtol=2e-4, atol=2e-4)
+    lengths = np.arange(FRAMES) < np.array([[FRAMES], [1]])
+    return jax.device_get(jax.jit(model.apply)(small_variables, np.stack([IMAGES, IMAGES]), lengths))
+
+
+def test_one_window_over_all_frames_whatever_its_stride(whole: PlainPrediction, in_one_window: Predictions) -> None:
+    np.testing.assert_allclose(whole.depth, in_one_window.depth[0], rtol=2e-4, atol=2e-4)
+    np.testing.assert_allclose(whole.extrinsics, in_one_window.extrinsics[0], rtol=2e-4, atol=2e-4)
 
 
 def test_every_frame_sees_every_other(small_config: ModelConfig, small_variables: dict, whole: PlainPrediction) -> None:
@@ -46,16 +51,15 @@ def test_limited_trunk_and_periods_are_the_streams_not_vggts(small_config: Model
 
 def test_pictures_are_all_that_is_kept_until_the_end(small_config: ModelConfig, small_variables: dict) -> None:
     session = OfflineSession(LogVGGT(small_config), small_variables, OfflineSettings())
-    session.push(IMAGES[:4])
-    assert session.state_bytes == IMAGES[:4].nbytes
+    session.push(IMAGES)
+    assert session.state_bytes == IMAGES.nbytes
 
 
-def test_one_frame_alone(small_config: ModelConfig, small_variables: dict) -> None:
+def test_one_frame_alone(small_config: ModelConfig, small_variables: dict, in_one_window: Predictions) -> None:
     """A window of four frames holds it, so that the model is plain VGGT itself."""
     plain = predict_plain(LogVGGT(small_config), small_variables, IMAGES[:1])
-    predictions = jax.jit(LogVGGT(small_config).apply)(small_variables, IMAGES[None, :1])
-    np.testing.assert_allclose(plain.depth, predictions.depth[0], rtol=2e-4, atol=2e-4)
-    np.testing.assert_allclose(plain.extrinsics, predictions.extrinsics[0], rtol=2e-4, atol=2e-4)
+    np.testing.assert_allclose(plain.depth, in_one_window.depth[1, :1], rtol=2e-4, atol=2e-4)
+    np.testing.assert_allclose(plain.extrinsics, in_one_window.extrinsics[1, :1], rtol=2e-4, atol=2e-4)
 
 
 @pytest.mark.parametrize("size", [FRAMES, FRAMES + 3])
