@@ -178,7 +178,7 @@ def test_public_weights_run_in_chunks_unless_told_otherwise(
 ) -> None:
     save_model(tmp_path / "vggt", small_config, small_variables["params"], Provenance("vggt", 42))
     arguments = ["reconstruct", str(room), "--checkpoint", str(tmp_path / "vggt"), "--output", str(tmp_path / "out")]
-    arguments += ["--compilation-cache", "none", "--previews", "0"]
+    arguments += ["--compilation-cache", "none", "--previews", "0", "--max-frames", "4"]
     # Only chunks take a size.
     assert main([*arguments, "--chunk-size", "4", "--loops"]) == 0
     printed = capsys.readouterr()
