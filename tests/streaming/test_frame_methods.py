@@ -224,7 +224,7 @@ def test_bytes_of_a_pruned_state(small_config: ModelConfig, small_variables: dic
 def test_one_program_serves_all_frames(small_config: ModelConfig, small_variables: dict) -> None:
     """Nothing compiles again but where buffers double: at 3, 5 and 9 frames of a cache that starts with two. Streams
     are three times as long as what the bounded ones keep; small programs of single operations count as well."""
-    # A model of another configuration has compiled nothing yet. The step knows nothing of refinement: it is counted, and
+    # A model of another configuration has compiled nothing yet. The step knows nothing of refinement: it counts, and is
     # yet read from the cache where another test had it compiled.
     config = dataclasses.replace(small_config, refinement=dataclasses.replace(small_config.refinement, enabled=False))
     for method, settings, compiling in (
