@@ -13,7 +13,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from logvggt_jax.config import ModelConfig
+from logvggt_jax.config import ModelConfig, RefinementConfig, WindowConfig
 from logvggt_jax.geometry.pose_encoding import decode_poses
 from logvggt_jax.model.checks import check_images, checked_mask
 from logvggt_jax.model.cross_window import CrossWindowMemory
@@ -246,20 +246,31 @@ def shallow(config: ModelConfig) -> ModelConfig:
     return dataclasses.replace(config, encoder=encoder, aggregator=aggregator)
 
 
-@functools.lru_cache(maxsize=8)
 def variable_shapes(config: ModelConfig) -> Variables:
-    """{"params": …} of a model as `jax.ShapeDtypeStruct`s; traced once for each configuration, nothing is allocated."""
-    # Shapes do not depend on the form of attention, and tracing cuDNN's asks for a GPU.
-    model, patch = LogVGGT(dataclasses.replace(shallow(config), attention="xla")), config.encoder.patch_size
-    key = jax.eval_shape(jax.random.key, 0)
+    """{"params": …} of a model as `jax.ShapeDtypeStruct`s; nothing is allocated. Traced once for all configurations
+    that differ in depth, or in what shapes do not depend on: windows, refinement's mode, rounds of the camera head,
+    compute type, form of attention (and tracing cuDNN's asks for a GPU)."""
+    plain = dataclasses.replace(
+        shallow(config),
+        camera_head=dataclasses.replace(config.camera_head, iterations=1),
+        windows=WindowConfig(),
+        refinement=RefinementConfig(num_heads=config.refinement.num_heads),
+        dtype="float32",
+        attention="xla",
+    )
+    return unstack_layers({"params": _one_of_each_layer(plain)}, config, take=lambda layer, _: layer)
+
+
+@functools.lru_cache(maxsize=16)
+def _one_of_each_layer(config: ModelConfig) -> Variables:
+    """Shapes of the parameters of a shallow model, in which one layer of each family stands for the stack."""
+    model, patch, key = LogVGGT(config), config.encoder.patch_size, jax.eval_shape(jax.random.key, 0)
     params = {
         name: jax.eval_shape(functools.partial(call.module.init, **call.static), key, *call.inputs)["params"]
         for name, call in model.calls((patch, patch)).items()
     }
 
     def stacked(layers: Any) -> Any:
-        """One layer of each family in place of the stack."""
         return {re.sub(r"block_0$", "blocks", name): x for name, x in layers.items() if not re.search(_LATER, name)}
 
-    one_of_each = {**params, "encoder": stacked(params["encoder"]), "aggregator": stacked(params["aggregator"])}
-    return unstack_layers({"params": one_of_each}, config, take=lambda layer, _: layer)
+    return {**params, "encoder": stacked(params["encoder"]), "aggregator": stacked(params["aggregator"])}

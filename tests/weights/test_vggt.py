@@ -8,9 +8,9 @@ import ml_dtypes
 import numpy as np
 import pytest
 
-from logvggt_jax.config import DPTConfig, ModelConfig, RefinementConfig
+from logvggt_jax.config import DPTConfig, ModelConfig, RefinementConfig, WindowConfig
 from logvggt_jax.errors import InputError
-from logvggt_jax.model.logvggt import LogVGGT
+from logvggt_jax.model.logvggt import LogVGGT, variable_shapes
 from logvggt_jax.weights.lazy import LazyTensors
 from logvggt_jax.weights.vggt import config_from_vggt, parameter_shapes, params_from_vggt, vggt_rules
 
@@ -59,6 +59,20 @@ def test_the_table_fills_the_model_but_for_its_new_parameters():
             assert "/".join(path) not in found
             found["/".join(path)] = layout(tensor).shape
     assert found == expected
+
+
+def test_shapes_are_those_of_init_whatever_they_do_not_depend_on(small_config):
+    other = dataclasses.replace(
+        small_config,
+        camera_head=dataclasses.replace(small_config.camera_head, iterations=2),
+        windows=WindowConfig(5, 3, cross_window=False, cache="input"),
+        refinement=RefinementConfig(enabled=False, period=3, context=6, max_registers=12, num_heads=2),
+        dtype="bfloat16",
+        attention="xla",
+    )
+    images = jax.ShapeDtypeStruct((1, 1, 28, 42, 3), np.float32)
+    initial = jax.eval_shape(lambda x: LogVGGT(other).init(jax.random.key(0), x), images)["params"]
+    assert variable_shapes(other)["params"] == variable_shapes(small_config)["params"] == initial
 
 
 def test_layouts(converted, shallow):
