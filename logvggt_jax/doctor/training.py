@@ -63,10 +63,13 @@ def examine(subject: Subject) -> Iterator[Finding]:
     peak = matmul_flops_per_second("bfloat16", size=256 if subject.tiny else None)
     begun = time.perf_counter()
     # In one program: by itself each shape of a moment would be one more to compile.
-    beside = jax.jit(lambda: initial_state(params, optimizer)._replace(params=None), out_shardings=replicated(mesh))
+    beside = jax.jit(
+        lambda params: initial_state(params, optimizer)._replace(params=None), out_shardings=replicated(mesh)
+    )
     for clips in (1,) if subject.tiny or subject.quick else (4, 1, 2, 3):
         name, started = f"{clips} clips of {length} frames", time.perf_counter()
-        state = beside()._replace(params=jax.device_put(params, replicated(mesh)))
+        placed = jax.device_put(params, replicated(mesh))
+        state = beside(placed)._replace(params=placed)
         batch = jax.device_put(_clips(clips, length, subject.image_size), split(mesh))
         try:
             yield from _measured(name, step, state, batch, peak, subject)
@@ -74,7 +77,7 @@ def examine(subject: Subject) -> Iterator[Finding]:
             if not out_of_device_memory(error):
                 raise
             yield Finding("training", name, "does not fit the device's memory", note="fewer clips a device: batch_size")
-        del state, batch
+        del state, placed, batch
         now = time.perf_counter()
         if 2 * now - started - begun > _SECONDS:  # another one would take as long as this one
             return
