@@ -436,8 +436,8 @@ def _initial(config: ModelConfig, params: dict[str, Any]) -> dict[ParamPath, jax
     return {path: leaf for path, leaf in leaves.items() if path not in known}
 
 
-def _smallest_images(config: ModelConfig) -> np.ndarray:
-    return np.zeros((1, 1, config.encoder.patch_size, config.encoder.patch_size, 3))
+def _smallest_images(config: ModelConfig) -> jax.Array:
+    return jax.device_put(np.zeros((1, 1, config.encoder.patch_size, config.encoder.patch_size, 3), np.uint8))
 
 
 def _path(path: Any) -> ParamPath:
