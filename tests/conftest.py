@@ -57,7 +57,6 @@ DEAREST = (
     "streaming/test_frame_methods.py",
     "training/test_loop.py",
     "weights/test_checkpoints.py",
-    "data/feeding/test_pipeline.py",
     "model/test_windows.py",
     "doctor/test_doctor.py",
     "model/test_parity.py",
