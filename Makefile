@@ -7,6 +7,8 @@ DEMO := runs/demo
 JOBS ?= 2
 # The demo is small: it runs on the CPU wherever it is started.
 CPU := JAX_PLATFORMS=cpu
+# Some containers set it: each of the dozens of processes of a test run would then compile the package again.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help install demo test test-all lint docs clean
 .DEFAULT_GOAL := help
@@ -45,8 +47,13 @@ lint: install
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-test: lint
-	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder --durations=10 --junitxml=runs/test/report.xml
+# Types are checked beside the tests, which leave a core idle here and there.
+test: install
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	@$(BIN)/mypy & types=$$!; \
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder --durations=10 --junitxml=runs/test/report.xml; \
+	tests=$$?; wait $$types && exit $$tests
 	@echo "Test report: runs/test/report.xml"
 
 test-all: test
