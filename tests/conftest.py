@@ -34,6 +34,10 @@ QUICK = (
     f"--xla_cpu_opt_preset=CPU_OPT_PRESET_FAST_COMPILE --xla_disable_hlo_passes={','.join(LEFT_OUT)}"
 )
 os.environ.setdefault("XLA_FLAGS", QUICK + SIMPLE)
+# Programs do not say from which lines they were traced, which would take a few hundredths of the time; nor do those of
+# the processes that tests start.
+os.environ["JAX_TRACEBACK_IN_LOCATIONS_LIMIT"] = "0"
+jax.config.update("jax_traceback_in_locations_limit", 0)
 jax.config.update("jax_platforms", "cpu")
 jax.config.update("jax_num_cpu_devices", 16)
 
