@@ -7,7 +7,7 @@ DEMO := runs/demo
 JOBS ?= 2
 # The demo is small: it runs on the CPU wherever it is started.
 CPU := JAX_PLATFORMS=cpu
-# Some containers set it: each of the dozens of processes of a test run would then compile the package again.
+# Where it is set, each of the dozens of processes of a test run would compile the package again.
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help install demo test test-all lint docs clean
@@ -51,9 +51,11 @@ lint: install
 test: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	@$(BIN)/mypy & types=$$!; \
+	@mkdir -p runs/test
+	@$(BIN)/mypy > runs/test/types.txt 2>&1 & types=$$!; trap 'kill $$types 2> /dev/null; exit 130' INT TERM; \
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder --durations=10 --junitxml=runs/test/report.xml; \
-	tests=$$?; wait $$types && exit $$tests
+	tests=$$?; wait $$types; typed=$$?; echo "Types:"; cat runs/test/types.txt; \
+	test $$tests -eq 0 || exit $$tests; exit $$typed
 	@echo "Test report: runs/test/report.xml"
 
 test-all: test

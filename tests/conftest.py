@@ -151,7 +151,12 @@ def forked_workers(_imported_once: None, monkeypatch: pytest.MonkeyPatch) -> Non
     they work on as spawned ones do, pickled; what takes each of those more than a second is imported once."""
     if "forkserver" in multiprocessing.get_all_start_methods():
         context = multiprocessing.get_context("forkserver")
-        monkeypatch.setattr(multiprocessing, "get_context", lambda _: context)
+
+        def forked(method: str) -> multiprocessing.context.BaseContext:
+            assert method == "spawn", "a fork of a process that runs JAX can deadlock"
+            return context
+
+        monkeypatch.setattr(multiprocessing, "get_context", forked)
 
 
 @pytest.fixture(autouse=True, scope="module")

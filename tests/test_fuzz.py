@@ -15,6 +15,8 @@ from fuzzing.pool import run_cases
 from logvggt_jax.errors import InputError
 from logvggt_jax.files import open_regular
 
+pytestmark = pytest.mark.usefixtures("forked_workers")
+
 SAMPLED = ("result", "trajectory", "evaluation")
 
 
@@ -66,8 +68,6 @@ def read_and_die(root: Path, output: Path) -> None:
 def read_nothing(root: Path, output: Path) -> None:
     raise ValueError("never reads")
 
-
-pytestmark = pytest.mark.usefixtures("forked_workers")
 
 READERS = {
     "message": read_without_file,

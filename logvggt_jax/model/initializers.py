@@ -44,11 +44,15 @@ def fan_in_normal(key: jax.Array, shape: tuple[int, ...], dtype: Any = jnp.float
 
 
 def constant(value: float) -> Initializer:
-    """The same value everywhere; made on the host and copied as it is, for which nothing is compiled: `asarray` would
-    hand a value that is made while others are traced to a program, one for each shape."""
+    """The same value everywhere; made on the host, and placed as other values of the context are.
+
+    Where no mesh is set it is copied as it is, for which nothing is compiled: `asarray` would hand a value that is made
+    while others are traced to a program, one for each shape.
+    """
 
     def initialize(key: jax.Array, shape: tuple[int, ...], dtype: Any = jnp.float32) -> jax.Array:
         del key
-        return jax.device_put(np.full(shape, value, dtype))
+        values = np.full(shape, value, dtype)
+        return jax.device_put(values) if jax.sharding.get_abstract_mesh().empty else jnp.asarray(values)
 
     return initialize

@@ -247,9 +247,11 @@ def shallow(config: ModelConfig) -> ModelConfig:
 
 
 def variable_shapes(config: ModelConfig) -> Variables:
-    """{"params": …} of a model as `jax.ShapeDtypeStruct`s; nothing is allocated. Traced once for all configurations
-    that differ in depth, or in what shapes do not depend on: windows, refinement's mode, rounds of the camera head,
-    compute type, form of attention (and tracing cuDNN's asks for a GPU)."""
+    """{"params": …} of a model as `jax.ShapeDtypeStruct`s; nothing is allocated.
+
+    Traced once for all configurations that differ only in depth, and in what shapes do not depend on: windows,
+    refinement's mode, rounds of the camera head, compute type, form of attention (and tracing cuDNN's asks for a GPU).
+    """
     plain = dataclasses.replace(
         shallow(config),
         camera_head=dataclasses.replace(config.camera_head, iterations=1),

@@ -148,7 +148,7 @@ def merging_of(
         return None
 
     def placed(tokens: np.ndarray) -> jax.Array:
-        return jax.device_put(tokens.astype(np.int32))
+        return jnp.asarray(tokens, jnp.int32)
 
     return TokenMerging(
         sources=placed(np.flatnonzero(is_source)),

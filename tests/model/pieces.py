@@ -98,4 +98,14 @@ _by_text: dict[str, Callable[..., Any]] = {}
 
 def _compiled_once_by_text(closed: ClosedJaxpr, text: str) -> Callable[..., Any]:
     """What lies between two blocks is traced anew for every layer, and reads the same."""
-    return _by_text.setdefault(text, jax.jit(jaxpr_as_fun(closed)))
+    compiled = jax.jit(jaxpr_as_fun(closed))
+    return _by_text.setdefault(text, compiled) if _is_told_by_its_text(closed) else compiled
+
+
+def _is_told_by_its_text(closed: ClosedJaxpr) -> bool:
+    """Constants of functions within it and callbacks are not in it."""
+    values = [value for equation in closed.jaxpr.eqns for value in equation.params.values()]
+    inner = [each for value in values for each in (value if isinstance(value, tuple) else (value,))]
+    callbacks = any("callback" in equation.primitive.name for equation in closed.jaxpr.eqns)
+    nested = (each for each in inner if isinstance(each, ClosedJaxpr))
+    return not closed.consts and not callbacks and all(map(_is_told_by_its_text, nested))

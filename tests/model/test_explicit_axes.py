@@ -1,11 +1,13 @@
 """A mesh whose axes are explicit in types: the model takes batches that are split over it."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import NamedSharding, P
 from jax.sharding import AxisType
 
 from logvggt_jax import LogVGGT, ModelConfig
+from logvggt_jax.model.initializers import constant
 
 
 def test_a_batch_over_explicit_axes_gives_its_numbers_split_as_it_was(
@@ -50,3 +52,20 @@ def test_parameters_that_are_split_are_not_taken_for_the_batch(
         everyone = np.ones((batch, frames), bool)
         expected = model.refine(small_variables, tokens[:, :, 0], tokens[:, :, 1:], everyone, everyone)
         np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_initial_values_lie_where_a_mesh_that_is_set_puts_them() -> None:
+    """Also those that are made while what is around them is only traced, as parameters are."""
+    made = []
+
+    def trace() -> None:
+        with jax.ensure_compile_time_eval():
+            made.append(constant(0.5)(jax.random.key(0), (2, 3)))
+
+    with jax.set_mesh(jax.make_mesh((2,), ("data",), axis_types=(AxisType.Explicit,))):
+        trace()
+        jax.eval_shape(trace)
+        others = jnp.asarray(np.zeros((2, 3), np.float32)).sharding
+    assert [value.sharding for value in made] == [others, others]
+    trace()
+    assert made[-1].sharding == jnp.zeros((2, 3)).sharding

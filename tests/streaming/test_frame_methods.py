@@ -100,6 +100,7 @@ def test_one_camera_cache_is_another_model(
 def test_an_anchored_window_is_causal_until_a_frame_leaves(
     small_config: ModelConfig, small_variables: dict, causal: list[FrameResult]
 ) -> None:
+    assert AnchoredWindowSettings().window == 5
     found = run("anchored-window", small_config, small_variables, AnchoredWindowSettings(window=2))
     assert_alike(found[:3], causal[:3])
     assert_differ(found[3], causal[3])

@@ -60,6 +60,7 @@ def assert_equals_whole(
 ) -> None:
     """Streams of these of `COUNTS` frames give the depth in `whole` and the poses that the model's mode makes of its
     tokens."""
+    assert counts and set(counts) <= set(COUNTS)
     rows = np.array(COUNTS) - 1
     tokens = whole.camera_tokens[rows], whole.register_tokens[rows]
     expected = np.asarray(refine(model, variables, *tokens, LENGTHS[rows]))

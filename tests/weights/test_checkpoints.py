@@ -261,24 +261,15 @@ def test_digests_of_earlier_versions_are_compared_as_they_were_made():
         verify_digests({**tree, "a": tree["a"] + 1}, mixed, "somewhere")
 
 
-def test_a_converted_vggt_equals_the_one_converted_in_memory(
-    folder, vggt_file, vggt_config, vggt_state_dict, small_variables, capsys
-):
-    """It replaces a model folder, and only when asked."""
-    with pytest.raises(OutputExists, match="--overwrite"):
-        convert(vggt_file, folder)
-    with pytest.raises(InputError, match="no such file"):
-        convert(folder.parent / "absent.pt", folder, overwrite=True)
-    _assert_same(load_model(folder)[1], small_variables)
-    capsys.readouterr()
-    report = convert(vggt_file, folder, point_head=True, overwrite=True)
+def test_a_converted_vggt_equals_the_one_converted_in_memory(tmp_path, vggt_file, vggt_config, vggt_state_dict, capsys):
+    report = convert(vggt_file, tmp_path / "model", point_head=True)
     assert len(report.used) == len(vggt_state_dict) - 2
     said = capsys.readouterr()
     assert f"{len(report.used)} tensors used, 2 skipped, 12 parameters initialised" in said.out
     assert "the folder takes about" in said.err and "encoder of 1 blocks and width 16" in said.err
-    assert [entry.name for entry in folder.parent.iterdir()] == ["model"]
-    model, variables = load_model(folder)
-    assert read_provenance(folder) == Provenance("vggt", 518, None, f"VGGT checkpoint {vggt_file}")
+    assert [entry.name for entry in tmp_path.iterdir()] == ["model"]
+    model, variables = load_model(tmp_path / "model")
+    assert read_provenance(tmp_path / "model") == Provenance("vggt", 518, None, f"VGGT checkpoint {vggt_file}")
     direct, direct_variables = from_pretrained(vggt_file, point_head=True)
     assert model == direct == LogVGGT(vggt_config)
     _assert_same(variables, direct_variables)
@@ -341,6 +332,18 @@ def test_conversion_checks_the_destination_before_it_reads(tmp_path, vggt_file, 
     (tmp_path / "config.json").write_text("{}")
     with pytest.raises(OutputExists, match="not a model folder"):
         convert(vggt_file, tmp_path, overwrite=True)
+
+
+def test_conversion_replaces_a_model_folder_only_when_asked(folder, vggt_file, vggt_config, small_variables):
+    with pytest.raises(OutputExists, match="--overwrite"):
+        convert(vggt_file, folder)
+    _assert_same(load_model(folder)[1], small_variables)
+    with pytest.raises(InputError, match="no such file"):
+        convert(folder.parent / "absent.pt", folder, overwrite=True)
+    _assert_same(load_model(folder)[1], small_variables)
+    convert(vggt_file, folder, overwrite=True)
+    assert load_model(folder)[0].config == dataclasses.replace(vggt_config, point_head=None)
+    assert [entry.name for entry in folder.parent.iterdir()] == ["model"]
 
 
 def test_conversion_says_the_space_it_needs_and_stops_without(tmp_path, vggt_file, monkeypatch):

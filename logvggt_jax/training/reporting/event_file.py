@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 from tensorboardX import summary
 from tensorboardX.proto.event_pb2 import Event, SessionLog
-from tensorboardX.proto.summary_pb2 import Summary
 from tensorboardX.record_writer import RecordWriter
 
 from logvggt_jax.errors import disk_errors
@@ -40,8 +39,8 @@ class EventFile:
 
     def add_scalars(self, step: int, values: Mapping[str, float]) -> None:
         """Numbers of `step` by name, all of them one event: the checksum of each is made in Python."""
-        scalars = [Summary.Value(tag=name, simple_value=float(value)) for name, value in values.items()]
-        self._write(Event(step=step, summary=Summary(value=scalars)))
+        scalars = [summary.scalar(name, value).value[0] for name, value in values.items()]
+        self._write(Event(step=step, summary=summary.Summary(value=scalars)))
 
     def add_picture(self, step: int, name: str, picture: np.ndarray) -> None:
         """A picture of `step`, [h, w, 3] uint8 RGB."""

@@ -113,7 +113,8 @@ class MetricsLog:
 
     def _draw(self, step: int, values: Mapping[str, float]) -> None:
         finite = {name: value for name, value in values.items() if math.isfinite(value)}
-        self._events.add_scalars(step, finite)
+        if finite:
+            self._events.add_scalars(step, finite)
         if self._wandb is not None:
             self._wandb.write(step, finite)
 

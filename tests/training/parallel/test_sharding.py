@@ -248,7 +248,7 @@ Steps = list[tuple[TrainState, dict[str, float], np.ndarray]]
 
 def _three_steps(config: TrainConfig, model: Any, params: Any, clips: Clips, devices: int) -> Steps:
     """What three steps that keep an average return, on the host."""
-    mesh, averaging = data_mesh(devices), dataclasses.replace(config, average=0.5)
+    mesh, averaging = data_mesh(devices), dataclasses.replace(config, average=0.75)
     program = make_program(model, averaging, jax.eval_shape(lambda: params), mesh)
     state, batch = program.initial_state(params), put_batch(clips, mesh)
     compiled, found = program.step.lower(state, batch).compile(), []
@@ -287,7 +287,7 @@ def test_the_average_follows_the_parameters(layered_params: Any, steps_alone: St
     expected = {name: tree for name, tree in layered_params.items() if name != "encoder"}
     for after, *_ in steps_alone:
         expected = jax.tree.map(
-            lambda a, p: 0.5 * a + 0.5 * p, expected, {name: after.params[name] for name in expected}
+            lambda a, p: 0.75 * a + 0.25 * p, expected, {name: after.params[name] for name in expected}
         )
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7), state.average, expected)
     moved = np.abs(state.averaged["camera_head"]["bias"] - state.params["camera_head"]["bias"]).max()
