@@ -201,7 +201,6 @@ def test_sequences_of_another_split_are_known_by_name_alone(scenes: Path, tmp_pa
     assert open_dataset(NAME, tmp_path / "here", "train").num_frames("scene/seq-03") == 4
 
 
-@pytest.mark.usefixtures("forked_workers")
 def test_the_command_packs_with_several_processes(
     scenes: Path, packed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

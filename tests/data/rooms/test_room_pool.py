@@ -88,7 +88,6 @@ def test_a_pool_on_disk_is_bounded_by_its_free_space_alone(tmp_path: Path, monke
     assert not (tmp_path / "full").exists()
 
 
-@pytest.mark.usefixtures("forked_workers")
 def test_worker_processes_render_the_same(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(room_pool, "_SERIAL_PIXELS", 0)
     assert_same_frames(render_pool(ROOMS, workers=2, progress=False), ROOMS)
