@@ -18,16 +18,15 @@ from logvggt_jax.interruption import one_line_at_ctrl_c
 
 with one_line_at_ctrl_c("eval.py"):
     from absl import app, flags
-    from ml_collections import config_flags
 
     from logvggt_jax.compile import check_devices, enable_compilation_cache
     from logvggt_jax.errors import InputError, one_line, printable
     from logvggt_jax.evaluation.report.report import print_report
     from logvggt_jax.evaluation.run import run_evaluation
-    from logvggt_jax.program_flags import flags_parser
+    from logvggt_jax.program_flags import define_config, flags_parser
     from logvggt_jax.terminal import forgiving_streams, one_log_handler
 
-_CONFIG = config_flags.DEFINE_config_file("config", None, "what to evaluate: a file of configs/eval", lock_config=True)
+_CONFIG = define_config("eval.py", "what to evaluate: a file of configs/eval")
 _CHECKPOINT = flags.DEFINE_string(
     "checkpoint", None, "model folder, as training and `logvggt convert` write it, or `rooms`, which ships"
 )

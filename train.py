@@ -25,11 +25,10 @@ from logvggt_jax.interruption import INTERRUPTED, one_line_at_ctrl_c
 with one_line_at_ctrl_c("train.py"):
     import jax
     from absl import app, flags
-    from ml_collections import config_flags
 
     from logvggt_jax.compile import check_devices, check_nccl, enable_compilation_cache
     from logvggt_jax.errors import InputError, one_line
-    from logvggt_jax.program_flags import flags_parser
+    from logvggt_jax.program_flags import define_config, flags_parser
     from logvggt_jax.terminal import forgiving_streams, one_log_handler
     from logvggt_jax.training.config import TrainConfig
     from logvggt_jax.training.dry_run import described_mesh, dry_run
@@ -41,7 +40,7 @@ with one_line_at_ctrl_c("train.py"):
     from logvggt_jax.training.reporting.profile import ProfiledSteps
     from logvggt_jax.training.source_text import with_sources
 
-_CONFIG = config_flags.DEFINE_config_file("config", None, "File with the run's settings.", lock_config=True)
+_CONFIG = define_config("train.py", "File with the run's settings.")
 _SOURCES = flags.DEFINE_multi_string(
     "source", [], "Data to train on instead of the configuration's: NAME=FOLDER,split=…,frames=FIRST:STOP; repeatable."
 )

@@ -6,8 +6,17 @@ import sys
 from collections.abc import Callable
 
 from absl import flags, logging
+from ml_collections import config_flags
 
 from logvggt_jax.errors import one_line
+
+
+def define_config(program: str, what: str) -> flags.FlagHolder:
+    """The flag --config, for whose default the library reads the command line at once: a --flagfile in it may fail."""
+    try:
+        return config_flags.DEFINE_config_file("config", None, what, lock_config=True)
+    except (flags.Error, OSError) as error:
+        sys.exit(f"{program}: {_reason(error)}")
 
 
 def flags_parser(program: str) -> Callable[[list[str]], list[str]]:

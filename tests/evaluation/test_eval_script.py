@@ -49,6 +49,7 @@ def test_an_evaluation_leaves_tables_json_and_figures(
     [
         (["--config.evaluation.strides=3"], "no such field: 'strides' Did you mean \"stride\""),
         (["--config=configs/eval/none.py"], "configs/eval/none.py"),
+        (["--flagfile=none.txt"], "Unable to open flagfile: [Errno 2] No such file or directory: 'none.txt'"),
         (["--data_root=d", "--config.evaluation.image_size=(28, 42)"], "leave --data_root=d out"),
     ],
 )

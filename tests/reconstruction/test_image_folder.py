@@ -478,7 +478,11 @@ def test_pictures_that_look_all_around_are_told(tmp_path: Path) -> None:
 def test_files_of_several_pictures_are_told(tmp_path: Path) -> None:
     pages = [Image.new("RGB", (30, 20)), Image.new("RGB", (30, 20))]
     pages[0].save(tmp_path / "a.tif", save_all=True, append_images=pages[1:])
-    assert "of which the first is taken: 1 (a.tif: 2)" in open_source(tmp_path).notes[0]
+    burst = pillow_heif.HeifFile()
+    for page in pages:
+        burst.add_from_pillow(page)
+    burst.save(tmp_path / "b.heic")
+    assert "of which one is read: 2 (a.tif: 2, b.heic: 2)" in open_source(tmp_path).notes[0]
 
 
 def test_names_that_no_result_could_have_are_refused(tmp_path: Path) -> None:

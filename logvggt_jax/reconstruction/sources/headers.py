@@ -35,7 +35,7 @@ class PictureHeader:
       orientation: EXIF orientation, 1 to 8, that is still to be applied to the decoded pixels.
       focal_length: pixels of the picture, from EXIF; None where it says nothing.
       deep_grey: one channel of 16 bits, which may be a depth map.
-      pages: pictures in the file; the first is the one that is read.
+      pages: pictures in the file; one is read: the first, of HEIC the one that it names.
       panorama: it is said to look all around, equirectangular.
       taken: when by the camera's clock, as `2026:05:01 12:30:59`; None where it does not say.
     """
@@ -77,7 +77,7 @@ def read_header(path: Path) -> PictureHeader:
             exif = _exif(picture)
             # Pillow turns TIFF itself, and its size is the upright one already.
             orientation = 1 if kind == "TIFF" else exif.get(ExifTags.Base.Orientation, 1)
-            pages = getattr(picture, "n_frames", 1) if kind != "HEIC" else 1
+            pages = getattr(picture, "n_frames", 1)
             if not _reaches_end(kind, picture, stream):
                 raise BrokenPicture(f"{path}: truncated picture of {_bytes(stream)} bytes: fetch it again")
         sideways = orientation in (5, 6, 7, 8)

@@ -209,9 +209,7 @@ class FolderSource(Source):
             self.notes.append(f"left out: {len(self.skipped)} broken ({_reasons(self.skipped)})")
         if several := [picture for picture in pictures if picture.header.pages > 1]:
             listed = some(f"{picture.file.name}: {picture.header.pages}" for picture in several)
-            self.notes.append(
-                f"files that hold several pictures, of which the first is taken: {len(several)} ({listed})"
-            )
+            self.notes.append(f"files that hold several pictures, of which one is read: {len(several)} ({listed})")
         if around := [picture.file.name for picture in pictures if picture.header.panorama]:
             self.notes.append(
                 f"images that look all around (equirectangular), where a pinhole camera is assumed: {len(around)} "
