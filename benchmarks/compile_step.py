@@ -34,7 +34,7 @@ from kernels import kernels
 from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.described import attention_kernels, cudnn_by_description, described_devices
 from logvggt_jax.doctor.training import h20_step
-from logvggt_jax.model.logvggt import variable_shapes
+from logvggt_jax.model.initialization import variable_shapes
 from logvggt_jax.model.parameters import in_compute_type, stack_layers
 from logvggt_jax.training.parallel.sharding import DATA_AXIS, replicated, split
 from logvggt_jax.training.step.costs import abstract_clips

@@ -13,7 +13,8 @@ import numpy as np
 
 from logvggt_jax.doctor.finding import Finding
 from logvggt_jax.doctor.subject import Subject, random_variables
-from logvggt_jax.model.logvggt import LogVGGT, variable_shapes
+from logvggt_jax.model.initialization import variable_shapes
+from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.model.parameters import in_compute_type, stack_layers
 from logvggt_jax.operations import count_flops, matmul_flops_per_second
 

@@ -17,7 +17,8 @@ from logvggt_jax.config import (
     ModelConfig,
     RefinementConfig,
 )
-from logvggt_jax.model.logvggt import LogVGGT, variable_shapes
+from logvggt_jax.model.initialization import variable_shapes
+from logvggt_jax.model.logvggt import LogVGGT
 
 # Values that parameters are cut from: a generator for each of a thousand shapes would compile for minutes.
 _BLOCK = 1 << 22

@@ -22,7 +22,8 @@ from logvggt_jax.config import (
     RefinementConfig,
 )
 from logvggt_jax.errors import InputError
-from logvggt_jax.model.logvggt import LogVGGT, shallow, variable_shapes
+from logvggt_jax.model.initialization import shallow, variable_shapes
+from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.weights.digests import non_finite
 from logvggt_jax.weights.lazy import Header, LazyTensors
 

@@ -12,7 +12,7 @@ import pytest
 from pieces import in_pieces
 
 from logvggt_jax import DPTConfig, LogVGGT, ModelConfig
-from logvggt_jax.model.logvggt import variable_shapes
+from logvggt_jax.model.initialization import variable_shapes
 from logvggt_jax.model.parameters import in_compute_type, run, stack_layers, unstack_layers
 from logvggt_jax.model.windows import Windows
 from logvggt_jax.operations import count_flops

@@ -10,7 +10,8 @@ import pytest
 
 from logvggt_jax.config import DPTConfig, ModelConfig, RefinementConfig, WindowConfig
 from logvggt_jax.errors import InputError
-from logvggt_jax.model.logvggt import LogVGGT, variable_shapes
+from logvggt_jax.model.initialization import variable_shapes
+from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.weights.lazy import LazyTensors
 from logvggt_jax.weights.vggt import config_from_vggt, parameter_shapes, params_from_vggt, vggt_rules
 

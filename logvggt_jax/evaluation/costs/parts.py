@@ -14,7 +14,8 @@ import jax.numpy as jnp
 
 from logvggt_jax.config import ModelConfig
 from logvggt_jax.model.aggregator import WindowTokens
-from logvggt_jax.model.logvggt import LogVGGT, variable_shapes
+from logvggt_jax.model.initialization import variable_shapes
+from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.model.parameters import Variables, stack_layers
 from logvggt_jax.model.refinement import Span, num_triggers
 from logvggt_jax.model.windows import num_windows

@@ -8,7 +8,8 @@ import optax
 from jax.sharding import Mesh
 
 from logvggt_jax.config import ModelConfig
-from logvggt_jax.model.logvggt import LogVGGT, variable_shapes
+from logvggt_jax.model.initialization import variable_shapes
+from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.model.parameters import stack_layers
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.parallel.sharding import Layout, parameter_layout

@@ -17,7 +17,7 @@ from logvggt_jax.evaluation.costs.parts import (
     sequence_parts,
     time_part,
 )
-from logvggt_jax.model.logvggt import variable_shapes
+from logvggt_jax.model.initialization import variable_shapes
 from logvggt_jax.operations import count_flops, matmul_flops_per_second
 
 ROOT = Path(__file__).parents[2]
