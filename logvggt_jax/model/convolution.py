@@ -2,7 +2,8 @@
 
 XLA's CPU compiler brings convolutions into the one form that it has a fast kernel for, but only outside of loops:
 within the scan over windows a kernel's gradient falls back to scalar code, more than ten times slower. There the
-gradients are written in forms that need no rewriting.
+gradients are written in forms that need no rewriting. Which form a program has is decided where it is lowered, so that
+one for a described accelerator is that accelerator's.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ class Convolution(ShapeCheck, nn.Module):
         x = x.astype(dtype)
         if size == 1:
             y = jnp.matmul(x, kernel[0, 0], precision=product_precision(dtype))
-        elif self.strides == 1 and jax.default_backend() == "cpu":
+        elif self.strides == 1:
             y = _looped_convolution(x, kernel)
         else:
             y = _convolve(x, kernel, self.strides)
@@ -67,8 +68,17 @@ def _forward(x: jax.Array, kernel: jax.Array) -> tuple[jax.Array, tuple[jax.Arra
 
 
 def _backward(saved: tuple[jax.Array, jax.Array], gradient: jax.Array) -> tuple[jax.Array, jax.Array]:
+    return jax.lax.platform_dependent(*saved, gradient, cpu=_by_products, default=_by_convolutions)
+
+
+def _by_convolutions(x: jax.Array, kernel: jax.Array, gradient: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """As JAX differentiates a convolution."""
+    _, pull_back = jax.vjp(lambda x, kernel: _convolve(x, kernel, 1), x, kernel)
+    return pull_back(gradient)
+
+
+def _by_products(x: jax.Array, kernel: jax.Array, gradient: jax.Array) -> tuple[jax.Array, jax.Array]:
     """To the input: a convolution with the mirrored kernel. To the kernel: a product for each of its places."""
-    x, kernel = saved
     size, (height, width) = kernel.shape[0], x.shape[1:3]
     x_gradient = _convolve(gradient, jnp.swapaxes(kernel[::-1, ::-1], 2, 3), 1)
     margin = (size - 1) // 2

@@ -53,6 +53,17 @@ def test_values_and_gradients(size, strides, height, width):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4), gradients, others)
 
 
+@pytest.mark.parametrize(("platform", "convolutions", "products"), [("cpu", 2, 1), ("cuda", 3, 0), ("tpu", 3, 0)])
+def test_gradients_have_the_form_of_the_platform_that_they_are_lowered_for(platform, convolutions, products):
+    """Whatever this machine has: programs for described accelerators are compiled on CPUs."""
+    layer = Convolution(6, 3, "float32")
+    x = jax.ShapeDtypeStruct((1, 4, 5, 3), jnp.float32)
+    variables = jax.eval_shape(layer.init, jax.eval_shape(jax.random.key, 0), x)
+    gradients = jax.jit(jax.grad(lambda variables, x: (layer.apply(variables, x) ** 2).sum(), argnums=(0, 1)))
+    program = gradients.trace(variables, x).lower(lowering_platforms=(platform,)).as_text()
+    assert (program.count("stablehlo.convolution"), program.count("stablehlo.dot_general")) == (convolutions, products)
+
+
 def test_bfloat16_computes_in_bfloat16():
     x = np.ones((1, 4, 4, 3), np.float32)
     layer = Convolution(6, 3, "bfloat16")
