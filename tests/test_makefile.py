@@ -3,6 +3,7 @@
 import functools
 import importlib.util
 import operator
+import re
 import shlex
 import subprocess
 from pathlib import Path
@@ -73,3 +74,8 @@ def test_the_demo_uses_the_model_that_ships(commands: list[list[str]]) -> None:
 def test_one_duration_of_the_demo_is_stated() -> None:
     assert "takes five to nine minutes on two cores" in (ROOT / "README.md").read_text()
     assert "README says how long it takes" in (ROOT / "Makefile").read_text()
+    pages = [ROOT / name for name in ("README.md", "Makefile", "CONTRIBUTING.md", "scripts/demo_page.py")]
+    for page in [*pages, *(ROOT / "docs").rglob("*.md")]:
+        sentences = re.split(r"(?<=[.;:])\s", page.read_text())
+        stated = [each for each in sentences if "make demo" in each and re.search(r"\bminutes?\b", each)]
+        assert all("five to nine minutes" in each for each in stated), page

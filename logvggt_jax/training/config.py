@@ -177,7 +177,7 @@ class DataConfig:
             raise InputError("DataConfig.sources is empty: name at least one data set")
         _require_different(self.sources, "DataConfig.sources")
         require_within(self, "[0, 1]", "reverse")
-        require_within(self, "[0, inf)", "worker_count", "num_threads")
+        require_counts(self, "worker_count", "num_threads", least=0)
         require_within(self, "[0, 1)", "min_valid_depth", "max_broken")
 
 
@@ -286,7 +286,7 @@ class TrainConfig:
                     "every clip at one size: give all stages the same sizes"
                 )
         require_counts(self, "log_every", "save_every", "keep_checkpoints", "max_skipped_in_a_row", "accumulate")
-        require_within(self, "[0, inf)", "seed")
+        require_counts(self, "seed", least=0)
         require_within(self, "[0, 1)", "average")
         require_within(self, "(0, inf)", "max_minutes")
 

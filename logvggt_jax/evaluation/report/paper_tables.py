@@ -3,7 +3,7 @@
 import importlib.resources
 import json
 import statistics
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from logvggt_jax.evaluation.report.tables import Table
@@ -77,15 +77,21 @@ def paper_tables(results: Mapping[str, Any]) -> list[Table]:
     return [*tables, *_timings(paper, results.get("timings"))]
 
 
-def _by_count(data: Mapping[str, Any], columns: Any) -> list[tuple[str, Any, list[PaperColumn]]]:
+def _by_count(
+    data: Mapping[str, Any], columns: Callable[[str], list[PaperColumn]]
+) -> list[tuple[str, Any, list[PaperColumn]]]:
+    """A group of rows for each number of frames: that number, the paper's rows {method: {data set: {metric: value}}},
+    and the columns that `columns` has for it."""
     return [(count, rows, columns(count)) for count, rows in data.items()]
 
 
 def _one_dataset(rows: Mapping[str, Any]) -> dict[str, Any]:
+    """Rows {method: {metric: value}} of a table of CO3Dv2 alone in the form of the others."""
     return {name: {"CO3Dv2": values} for name, values in rows.items()}
 
 
 def _clouds(count: str) -> list[PaperColumn]:
+    """Accuracy, completeness and normals of the clouds of so many frames, mean and median in columns of their own."""
     measures = (
         ("Acc mean ↓", "acc_mean", "acc_mean"),
         ("Acc med ↓", "acc_med", "acc_median"),
@@ -102,6 +108,7 @@ def _clouds(count: str) -> list[PaperColumn]:
 
 
 def _cloud_pairs(count: str) -> list[PaperColumn]:
+    """The same with mean and median in one cell."""
     return [
         PaperColumn(
             f"{heading} {arrow}",
@@ -131,6 +138,7 @@ def _longer_depth(count: str) -> list[PaperColumn]:
 
 
 def _depth_columns(label: str, benchmark: str) -> list[PaperColumn]:
+    """Abs Rel and δ < 1.25, with one scale a sequence, under the heading `label`."""
     return [
         PaperColumn(heading, label, (theirs,), benchmark, (ours,), "depth", 3)
         for heading, theirs, ours in _DEPTH_METRICS
@@ -143,6 +151,7 @@ def _poses() -> list[PaperColumn]:
 
 
 def _pose_columns(label: str, benchmark: str) -> list[PaperColumn]:
+    """RRA, RTA and AUC at 30 degrees, in percent."""
     return [
         PaperColumn(f"{theirs} ↑", label, (theirs,), benchmark, (ours,), "pose", 2, 100.0)
         for theirs, ours in _POSE_METRICS
@@ -150,6 +159,7 @@ def _pose_columns(label: str, benchmark: str) -> list[PaperColumn]:
 
 
 def _ablation(count: str) -> list[PaperColumn]:
+    """Chamfer distance and normals of both sets of clouds, and CO3Dv2's poses, of so many frames."""
     columns: list[PaperColumn] = []
     for label, slug in _CLOUDS:
         benchmark = f"{slug}-reconstruction-{count}"
@@ -162,6 +172,7 @@ def _ablation(count: str) -> list[PaperColumn]:
 def _table(
     title: str, groups: Sequence[tuple[str, Mapping[str, Any], list[PaperColumn]]], results: Mapping[str, Any]
 ) -> Table:
+    """The paper's rows of each group of `_by_count`, and below them this run's; groups without counts have "" there."""
     has_counts = bool(groups[0][0])
     header = ["method", *(["frames"] if has_counts else [])]
     header += [f"{column.dataset} {column.heading}" for column in groups[0][2]]
@@ -186,6 +197,7 @@ def _table(
 
 
 def _paper_cell(data: Mapping[str, Any], column: PaperColumn) -> str:
+    """Of a method's {data set: {metric: value}}; marked where the number cannot be, see `IMPOSSIBLE_NOTE`."""
     values = data[column.dataset]
     numbers = [values[metric] for metric in column.metrics]
     if None in numbers:
@@ -196,6 +208,7 @@ def _paper_cell(data: Mapping[str, Any], column: PaperColumn) -> str:
 
 
 def _own_cell(results: Mapping[str, Any], method: str, column: PaperColumn) -> str:
+    """Of this run's summary, with the number of clips where not all were measured; a dash for what was not."""
     benchmark = next((b for b in results["benchmarks"] if b["name"] == column.benchmark), None)
     entry = next((e for e in results["summary"] if e["benchmark"] == column.benchmark and e["method"] == method), None)
     if benchmark is None or entry is None:
@@ -211,6 +224,7 @@ def _own_cell(results: Mapping[str, Any], method: str, column: PaperColumn) -> s
 
 
 def _timings(paper: Mapping[str, Any], measured: Mapping[str, Any] | None) -> Iterator[Table]:
+    """The appendix's tables of runtime and of frames a second; `measured` is what a run that timed itself has."""
     runtime = paper["runtime_breakdown_1000_frames"]["data"]
     rows = [
         [f"{name} (paper)", f"{v['runtime_ms']:,.0f}", f"{v['share_percent']:.2f} %"] for name, v in runtime.items()
@@ -251,6 +265,7 @@ def _timing_setting(measured: Mapping[str, Any]) -> str:
 
 
 def _rate(rates: Sequence[float] | str | None) -> str:
+    """Median and extremes of frames a second of the rounds; a dash where a reason stands in their place."""
     if rates is None or isinstance(rates, str):
         return "-"
     return f"{statistics.median(rates):.1f} ({min(rates):.1f} to {max(rates):.1f})"

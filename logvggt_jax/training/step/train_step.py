@@ -136,6 +136,7 @@ def make_train_step(
         directions, opt_state = optimizer.update(gradients, state.opt_state, state.params)
         params = apply_updates(state.params, directions, learning_rate)
 
+        # Not `optax.apply_if_finite`, which looks at the gradient alone and knows neither average nor longest row.
         def keep_if_usable(new: Any, old: Any) -> Any:
             return jax.tree.map(lambda a, b: jnp.where(usable, a, b), new, old)
 
