@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import pickle
 import random
@@ -14,6 +15,8 @@ from typing import Any
 
 import pytest
 from orbax.checkpoint import StandardCheckpointer
+from pixel_program import PIXEL_MODEL, PIXEL_SETTINGS
+from root_programs import RootPrograms, Running
 
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.weights.checkpoints import read_provenance
@@ -42,6 +45,53 @@ print("begins", flush=True)
 state = loop.train(config, Path(sys.argv[2]), mesh=data_mesh(2))
 Path(sys.argv[2], "ended.pickle").write_bytes(pickle.dumps(jax.device_get(state)))
 """
+
+# Two stages, with a save in the middle of the first.
+SHORT = (
+    *PIXEL_SETTINGS,
+    "--config.stages.stage_1.steps=8",
+    "--config.stages.stage_2.steps=2",
+    "--config.stages.stage_2.clip_length=4",
+    "--config.log_every=1",
+    "--config.save_every=4",
+    "--validation_source=none",
+)
+# A run that stands still once the line of step 6 is written: there it is killed, however fast the machine is.
+STANDS_STILL = """
+import time
+write = loop.MetricsLog.write
+def stand_still(log, step, *given, **words):
+    write(log, step, *given, **words)
+    if step == 6:
+        time.sleep(600)
+loop.MetricsLog.write = stand_still
+"""
+
+
+def test_a_killed_run_ends_as_one_that_was_left_alone(programs: RootPrograms, tmp_path: Path) -> None:
+    def start(name: str, *, patch: str = "") -> Running:
+        return programs.start("train.py", *SHORT, f"--workdir={tmp_path / name}", first=PIXEL_MODEL + patch)
+
+    killed = start("killed", patch=STANDS_STILL)
+    written, saved = tmp_path / "killed" / "metrics.jsonl", tmp_path / "killed" / "checkpoints" / "4"
+    end = time.monotonic() + 300
+    while not (saved.is_dir() and b'{"step": 6,' in written.read_bytes()):
+        assert time.monotonic() < end, killed.error.read_text()
+        time.sleep(0.02)
+    killed.send_signal(signal.SIGKILL)
+    assert killed.wait() == -signal.SIGKILL
+    # Both read the programs that the first one compiled.
+    resumed, alone = start("killed"), start("alone")
+    assert [resumed.wait(), alone.wait()] == [0, 0], resumed.error.read_text() + alone.error.read_text()
+    assert "4/10 steps done, results in" in resumed.output.read_text()
+
+    ends = [tmp_path / name for name in ("alone", "killed")]
+    lines = [(folder / "metrics.jsonl").read_bytes() for folder in ends]
+    assert lines[0] == lines[1] and lines[0].count(b"loss/total") == 10
+    states = [json.loads((folder / "checkpoints" / "10" / "meta" / "metadata").read_text()) for folder in ends]
+    assert states[0]["digests"] == states[1]["digests"]
+    models = [digests(StandardCheckpointer().restore(folder / "model" / "params")) for folder in ends]
+    assert models[0] == models[1]
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from pixel_program import PIXEL_MODEL, PIXEL_SETTINGS
 from root_programs import RootPrograms
 
 from logvggt_jax.errors import InputError
@@ -36,29 +37,6 @@ SETTINGS = (
     "--config.validation.every=2",
     "--config.log_every=1",
     "--config.save_every=2",
-)
-
-PIXEL_MODEL = """
-import sys
-sys.path[:0] = ["tests/training", "."]
-import conftest
-from logvggt_jax.training import loop
-conftest.use_pixel_model(loop)
-"""
-PIXEL_SETTINGS = (
-    *SETTINGS[:1],
-    "--config.stages.stage_1.steps=100000",
-    "--config.stages.stage_1.batch_size=2",
-    "--config.stages.stage_2.batch_size=2",
-    # Each process renders its rooms, which otherwise takes as long as all else that it does.
-    "--config.data.sources.rooms.options.num_rooms=2",
-    "--config.data.sources.rooms.options.num_frames=24",
-    "--config.validation.num_clips=2",
-    "--config.validation.sources.rooms.options.num_rooms=2",
-    "--config.validation.sources.rooms.options.num_frames=24",
-    "--config.validation.every=100000",
-    "--config.log_every=10",
-    "--config.save_every=100000",
 )
 
 
