@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 from collections import deque
 from collections.abc import Callable
 
 import jax
 from absl import logging
 
+from logvggt_jax.training.parallel.agreement import Exchange
 from logvggt_jax.training.reporting.progress import IntervalMeans
 from logvggt_jax.training.reporting.skipped import clips_to_blame, described
 from logvggt_jax.training.step.train_step import Metrics
@@ -32,6 +34,7 @@ class StepsInFlight:
         self._in_a_row = in_a_row
         self._skipped, self._step_ended = float(skipped), step_ended
         self._steps: deque[tuple[int, Metrics, jax.Array, list[str]]] = deque()
+        self._exchange = Exchange("skipped")
         # Clips of the latest updates left out in a row, and its last step.
         self._blamed: list[str] = []
         self._last_skip = -1
@@ -54,7 +57,9 @@ class StepsInFlight:
             self._step_ended()
             self.means.add(values)
             if values["skipped"] > self._skipped:
-                self._blame(step, *clips_to_blame(finite, names))
+                # All processes have the same counter and find the same steps left out.
+                exchange = functools.partial(self._exchange, step)
+                self._blame(step, *clips_to_blame(finite, names, exchange))
                 self._in_a_row += 1
                 self.longest_skip = max(self.longest_skip, self._in_a_row)
             else:

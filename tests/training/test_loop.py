@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from dazzled_model import DazzledModel
 from jax.sharding import Mesh
 
 from logvggt_jax.data.feeding.clips import ClipReader
@@ -707,20 +708,6 @@ def test_workers_may_change_when_a_run_goes_on(
     backwards = dataclasses.replace(run_config, data=dataclasses.replace(run_config.data, reverse=1.0))
     with pytest.raises(ValueError, match=r"other settings: data\.reverse=0\.5, now 1\.0"):
         train(backwards, finished, mesh=data_mesh(2))
-
-
-@dataclasses.dataclass(frozen=True)
-class DazzledModel:
-    """The quick model, which a black picture drives to infinity."""
-
-    config: Any
-    model: Any
-
-    def apply(self, variables: Any, images: jax.Array, *given: Any, **options: Any) -> Any:
-        predictions = self.model.apply(variables, images, *given, **options)
-        dark = images.astype(jnp.float32).sum((1, 2, 3, 4)) == 0
-        depth = jnp.where(dark[:, None, None, None], jnp.inf, predictions.depth)
-        return dataclasses.replace(predictions, depth=depth)
 
 
 def test_clips_that_make_updates_useless_are_named_and_the_same_command_goes_past_them(

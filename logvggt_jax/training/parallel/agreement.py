@@ -25,6 +25,8 @@ from logvggt_jax.training.parallel.sharding import replicated, split
 
 # A network file system shows a new file to other machines after so long.
 SHARED_SECONDS = 60.0
+# Others may still wait for the clips of a step that this process has begun already.
+ANSWER_SECONDS = 60.0
 
 
 def any_process(wants: bool) -> bool:
@@ -37,6 +39,40 @@ def from_all(values: np.ndarray) -> np.ndarray:
     if jax.process_count() == 1:
         return values[None]
     return np.asarray(multihost_utils.process_allgather(values))
+
+
+class Exchange:
+    """What processes tell one another without their devices: they may do so at different points between their steps,
+    and none waits for ever. There is one exchange of a `name` in the life of the processes."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._last: str | None = None
+
+    def __call__(self, number: int, text: str) -> list[str | None]:
+        """The `text` of every process for this `number`, which none gives twice; None of a process that has not given
+        its own within `ANSWER_SECONDS`."""
+        if jax.process_count() == 1:
+            return [text]
+        # The store of keys that JAX's processes share has no public name.
+        from jax._src.distributed import global_state
+
+        assert global_state.client is not None
+        key, end = f"logvggt/{self._name}/{number}", time.monotonic() + ANSWER_SECONDS
+        own = f"{key}/{jax.process_index()}"
+        global_state.client.key_value_set(own, text)
+        texts: list[str | None] = []
+        for process in range(jax.process_count()):
+            milliseconds = max(int(1000 * (end - time.monotonic())), 1)
+            try:
+                texts.append(global_state.client.blocking_key_value_get(f"{key}/{process}", milliseconds))
+            except jax.errors.JaxRuntimeError:
+                texts.append(None)
+        # Whoever has spoken now has heard what was said before.
+        if self._last is not None:
+            global_state.client.key_value_delete(self._last)
+        self._last = own
+        return texts
 
 
 class Vote:

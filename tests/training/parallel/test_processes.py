@@ -168,6 +168,35 @@ def test_a_stop_signal_for_one_process_stops_all_after_the_same_step(programs: R
         assert (tmp_path / "checkpoints" / found[1]).is_dir()
 
 
+def test_clips_of_one_process_that_make_an_update_useless_are_named_by_all(
+    programs: RootPrograms, tmp_path: Path
+) -> None:
+    dazzled = """
+from dazzled_model import DazzledModel
+loop.LogVGGT = lambda config: DazzledModel(config, conftest.PixelModel(config))
+"""
+    black = """
+from logvggt_jax.data.feeding.clips import ClipReader
+read = ClipReader.__call__
+def reading(reader, *given):
+    clip = read(reader, *given)
+    return {**clip, "images": 0 * clip["images"], "name": "black " + clip["name"]}
+ClipReader.__call__ = reading
+"""
+    flags = ("--config.max_skipped_in_a_row=2", "--config.log_every=100000", "--validation_source=none")
+    with PixelRuns(programs, tmp_path, tmp_path, patches=(dazzled, dazzled + black), flags=flags) as runs:
+        errors = [runs.errors(number) for number in range(2)]
+        assert [process.returncode for process in runs.processes] == [1, 1], errors
+    for said in errors:
+        named = re.findall(r"step (\d): update left out, loss was not finite in (.*)", said)
+        # Two more were under way when two were known.
+        assert [step for step, _ in named] == ["1", "2", "3", "4"], said
+        (end,) = re.findall(r"4 updates in a row had a non-finite loss .*, with (.*); the same command goes on", said)
+        assert end == "; ".join(clips for _, clips in named), said
+        # One clip each, of process 1.
+        assert all(re.fullmatch(r"black rooms, [^;]*", clips) for _, clips in named), said
+
+
 def test_folders_that_are_not_shared_are_an_error_of_the_start(programs: RootPrograms, tmp_path: Path) -> None:
     patch = "from logvggt_jax.training.parallel import agreement; agreement.SHARED_SECONDS = 0.5"
     with PixelRuns(programs, tmp_path / "a", tmp_path / "b", patches=(patch, patch)) as runs:
