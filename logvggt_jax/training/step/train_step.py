@@ -28,7 +28,7 @@ LossTerms = Callable[[Any, Batch], tuple[dict[str, Mean], dict[str, Mean], jax.A
 
 def make_loss_terms(model: LogVGGT, config: LossConfig, *, frozen: tuple[str, ...] = ()) -> LossTerms:
     """A function (parameters, one device's share of a batch) -> (terms of the objective, errors to be logged, bool [b]
-    which clips are finite in predictions and targets).
+    which clips are finite in predictions, targets and terms).
 
     Both are sums and counts over that share alone, so the function holds no communication of its own and can be
     differentiated on each device by itself. What the patterns `frozen` match has no gradient.
@@ -40,8 +40,10 @@ def make_loss_terms(model: LogVGGT, config: LossConfig, *, frozen: tuple[str, ..
         predictions = model.apply(variables, batch["images"], frame_mask, remat=True)
         targets = normalize_clips(batch["depth"], batch["intrinsics"], batch["extrinsics"], frame_mask=frame_mask)
         seen: Any = jax.lax.stop_gradient(predictions)
-        means = loss_terms(predictions, targets, config, batch.get("confidence"))
-        return means, clip_errors(seen, targets), _finite_clips(seen, targets)
+        confidence = batch.get("confidence")
+        means = loss_terms(predictions, targets, config, confidence)
+        finite = _finite_clips(seen, targets) & _finite_terms(seen, targets, config, confidence)
+        return means, clip_errors(seen, targets), finite
 
     return terms
 
@@ -117,8 +119,8 @@ def make_train_step(
     A batch holds `images` uint8 [B, T, H, W, 3], `depth` [B, T, H, W], `intrinsics` [B, T, 3, 3], `extrinsics`
     [B, T, 4, 4], optionally `frame_mask` bool [B, T], and for a distillation the teacher's `confidence` [B, T, H, W].
     Metrics are float32 scalars, equal on all devices. A non-finite loss or gradient leaves parameters and moments as
-    they were and is counted in the state; where it comes from predictions or targets, `finite clips`, bool [B] and
-    split as the batch is, says of which clips.
+    they were and is counted in the state; where it comes from predictions, targets or the loss of single clips, `finite
+    clips`, bool [B] and split as the batch is, says of which clips.
 
     State and optimiser lie as `layout` says. `accumulate`: see `loss_and_gradients`. `average` is the decay of the
     moving average in a step, for a state that has one.
@@ -175,3 +177,16 @@ def _finite_clips(predictions: Predictions, targets: Targets) -> jax.Array:
     depth = jnp.isfinite(predictions.depth) & jnp.isfinite(predictions.depth_confidence) & jnp.isfinite(targets.depth)
     poses = jnp.isfinite(predictions.pose_encodings).all((-2, -1)) & jnp.isfinite(targets.pose_encoding).all(-1)
     return ((depth.all((-2, -1)) & poses) | ~targets.frame_valid).all(-1)
+
+
+def _finite_terms(
+    predictions: Predictions, targets: Targets, config: LossConfig, confidence: jax.Array | None
+) -> jax.Array:
+    """bool [b]: whether a clip's own terms are finite, which overflow where its finite predictions are far off."""
+
+    def clip_is_finite(*clip: Any) -> jax.Array:
+        predictions, targets, confidence = jax.tree.map(lambda x: x[None], clip)
+        means = loss_terms(predictions, targets, config, confidence)
+        return jnp.isfinite(jnp.stack([mean.numerator for mean in means.values()])).all()
+
+    return jax.vmap(clip_is_finite)(predictions, targets, confidence)

@@ -151,6 +151,26 @@ def test_non_finite_updates_are_skipped_and_counted(
     assert not np.array_equal(bias, before.params["camera_head"]["bias"])
 
 
+def test_a_clip_whose_finite_predictions_overflow_its_loss_is_told_from_the_others(
+    pixel_model: Any, loss_config: LossConfig, pixel_params: Any, clips: Clips
+) -> None:
+    class FarOff(type(pixel_model)):  # type: ignore[misc]
+        """Sees black pictures very far away, and is very sure of it."""
+
+        def apply(self, variables: Any, images: jax.Array, *given: Any, **options: Any) -> Any:
+            predictions = super().apply(variables, images, *given, **options)
+            black = (images.sum((1, 2, 3, 4)) == 0)[:, None, None, None]
+            depth, confidence = (jnp.where(black, 1e30, x) for x in (predictions.depth, predictions.depth_confidence))
+            return dataclasses.replace(predictions, depth=depth, depth_confidence=confidence)
+
+    images = clips["images"].copy()
+    images[2] = 0
+    terms = jax.jit(make_loss_terms(FarOff(pixel_model.config), loss_config))
+    means, _, finite = terms(pixel_params, {**clips, "images": images})
+    assert not np.isfinite(means["depth_error"].numerator)
+    assert finite.tolist() == [clip != 2 for clip in range(8)]
+
+
 def test_batches_have_to_split_over_the_devices() -> None:
     with pytest.raises(ValueError, match="stage 'only': batch_size=8 does not split over 3 devices"):
         check_batch_size(STAGES[0], data_mesh(3))
