@@ -190,7 +190,7 @@ class _Run:
         self.checkpoints.wait()
         log.say(
             f"{step}/{self.config.total_steps} steps done; model in {self.checkpoints.models.newest}; "
-            f"{goodput(self.times.productive, time.time() - log.started)}"
+            f"{goodput(self.times.productive, log.seconds_since_start())}"
         )
 
     def _train_stage(

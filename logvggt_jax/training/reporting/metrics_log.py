@@ -22,13 +22,15 @@ from logvggt_jax.training.reporting.wandb_run import WandbRun
 FILE_NAME = "metrics.jsonl"
 # Beside the metrics, whose file is the same, byte by byte, however often a run was interrupted.
 TIMES_NAME = "times.jsonl"
+# By so much at least the clock of the day departs from one that nobody sets where it was set.
+_SET_SECONDS = 60.0
+_CLOCK_SET = "clock_set_by"
 
 
 class MetricsLog:
     """Appends to `metrics.jsonl`, `times.jsonl` and `tensorboard/` of a work folder; a context manager.
 
     Attributes:
-      started: when the run began for the first time, seconds since 1970.
       productive_seconds: what earlier sessions spent on the steps that are left of them.
 
     On a run that resumes at `first_step`, lines of later steps (of the run that was interrupted) are dropped, so
@@ -53,7 +55,10 @@ class MetricsLog:
         self.console = console
         self.silent = silent
         self._wandb = wandb
-        self.started, self.productive_seconds = time.time(), 0.0
+        self.productive_seconds = 0.0
+        self._started = self._opened = time.time()
+        self._opened_steadily = _steady_time()
+        self._was_set = False
         if silent:
             return
         times = workdir / TIMES_NAME
@@ -67,7 +72,8 @@ class MetricsLog:
         self._events = EventFile(workdir / "tensorboard", purge_step=0 if anew else first_step + 1)
         known = [entry for entry in read_metrics(times) if {"time", "productive_seconds"} <= entry.keys()]
         if known:
-            self.started = known[0]["time"]
+            self._started = known[0]["time"]
+            self._was_set = any(_CLOCK_SET in entry for entry in known)
             self.productive_seconds = known[-1]["productive_seconds"]
         else:
             self.write_times(first_step, {"productive_seconds": 0.0})
@@ -89,10 +95,22 @@ class MetricsLog:
 
     def write_times(self, step: int, values: dict[str, float]) -> None:
         """The same for what differs from one machine and session to the next, in a file of its own, with `time`
-        (seconds since 1970)."""
+        (seconds since 1970), and where the clock was set in this session by how many seconds."""
         if not self.silent:
-            self._append(self._times, {"step": step, "time": round(time.time(), 3), **_finite(values)})
+            jump = self._clock_jump()
+            was_set = {_CLOCK_SET: round(jump, 3)} if abs(jump) > _SET_SECONDS else {}
+            self._append(self._times, {"step": step, "time": round(time.time(), 3), **was_set, **_finite(values)})
             self._draw(step, {f"times/{name}": value for name, value in values.items()})
+
+    def seconds_since_start(self) -> float | None:
+        """Since the run began for the first time, by the clock of the day; None where that was set in a session."""
+        if self._was_set or abs(self._clock_jump()) > _SET_SECONDS:
+            return None
+        return time.time() - self._started
+
+    def _clock_jump(self) -> float:
+        """Seconds by which the clock of the day was set since this session began."""
+        return (time.time() - self._opened) - (_steady_time() - self._opened_steadily)
 
     def show(self, step: int, pictures: Mapping[str, np.ndarray]) -> None:
         """Pictures by name, [h, w, 3] uint8 RGB."""
@@ -122,6 +140,11 @@ class MetricsLog:
         """One line on the terminal."""
         if not self.silent:
             self.console.print(message, highlight=False, soft_wrap=True)
+
+
+def _steady_time() -> float:
+    """Seconds by a clock that nobody sets and that, where the system has one, goes on while the machine sleeps."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME) if hasattr(time, "CLOCK_BOOTTIME") else time.monotonic()
 
 
 def _finite(values: Mapping[str, float]) -> dict[str, float | None]:

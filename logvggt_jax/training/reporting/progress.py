@@ -60,14 +60,17 @@ def progress_line(
     return f"step {step}/{total} {stage}: {', '.join(parts)}, {left}"
 
 
-def goodput(productive: float, wall: float) -> str:
+def goodput(productive: float, wall: float | None) -> str:
     """The share of the time since the first start that went into training, in words.
 
     Args:
       productive: seconds of the steps that made the present state.
-      wall: seconds since the first start, by a clock that may have been set in between.
+      wall: seconds since the first start, by a clock that may have been set between two sessions; None where it was
+        set within one.
     """
     done = f"{duration(productive)} of training"
+    if wall is None:
+        return f"goodput not known, {done}: the clock was set since the first start"
     if wall < productive or wall <= 0:
         return f"goodput not known, {done} in less time: the clock was set back since the first start"
     return f"goodput {productive / wall:.0%}: {done} in {duration(wall)} since the first start"

@@ -3,6 +3,7 @@
 import io
 import os
 import struct
+import time
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from rich.console import Console
 from tensorboardX.proto.event_pb2 import Event
 
 from logvggt_jax.errors import DiskError
+from logvggt_jax.training.reporting import metrics_log
 from logvggt_jax.training.reporting.metrics_log import FILE_NAME, TIMES_NAME, MetricsLog, read_metrics
 
 
@@ -95,6 +97,34 @@ def test_a_run_that_begins_anew_replaces_step_0_and_keeps_when_it_began(tmp_path
     (file,) = (tmp_path / "tensorboard").iterdir()
     begun = [event.step for event in _events(file.read_bytes()) if event.HasField("session_log")]
     assert begun == [0], "where it takes over from the start before"
+
+
+@pytest.mark.parametrize("jump", [3600.0, -3600.0])
+def test_the_time_since_the_first_start_is_not_known_once_the_clock_jumped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, jump: float
+) -> None:
+    day, steady = [1e9], [50.0]
+    monkeypatch.setattr(time, "time", lambda: day[0])
+    monkeypatch.setattr(metrics_log, "_steady_time", lambda: steady[0])
+
+    def pass_by(seconds: float) -> None:
+        day[0], steady[0] = day[0] + seconds, steady[0] + seconds
+
+    with _log(tmp_path, 0) as log:
+        pass_by(100.0)
+        log.write_times(1, {"productive_seconds": 90.0})
+        assert log.seconds_since_start() == 100.0
+    # What passes between two sessions counts, though the steady clock begins anew where the machine does.
+    day[0], steady[0] = day[0] + 1000.0, 3.0
+    with _log(tmp_path, 1) as log:
+        pass_by(100.0)
+        assert log.seconds_since_start() == 1200.0
+        day[0] += jump
+        assert log.seconds_since_start() is None
+        log.write_times(2, {"productive_seconds": 180.0})
+    assert [entry.get("clock_set_by") for entry in read_metrics(tmp_path / TIMES_NAME)] == [None, None, jump]
+    with _log(tmp_path, 2) as log:
+        assert log.seconds_since_start() is None
 
 
 def test_damaged_lines_cost_a_resumed_run_no_others(tmp_path: Path) -> None:

@@ -77,10 +77,11 @@ def test_means_are_of_finite_values_and_counters_are_the_last() -> None:
     assert math.isnan(means.read()["loss/total"])
 
 
-def test_goodput_is_not_known_where_the_clock_was_set_back() -> None:
+def test_goodput_is_not_known_where_the_clock_was_set() -> None:
     assert progress.goodput(60, 120) == "goodput 50%: 1:00 of training in 2:00 since the first start"
     for wall in (59.0, -3600.0):
         assert progress.goodput(60, wall).startswith("goodput not known, 1:00 of training in less time: the clock was")
+    assert progress.goodput(60, None) == "goodput not known, 1:00 of training: the clock was set since the first start"
 
 
 def test_a_line_says_what_a_person_looks_for() -> None:
