@@ -58,6 +58,7 @@ DEAREST = (
     # Waits for a process of its own while another worker compiles what the next files initialise parameters with.
     "training/test_train_script.py",
     "model/test_logvggt.py",
+    "training/parallel/test_sharding.py",
     "streaming/test_frame_methods.py",
     "training/test_loop.py",
     "weights/test_checkpoints.py",
@@ -74,7 +75,6 @@ DEAREST = (
     "evaluation/costs/test_throughput.py",
     "evaluation/test_eval_script.py",
     "training/parallel/test_processes.py",
-    "training/parallel/test_sharding.py",
     "weights/test_vggt.py",
     "evaluation/test_run.py",
 )

@@ -55,10 +55,11 @@ class LayeredModel:
 
 
 class Outcome(NamedTuple):
-    """The gradient of the first step, on the host, and the loss of every step."""
+    """The gradient of the first step and the parameters after the last one, on the host, and the loss of every step."""
 
     gradient: Any
     losses: list[float]
+    params: Any
 
 
 def first_gradient(
@@ -88,10 +89,12 @@ def steps(model: Any, config: TrainConfig, params: Any, clips: Clips, mesh: Mesh
         state, metrics, _ = step(state, batch)
         losses.append(float(metrics["loss/total"]))
         if gradient is None:
-            # Adam's first moment is the gradient, but for a factor.
-            moments = [x for x in jax.tree.leaves(state.opt_state, is_leaf=_is_adam) if _is_adam(x)]
-            gradient = jax.tree.map(lambda x: np.asarray(whole_array(x)) / (1 - config.optimizer.b1), moments[0].mu)
-    return Outcome(gradient, losses)
+            # Adam's first moment is the gradient, but for a factor. Each module has an Adam of its own, whose tree is
+            # empty where the other modules are.
+            adams = [x for x in jax.tree.leaves(state.opt_state, is_leaf=_is_adam) if _is_adam(x)]
+            moments = {name: tree for adam in adams for name, tree in adam.mu.items() if jax.tree.leaves(tree)}
+            gradient = jax.tree.map(lambda x: np.asarray(whole_array(x)) / (1 - config.optimizer.b1), moments)
+    return Outcome(gradient, losses, jax.tree.map(lambda x: np.asarray(whole_array(x)), state.params))
 
 
 def _is_adam(state: Any) -> bool:
