@@ -1,11 +1,16 @@
 """The paper's losses against formulas written out, and their behaviour at the edges."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from logvggt_jax.training.losses import log_vggt as losses
+from logvggt_jax.training.losses import vggt
+from logvggt_jax.training.losses.distillation import distilled_depth_losses
+from logvggt_jax.training.losses.mean import Mean
 
 WEIGHTS = {"translation_weight": 1.0, "rotation_weight": 1.0, "field_of_view_weight": 0.5, "gamma": 0.6}
 # As programs, which training runs: one by one each operation would compile by itself.
@@ -71,24 +76,51 @@ def test_nothing_valid_gives_zero_with_a_finite_gradient() -> None:
     assert float(value) == 0.0 and all(not np.asarray(gradient).any() for gradient in gradients)
 
 
-def test_masked_pixels_frames_and_clips_have_no_gradient() -> None:
+def _paper_terms(depth, confidence, poses, target, wanted, pixels, frames) -> dict[str, Mean]:
+    terms = losses.depth_losses(depth, confidence, target, pixels, alpha=0.2)
+    return {**terms, "camera": losses.camera_loss(poses, wanted, frames, **WEIGHTS)}
+
+
+def _vggt_terms(depth, confidence, poses, target, wanted, pixels, frames) -> dict[str, Mean]:
+    terms = vggt.depth_losses(depth, confidence, target, pixels, alpha=0.2)
+    return {**terms, **vggt.camera_losses(poses, wanted, frames, pixels, gamma=0.6)}
+
+
+def _distilled_terms(depth, confidence, poses, target, wanted, pixels, frames) -> dict[str, Mean]:
+    terms = distilled_depth_losses(depth, confidence, target, pixels, 2.0 + target, alpha=0.2)
+    return {**terms, "camera": losses.camera_loss(poses, wanted, frames, **WEIGHTS)}
+
+
+@pytest.mark.parametrize("terms", [_paper_terms, _vggt_terms, _distilled_terms])
+def test_masked_pixels_frames_and_clips_have_no_gradient(terms: Callable[..., dict[str, Mean]]) -> None:
     generator = np.random.default_rng(4)
-    shape = (3, 3, 4, 5)
+    # VGGT's losses count clips from a hundred pixels in the first frame on, and drop the largest of a thousand errors.
+    shape = (3, 3, 20, 25)
     depth, target, confidence = generator.uniform(1, 2, (3, *shape))
     poses, wanted = generator.normal(size=(3, 3, 2, 9)), generator.normal(size=(3, 3, 9))
     pixels, frames = generator.uniform(size=shape) < 0.7, np.ones((3, 3), bool)
     frames[0, 2], frames[1] = False, False  # a frame of one clip, all of another
     pixels &= frames[..., None, None]
 
-    def loss(depth: jax.Array, confidence: jax.Array, poses: jax.Array) -> jax.Array:
-        terms = depth_losses(depth, confidence, jnp.asarray(target), jnp.asarray(pixels), alpha=0.2)
-        camera = camera_loss(poses, jnp.asarray(wanted), jnp.asarray(frames), **WEIGHTS)
-        return camera.value() + sum(term.value() for term in terms.values())
+    @jax.jit
+    def gradients(*predicted: jax.Array) -> tuple[jax.Array, ...]:
+        def loss(*predicted: jax.Array) -> jax.Array:
+            return sum(term.value() for term in terms(*predicted, target, wanted, pixels, frames).values())
 
-    of_depth, of_confidence, of_poses = jax.grad(loss, (0, 1, 2))(*map(jnp.asarray, (depth, confidence, poses)))
+        return jax.grad(loss, (0, 1, 2))(*predicted)
+
+    of_depth, of_confidence, of_poses = map(np.asarray, gradients(depth, confidence, poses))
     for gradient in (of_depth, of_confidence):
-        assert not np.asarray(gradient)[~pixels].any() and np.asarray(gradient)[pixels].any()
-    assert not np.asarray(of_poses)[~frames].any() and np.asarray(of_poses)[frames].all((-2, -1)).all()
+        assert not gradient[~pixels].any() and gradient[pixels].any()
+    assert not of_poses[~frames].any() and of_poses[frames].all((-2, -1)).all()
+    # What is masked may be anything.
+    found = gradients(
+        np.where(pixels, depth, np.inf),
+        np.where(pixels, confidence, 0.0),
+        np.where(frames[..., None, None], poses, np.inf),
+    )
+    for changed, kept in zip(found, (of_depth, of_confidence, of_poses), strict=True):
+        np.testing.assert_array_equal(changed, kept)
 
 
 def test_invalid_pixels_have_no_influence() -> None:
