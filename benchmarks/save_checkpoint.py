@@ -65,6 +65,7 @@ def main() -> None:
     generator = np.random.default_rng(0)
     params = jax.tree.map(lambda leaf: generator.standard_normal(leaf.shape, np.float32), shapes)
     state = make_program(LogVGGT(config.model), config, shapes, mesh).initial_state(params)
+    del params  # a training run does not keep them either
     size = sum(leaf.nbytes for leaf in jax.tree.leaves(state))
     waited, finished, processor = [], [], []
     with (
