@@ -1,14 +1,19 @@
 """Whoever is lost is named to all, whoever is done to nobody, and strangers are not heard."""
 
+import os
 import platform
 import queue
+import shutil
 import socket
+import subprocess
+import sys
 import threading
+import time
 from collections.abc import Iterator
 
 import pytest
 
-from logvggt_jax.training.parallel.lifeline import Lifeline, accept, connect, listen
+from logvggt_jax.training.parallel.lifeline import SILENCE_SECONDS, Lifeline, accept, connect, listen
 
 Heard = dict[int, "queue.Queue[str]"]
 
@@ -71,3 +76,73 @@ def test_those_that_are_done_are_not_missed(three) -> None:  # type: ignore[no-u
     lines[0].close()
     lines[2].wait(10)
     assert all(losses.empty() for losses in heard.values())
+
+
+# One of two processes, given its number; it ends as a training run does.
+ONE_OF_TWO = """
+import sys, time
+from logvggt_jax.training.parallel.joining import end_process
+from logvggt_jax.training.parallel.lifeline import Lifeline, accept, connect, listen
+number, port = map(int, sys.argv[1:])
+if number == 0:
+    with listen() as server:
+        print(server.getsockname()[1], flush=True)
+        peers = accept(server, "secret", 2)
+else:
+    peers = connect("10.99.0.1", port, "secret", number)
+Lifeline(peers, process=number, on_loss=end_process)
+print("watches", flush=True)
+time.sleep(300)
+"""
+
+
+@pytest.fixture
+def two_machines() -> Iterator[list[str]]:
+    """Names of two network namespaces with a cable between them; the addresses are 10.99.0.1 and 10.99.0.2."""
+    if shutil.which("ip") is None:
+        pytest.skip("no `ip` that makes network namespaces")
+    names = [f"lifeline-{os.getpid()}-{number}" for number in range(2)]
+
+    def ip(*arguments: str) -> None:
+        done = subprocess.run(["ip", *arguments], capture_output=True, text=True, check=False)
+        if done.returncode:
+            pytest.skip(f"no network namespaces here: ip {' '.join(arguments)}: {done.stderr.strip()}")
+
+    try:
+        for name in names:
+            ip("netns", "add", name)
+        ip("-n", names[0], "link", "add", "cable", "type", "veth", "peer", "name", "cable", "netns", names[1])
+        for number, name in enumerate(names, 1):
+            ip("-n", name, "address", "add", f"10.99.0.{number}/24", "dev", "cable")
+            ip("-n", name, "link", "set", "cable", "up")
+        yield names
+    finally:
+        for name in names:
+            subprocess.run(["ip", "netns", "delete", name], capture_output=True, check=False)
+
+
+@pytest.mark.slow
+def test_a_machine_that_falls_silent_is_lost_within_the_stated_time(two_machines: list[str]) -> None:
+    def start(number: int, port: str) -> "subprocess.Popen[str]":
+        command = ["ip", "netns", "exec", two_machines[number], sys.executable, "-c", ONE_OF_TWO, str(number), port]
+        return subprocess.Popen(command, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+
+    first = start(0, "0")
+    assert first.stdout is not None
+    second = start(1, first.stdout.readline().strip())
+    try:
+        assert second.stdout is not None
+        assert first.stdout.readline() == second.stdout.readline() == "watches\n"
+        time.sleep(1)  # until each has the other's name
+        # Nobody closes the connection, as where a machine loses its power.
+        subprocess.run(["ip", "-n", two_machines[1], "link", "set", "cable", "down"], check=True)
+        started = time.monotonic()
+        _, errors = first.communicate(timeout=10 * SILENCE_SECONDS)
+        assert time.monotonic() - started < SILENCE_SECONDS + 5
+        where = f"process 1 on {platform.node()}"
+        assert errors == f"train.py: {where} was lost: it was killed, or its machine is gone\n"
+        assert first.returncode == 1
+    finally:
+        for process in (first, second):
+            process.kill()
+            process.communicate()
