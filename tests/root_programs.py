@@ -26,6 +26,7 @@ for line in sys.stdin:
     order = json.loads(line)
     if isinstance(order, int):
         print(os.waitstatus_to_exitcode(os.waitpid(order, 0)[1]), flush=True)
+        order = None
         continue
     child = os.fork()
     if child == 0:
