@@ -15,6 +15,7 @@ import numpy as np
 
 from logvggt_jax.data.errors import BrokenPicture
 from logvggt_jax.data.formats.calibration import numbers, pinhole, pose_from_quaternion, whole_number
+from logvggt_jax.data.formats.lens import Lens
 from logvggt_jax.data.formats.source_files import SourceFiles, read_regular
 from logvggt_jax.errors import InputError
 
@@ -40,8 +41,21 @@ _MODELS = (
     ("EQUIRECTANGULAR", 2),
 )
 _PARAMETERS = dict(_MODELS)
-# Pinholes where the parameters after focal lengths (one or two) and principal point are 0.
-_FOCAL_LENGTHS = {"SIMPLE_PINHOLE": 1, "PINHOLE": 2, "SIMPLE_RADIAL": 1, "RADIAL": 1, "OPENCV": 2}
+# Models whose parameters after focal lengths and principal point are OpenCV's, in its order: how many focal lengths,
+# and whether it is a fisheye.
+_OF_OPENCV = {
+    "SIMPLE_PINHOLE": (1, False),
+    "PINHOLE": (2, False),
+    "SIMPLE_RADIAL": (1, False),
+    "RADIAL": (1, False),
+    "OPENCV": (2, False),
+    "FULL_OPENCV": (2, False),
+    "OPENCV_FISHEYE": (2, True),
+    "SIMPLE_RADIAL_FISHEYE": (1, True),
+    "RADIAL_FISHEYE": (1, True),
+    "SIMPLE_FISHEYE": (1, True),
+    "FISHEYE": (2, True),
+}
 _MAX_SIZE = 10**6  # pixels
 _KEYPOINT_BYTES = 24
 _DEPTH_HEADER = re.compile(rb"(\d{1,6})&(\d{1,6})&(\d{1,6})&")
@@ -61,16 +75,17 @@ class ColmapCamera:
     size: tuple[int, int]
     parameters: tuple[float, ...]
 
-    def intrinsics(self) -> np.ndarray | None:
-        """Intrinsics [3, 3] float64 in pixels with centres at integers; None where the camera is no pinhole.
+    def pinhole_and_lens(self) -> tuple[np.ndarray, Lens] | None:
+        """Intrinsics [3, 3] float64 in pixels with centres at integers, and the lens before them; None for models that
+        are not among OpenCV's.
 
         The first pixel's centre is at (0.5, 0.5) for COLMAP, at (0, 0) here.
         """
-        focal_lengths = _FOCAL_LENGTHS.get(self.model)
-        if focal_lengths is None or any(self.parameters[focal_lengths + 2 :]):
+        if self.model not in _OF_OPENCV:
             return None
-        focal, (cx, cy) = self.parameters[:focal_lengths], self.parameters[focal_lengths : focal_lengths + 2]
-        return pinhole(focal[0], focal[-1], cx - 0.5, cy - 0.5)
+        count, fisheye = _OF_OPENCV[self.model]
+        focal, (cx, cy) = self.parameters[:count], self.parameters[count : count + 2]
+        return pinhole(focal[0], focal[-1], cx - 0.5, cy - 0.5), Lens(self.parameters[count + 2 :], fisheye)
 
 
 @dataclass(frozen=True)

@@ -6,17 +6,30 @@ from typing import Any
 import numpy as np
 
 from logvggt_jax.data.formats.calibration import pinhole
+from logvggt_jax.data.formats.lens import Lens
 
 TRANSFORMS_FILE = "transforms.json"
 CAMERA = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-_PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")
+# In OpenCV's order. nerfstudio's k4 of a lens that is no fisheye is another number than OpenCV's.
+_RADIAL = ("k1", "k2", "p1", "p2", "k3")
+_FISHEYE = ("k1", "k2", "k3", "k4")
+_MODELS = {
+    **dict.fromkeys(("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), _RADIAL),
+    "OPENCV_FISHEYE": _FISHEYE,
+}
 
 
-def is_pinhole(entry: Mapping[str, Any]) -> bool:
-    """Whether a camera, a frame's own values before those for all frames, is a pinhole without distortion."""
-    undistorted = not any(float(entry.get(name) or 0.0) for name in _DISTORTION)
-    return undistorted and entry.get("camera_model", "PINHOLE") in _PINHOLES
+def lens_of(entry: Mapping[str, Any]) -> Lens | None:
+    """The lens of a camera, a frame's own values before those for all frames; None for one that is not among OpenCV's.
+
+    Coefficients may be not finite.
+    """
+    model = entry.get("camera_model", "PINHOLE")
+    values = {name: float(entry.get(name) or 0.0) for name in _DISTORTION}
+    if model not in _MODELS or any(values[name] for name in _DISTORTION if name not in _MODELS[model]):
+        return None
+    return Lens(tuple(values[name] for name in _MODELS[model]), fisheye=_MODELS[model] is _FISHEYE)
 
 
 def camera_of(entry: Mapping[str, Any]) -> tuple[np.ndarray, float, float]:

@@ -20,10 +20,17 @@ from logvggt_jax.data.dataset import EVALUATION, TRAINING, About
 from logvggt_jax.data.formats.calibration import in_pixels, relative
 from logvggt_jax.data.formats.colmap_model import ColmapCamera, read_cameras, read_depth_map, read_images
 from logvggt_jax.data.formats.image import read_rgb
+from logvggt_jax.data.formats.lens import Lens
 from logvggt_jax.data.formats.ordering import natural_order
 from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame, read_depth_of
-from logvggt_jax.data.readers.own_recordings import PICTURE_SUFFIXES, file_below, find_recordings, names_beside
+from logvggt_jax.data.readers.own_recordings import (
+    PICTURE_SUFFIXES,
+    file_below,
+    find_recordings,
+    names_beside,
+    without_distortion,
+)
 from logvggt_jax.errors import InputError
 
 _DEPTH_UNITS = 1000.0
@@ -34,8 +41,11 @@ class Colmap(FolderDataset):
 
     Frames are in the natural order of their names (`img2` before `img10`). Pictures that COLMAP has not registered (`no
     pose`) do not count, nor do those without depth where the recording has any (`no depth`); without any, the frames'
-    depth is 0 throughout, no pixel valid. Cameras are `PINHOLE` or `SIMPLE_PINHOLE`, or `SIMPLE_RADIAL`, `RADIAL` or
-    `OPENCV` without distortion; others are refused. Pictures may be resized copies: the intrinsics follow their size.
+    depth is 0 throughout, no pixel valid. Pictures may be resized copies: the intrinsics follow their size.
+
+    Lens distortion is taken out while a frame is read: picture and depth are those of a pinhole of the same size, focal
+    lengths and principal point, where nothing was seen black with depth 0. That is so for OpenCV's models:
+    `SIMPLE_RADIAL`, `RADIAL`, `OPENCV`, `FULL_OPENCV`, and `OPENCV_FISHEYE` with its simpler forms; others are refused.
     """
 
     name = "colmap"
@@ -45,7 +55,7 @@ class Colmap(FolderDataset):
     splits = ("all",)
     own = True
     about = About(
-        source="photograph it and run COLMAP; undistort with `colmap image_undistorter` and pass its output folder",
+        source="photograph it and run COLMAP",
         licence="your own",
         size="your own",
         roles=(TRAINING, EVALUATION),
@@ -62,9 +72,8 @@ class Colmap(FolderDataset):
         images = [images[position] for position in natural_order([image.name for image in images])]
         paths = [file_below(pictures, image.name, image_file) for image in images]
         names = {pictures: set(files.names(pictures, self.expects)), **names_beside(files, paths, image_file)}
-        intrinsics = {
-            number: _intrinsics(cameras, number, camera_file, image_file) for number in {i.camera for i in images}
-        }
+        used = {image.camera for image in images}
+        known = {number: _camera(cameras, number, camera_file, image_file) for number in used}
         there = {each / name for each, held in names.items() for name in held}
         yield from (Dropped("no pose") for path in there - set(paths) if path.suffix.lower() in PICTURE_SUFFIXES)
         depths = _depth_files(files, folder, [image.name for image in images])
@@ -73,29 +82,32 @@ class Colmap(FolderDataset):
             if depth is None:
                 yield Dropped("no depth")
                 continue
-            others = {"name": image.name, "calibration": camera_file}
-            yield frame(path, depth, intrinsics[image.camera], image.extrinsics, **others)
+            intrinsics, lens = known[image.camera]
+            others = {"name": image.name, "calibration": camera_file, "lens": lens.row}
+            yield frame(path, depth, intrinsics, image.extrinsics, **others)
 
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         image = read_rgb(record.image)
         is_map = record.depth.suffix == ".bin"
         depth = read_depth_map(record.depth) if is_map else read_depth_of(record, image, _DEPTH_UNITS)
-        return image, depth, in_pixels(record.intrinsics, image.shape[:2], record.image, record.calibration)
+        intrinsics = in_pixels(record.intrinsics, image.shape[:2], record.image, record.calibration)
+        return without_distortion(record, image, depth, intrinsics)
 
 
-def _intrinsics(cameras: Mapping[int, ColmapCamera], number: int, path: Path, image_file: Path) -> np.ndarray:
-    """Intrinsics [3, 3] of a picture of one pixel."""
+def _camera(cameras: Mapping[int, ColmapCamera], number: int, path: Path, image_file: Path) -> tuple[np.ndarray, Lens]:
+    """Intrinsics [3, 3] of a picture of one pixel, and the lens."""
     if number not in cameras:
         raise InputError(f"{path}: no camera {number}, which {image_file} names: export the model again")
     camera = cameras[number]
-    matrix = camera.intrinsics()
-    if matrix is None:
+    known = camera.pinhole_and_lens()
+    if known is None:
         raise InputError(
-            f"{path}: camera {number} is {camera.model} with distortion, frames need a pinhole: run `colmap "
+            f"{path}: camera {number} is {camera.model} with distortion that is not among OpenCV's: run `colmap "
             f"image_undistorter --image_path <images> --input_path {path.parent} --output_path <new folder>` and pass "
             "the new folder"
         )
-    return relative(matrix, camera.size)
+    matrix, lens = known
+    return relative(matrix, camera.size), lens
 
 
 def _depth_files(files: SourceFiles, folder: Path, names: Sequence[str]) -> dict[str, Path]:

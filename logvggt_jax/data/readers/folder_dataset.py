@@ -9,7 +9,7 @@ import zipfile
 import zlib
 from collections import Counter, OrderedDict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
@@ -20,6 +20,7 @@ from logvggt_jax.data.dataset import Reader, check_indices, check_sequence, chec
 from logvggt_jax.data.errors import EmptySequence, MissingFiles, UnequalSizes
 from logvggt_jax.data.formats.calibration import check_intrinsics
 from logvggt_jax.data.formats.image import read_depth
+from logvggt_jax.data.formats.lens import Lens
 from logvggt_jax.data.formats.source_files import SourceFiles, refused
 from logvggt_jax.data.readers.listing_index import ListingIndex, code_digest
 from logvggt_jax.errors import InputError
@@ -45,9 +46,10 @@ class FrameRecord:
     calibration: Path | None = None  # the file that the intrinsics are from, for messages; None: constants of the set
     depth_scale: float = 1.0  # factor on the stored depth, where frames differ
     quarter_turns: int = 0  # counter-clockwise quarter turns from the stored picture to the one handed out
+    lens: np.ndarray = field(default_factory=lambda: Lens().row)  # of the stored picture, as `Lens.row` has it
 
 
-_FIELDS = tuple(field.name for field in fields(FrameRecord))
+_FIELDS = tuple(each.name for each in fields(FrameRecord))
 _PATHS = ("image", "depth", "companion", "calibration")
 
 

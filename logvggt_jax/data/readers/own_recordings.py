@@ -1,10 +1,16 @@
-"""What readers of people's own recordings share: which folders are one, and the files that a list in it names."""
+"""What readers of people's own recordings share: which folders are one, the files that a list in it names, and pictures
+with lens distortion."""
 
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path, PurePosixPath
 
-from logvggt_jax.data.errors import missing_files
+import numpy as np
+
+from logvggt_jax.data.errors import AbsurdIntrinsics, missing_files
+from logvggt_jax.data.formats.calibration import check_intrinsics
+from logvggt_jax.data.formats.lens import Lens
 from logvggt_jax.data.formats.source_files import SourceFiles
+from logvggt_jax.data.readers.folder_dataset import FrameRecord
 from logvggt_jax.errors import InputError
 
 PICTURE_SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
@@ -37,3 +43,24 @@ def names_beside(files: SourceFiles, paths: Iterable[Path], named_by: Path) -> d
     if absent := [path for path in paths if path.name not in names[path.parent]]:
         raise missing_files(dict.fromkeys(absent, f"but {named_by} names it; copy it there"))
     return names
+
+
+def without_distortion(
+    record: FrameRecord, image: np.ndarray, depth: np.ndarray, intrinsics: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What `_read_frame` returns of a frame's stored picture [H, W, 3] and depth [h, w]: as a pinhole takes them, of
+    the same size and with the same `intrinsics` [3, 3], see `Lens.as_pinhole`.
+
+    Raises AbsurdIntrinsics naming the calibration where the picture has nothing of that.
+    """
+    lens = Lens.of_row(record.lens)
+    if lens.is_pinhole or depth.shape != image.shape[:2]:  # which the caller refuses, naming both
+        return image, depth, intrinsics
+    check_intrinsics(intrinsics, image.shape[:2], record.image, record.calibration)
+    found = lens.as_pinhole(image, depth, intrinsics)
+    if found is None:
+        raise AbsurdIntrinsics(
+            f"{record.calibration}: nothing of {record.image.name} is left without its distortion "
+            f"({', '.join(f'{value:g}' for value in lens.coefficients)}): calibrate again"
+        )
+    return *found, intrinsics

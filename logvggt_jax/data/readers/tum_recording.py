@@ -14,8 +14,9 @@ Layout: the root is a recording, or holds folders that are recordings. A recordi
       cx 319.5
       cy 239.5
       depth_scale 1000   units of the 16-bit depth in a metre; left out: 5000, as in TUM RGB-D
+      k1 -0.05           distortion k1, k2, p1, p2, k3 as OpenCV has it; left out: 0
 
-Times are seconds; `#` starts a comment. Pictures are undistorted, and depth lies in their pixels.
+Times are seconds; `#` starts a comment. Depth lies in the pictures' pixels.
 """
 
 from collections.abc import Iterator, Mapping
@@ -27,9 +28,10 @@ from logvggt_jax.data.dataset import EVALUATION, TRAINING, About
 from logvggt_jax.data.errors import AbsurdIntrinsics
 from logvggt_jax.data.formats.calibration import in_pixels, numbers, pinhole, relative, whole_number
 from logvggt_jax.data.formats.image import read_rgb
+from logvggt_jax.data.formats.lens import Lens
 from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame, read_depth_of
-from logvggt_jax.data.readers.own_recordings import find_recordings
+from logvggt_jax.data.readers.own_recordings import find_recordings, without_distortion
 from logvggt_jax.data.readers.timed_rgbd import (
     UNITS_PER_METRE,
     Trajectory,
@@ -43,6 +45,7 @@ from logvggt_jax.errors import InputError
 _CALIBRATION = "calibration.txt"
 _NEEDED = ("width", "height", "fx", "fy", "cx", "cy")
 _DEPTH_SCALE = "depth_scale"
+_DISTORTION = ("k1", "k2", "p1", "p2", "k3")
 _MAX = 1e6  # pixels, and units of depth a metre
 
 
@@ -52,6 +55,9 @@ class TUMRecording(FolderDataset):
     Depth and pose of a picture are those nearest in time, less than 0.02 s away; pictures without depth or without a
     pose that near are dropped. Without any depth the frames' depth is 0 throughout, no pixel valid. Pictures may be
     resized copies: the intrinsics follow their size.
+
+    Lens distortion is taken out while a frame is read: picture and depth are those of a pinhole of the same size, focal
+    lengths and principal point, where nothing was seen black with depth 0.
     """
 
     name = "tum_recording"
@@ -78,7 +84,7 @@ class TUMRecording(FolderDataset):
     def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
         own = folder / _CALIBRATION
         calibration = own if files.exists(own) or folder == self.root else self.root / _CALIBRATION
-        intrinsics, units = _camera(files, calibration)
+        intrinsics, lens, units = _camera(files, calibration)
         times, images = _stream(folder, "rgb", files)
         trajectory = Trajectory(folder / "groundtruth.txt", files)
         pose_of = associate(times, trajectory.times)
@@ -92,7 +98,7 @@ class TUMRecording(FolderDataset):
                 yield Dropped("no depth")
                 continue
             extrinsics = trajectory.extrinsics(pose_index) if pose_index >= 0 else None
-            others = {"depth_scale": 1 / units, "calibration": calibration}
+            others = {"depth_scale": 1 / units, "calibration": calibration, "lens": lens.row}
             yield frame(image, depths[depth_index], intrinsics, extrinsics, **others)
 
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -109,7 +115,7 @@ class TUMRecording(FolderDataset):
                 f"{1 / record.depth_scale:g} in {record.calibration}: give the units of the files in a metre there "
                 "(`logvggt data check tum_recording` tells more)"
             )
-        return image, depth, intrinsics
+        return without_distortion(record, image, depth, intrinsics)
 
 
 def _stream(folder: Path, kind: str, files: SourceFiles) -> tuple[np.ndarray, list[Path]]:
@@ -118,9 +124,9 @@ def _stream(folder: Path, kind: str, files: SourceFiles) -> tuple[np.ndarray, li
     return listed_files(listing, files) if files.exists(listing) else named_files(folder / kind, files)
 
 
-def _camera(files: SourceFiles, path: Path) -> tuple[np.ndarray, float]:
-    """Intrinsics [3, 3] of a picture of one pixel, and units of depth a metre."""
-    known = (*_NEEDED, _DEPTH_SCALE)
+def _camera(files: SourceFiles, path: Path) -> tuple[np.ndarray, Lens, float]:
+    """Intrinsics [3, 3] of a picture of one pixel, the lens, and units of depth a metre."""
+    known = (*_NEEDED, _DEPTH_SCALE, *_DISTORTION)
     values: dict[str, float] = {}
     for line, text in content_lines(files.text(path, f"the calibration, lines 'name value' of {', '.join(known)}")):
         name, _, value = text.partition(" ")
@@ -137,6 +143,7 @@ def _camera(files: SourceFiles, path: Path) -> tuple[np.ndarray, float]:
     if not (min(size) >= 1 and max(size) <= _MAX and 1 <= units <= _MAX):
         raise InputError(f"{path}: width, height and depth_scale must be from 1 to {_MAX:g}: edit the file")
     intrinsics = pinhole(*(values[name] for name in ("fx", "fy", "cx", "cy")))
-    if not np.isfinite(intrinsics).all():
-        raise AbsurdIntrinsics(f"{path}: intrinsics must be finite: edit the file")
-    return relative(intrinsics, size), units
+    lens = Lens(tuple(values.get(name, 0.0) for name in _DISTORTION))
+    if not (np.isfinite(intrinsics).all() and np.isfinite(lens.coefficients).all()):
+        raise AbsurdIntrinsics(f"{path}: intrinsics must be finite, distortion too: edit the file")
+    return relative(intrinsics, size), lens, units

@@ -9,7 +9,7 @@ import numpy as np
 
 from logvggt_jax.data.formats.calibration import OPENGL_AXES, check_intrinsics, world_to_camera
 from logvggt_jax.data.formats.colmap_model import read_cameras, read_images
-from logvggt_jax.data.formats.nerfstudio_transforms import CAMERA, TRANSFORMS_FILE, camera_of, is_pinhole
+from logvggt_jax.data.formats.nerfstudio_transforms import CAMERA, TRANSFORMS_FILE, camera_of, lens_of
 from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.errors import InputError, MissingInput, disk_errors
 from logvggt_jax.files import read_json, user_path
@@ -83,7 +83,9 @@ def _colmap(folder: Path) -> list[ExternalPose]:
         if image.camera not in cameras:
             raise InputError(f"{file}: {image.name!r} has camera {image.camera}, which is not there: export it again")
         camera = cameras[image.camera]
-        poses.append(ExternalPose(image.name, None, image.extrinsics, camera.intrinsics(), camera.size))
+        known = camera.pinhole_and_lens()
+        intrinsics = known[0] if known is not None and known[1].is_pinhole else None
+        poses.append(ExternalPose(image.name, None, image.extrinsics, intrinsics, camera.size))
     return poses
 
 
@@ -106,7 +108,8 @@ def _nerfstudio_frame(document: dict[str, Any], frame: dict[str, Any], path: Pat
     extrinsics = world_to_camera(pose @ OPENGL_AXES, f"{path}, {name!r}", stored="camera_to_world")
     assert extrinsics is not None  # it is finite
     values = {**document, **frame}
-    if not is_pinhole(values) or any(key not in values for key in CAMERA):
+    lens = lens_of(values)
+    if lens is None or not lens.is_pinhole or any(key not in values for key in CAMERA):
         return ExternalPose(name, None, extrinsics)
     intrinsics, height, width = camera_of(values)
     return ExternalPose(name, None, extrinsics, intrinsics, (int(height), int(width)))

@@ -60,7 +60,10 @@ LAYOUT = Layout(
     damages=(
         (r"transforms\.json: not JSON", written(TABLE, '{"frames": [')),
         (r"transforms\.json: expected an object with a list", written(TABLE, '{"w": 3}')),
-        (r"frames\[3\]: OPENCV with distortion", changed(TABLE, lambda x: x.replace(b'"k1": 0.0', b'"k1": 0.1'))),
+        (r"frames\[3\]: OPENCV with distortion", changed(TABLE, lambda x: x.replace(b'"k1": 0.0', b'"k4": 0.1'))),
+        (r"frames\[3\]: OPENCV with distortion", changed(TABLE, lambda x: x.replace(b'"k1": 0.0', b'"k1": NaN'))),
+        (r"frames\[3\]: FOV with distortion", changed(TABLE, lambda x: x.replace(b'"OPENCV"', b'"FOV"'))),
+        (r"json: nothing of frame_\d+\.png", changed(TABLE, lambda x: x.replace(b'"k1": 0.0', b'"k1": -1e300'))),
         (r"frames\[3\]: no fl_y", changed(TABLE, lambda x: x.replace(b'"fl_y"', b'"fl"'))),
         (
             r"'\.\./frame_9\.png' is no file's name",

@@ -41,12 +41,13 @@ LAYOUT = Layout(
     damages=(
         (r"calibration\.txt: no such file", removed(TABLES[3])),
         (r"calibration\.txt: no line fx, cy", relined(TABLES[3], lambda lines: [*lines[:3], *lines[4:6]])),
-        (r"calibration\.txt, line 8: expected each of .* got 'k1'", written(TABLES[3], f"{CALIBRATION}k1 0.1\n")),
+        (r"calibration\.txt, line 8: expected each of .* got 'k4'", written(TABLES[3], f"{CALIBRATION}k4 0.1\n")),
         (r"calibration\.txt, line 8: expected each of .* got 'fx'", written(TABLES[3], f"{CALIBRATION}fx 50\n")),
         (r"calibration\.txt, line 8: expected 1 numbers, got 0", written(TABLES[3], f"{CALIBRATION}depth_scale\n")),
         (r"calibration\.txt: .* depth_scale must be from 1", written(TABLES[3], f"{CALIBRATION}depth_scale 0\n")),
         (r"calibration\.txt: expected a whole number", relined(TABLES[3], lambda lines: ["width inf", *lines[2:]])),
         (r"calibration\.txt: intrinsics must be finite", relined(TABLES[3], lambda x: [*x[:3], "fx nan", *x[4:]])),
+        (r"calibration\.txt: .* distortion too", written(TABLES[3], f"{CALIBRATION}k1 nan\n")),
         (r"calibration\.txt: intrinsics fx=", relined(TABLES[3], lambda x: [*x[:3], "fx 1", "fy 1", *x[5:]])),
     ),
 )

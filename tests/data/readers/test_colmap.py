@@ -76,6 +76,7 @@ def test_pictures_without_depth_or_registration_do_not_count(tmp_path: Path):
         ("SIMPLE_RADIAL {0} {1} 56 {4} {5} 0", 56),
         ("RADIAL {0} {1} 57 {4} {5} 0 0.0", 57),
         ("OPENCV {0} {1} 58 58 {4} {5} 0 0 0 0", 58),
+        ("FULL_OPENCV {0} {1} 59 59 {4} {5} 0 0 0 0 0 0 0 0", 59),
     ],
 )
 def test_cameras_without_distortion_are_pinholes(tmp_path: Path, camera: str, focal: float):
@@ -89,13 +90,13 @@ def test_cameras_without_distortion_are_pinholes(tmp_path: Path, camera: str, fo
 @pytest.mark.parametrize(
     "camera",
     [
-        "SIMPLE_RADIAL {0} {1} 55 {4} {5} 0.01",
-        "OPENCV {0} {1} 55 55 {4} {5} 0 0 0 1e-4",
-        "OPENCV_FISHEYE {0} {1} 55 55 {4} {5} 0 0 0 0",
         "FOV {0} {1} 55 55 {4} {5} 0.2",
+        "SIMPLE_DIVISION {0} {1} 55 {4} {5} 0.1",
+        "THIN_PRISM_FISHEYE {0} {1} 55 55 {4} {5} 0 0 0 0 0 0 0 0",
+        "EQUIRECTANGULAR {0} {1} {0} {1}",
     ],
 )
-def test_distorted_cameras_are_refused_by_name_with_the_mend(tmp_path: Path, camera: str):
+def test_distortion_that_is_not_opencvs_is_refused_by_name_with_the_mend(tmp_path: Path, camera: str):
     write_pictures(tmp_path, VIEWS)
     write_text_model(tmp_path / "sparse/0", VIEWS, camera)
     with pytest.raises(InputError, match=rf"cameras\.txt: camera 3 is {camera.split()[0]} .*colmap image_undistorter"):
