@@ -56,6 +56,13 @@ SHORT = (
     "--config.save_every=4",
     "--validation_source=none",
 )
+# One line for each program that is compiled or read.
+TOLD = """
+import jax.monitoring
+jax.monitoring.register_event_listener(
+    lambda event, **_: print(event.removeprefix("/jax/compilation_cache/"), file=sys.stderr)
+)
+"""
 # A run that stands still once the line of step 6 is written: there it is killed, however fast the machine is.
 STANDS_STILL = """
 import time
@@ -70,7 +77,8 @@ loop.MetricsLog.write = stand_still
 
 def test_a_killed_run_ends_as_one_that_was_left_alone(programs: RootPrograms, tmp_path: Path) -> None:
     def start(name: str, *, patch: str = "") -> Running:
-        return programs.start("train.py", *SHORT, f"--workdir={tmp_path / name}", first=PIXEL_MODEL + patch)
+        own = (f"--workdir={tmp_path / name}", f"--compilation_cache={tmp_path / 'cache'}")
+        return programs.start("train.py", *SHORT, *own, first=PIXEL_MODEL + TOLD + patch)
 
     killed = start("killed", patch=STANDS_STILL)
     written, saved = tmp_path / "killed" / "metrics.jsonl", tmp_path / "killed" / "checkpoints" / "4"
@@ -80,9 +88,12 @@ def test_a_killed_run_ends_as_one_that_was_left_alone(programs: RootPrograms, tm
         time.sleep(0.02)
     killed.send_signal(signal.SIGKILL)
     assert killed.wait() == -signal.SIGKILL
-    # Both read the programs that the first one compiled.
     resumed, alone = start("killed"), start("alone")
     assert [resumed.wait(), alone.wait()] == [0, 0], resumed.error.read_text() + alone.error.read_text()
+    # The step, of which both stages have the same, is compiled once and read twice.
+    assert len(list((tmp_path / "cache").glob("jit_on_all_devices-*-cache"))) == 1
+    first, *later = (run.error.read_text().splitlines() for run in (killed, alone, resumed))
+    assert "cache_misses" in first and all("cache_hits" in told for told in later) and "cache_misses" not in later[0]
     assert "4/10 steps done, results in" in resumed.output.read_text()
 
     ends = [tmp_path / name for name in ("alone", "killed")]

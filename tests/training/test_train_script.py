@@ -5,8 +5,10 @@ import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
+from orbax.checkpoint import StandardCheckpointer
 from root_programs import RootPrograms
 
 from logvggt_jax.training.reporting.metrics_log import read_metrics
@@ -59,6 +61,21 @@ def test_a_real_model_is_trained_validated_and_saved(begun: Path) -> None:
         assert set(variables["params"]) >= {"encoder", "aggregator", "camera_head", "depth_head"}
         training = read_provenance(begun / name).training
         assert training is not None and training.steps == steps
+
+
+def test_gradients_reach_all_that_is_trained(begun: Path) -> None:
+    """By Adam's first moments; GCCR's output, which begins at zero, hides its other layers, and nothing is masked."""
+    state = StandardCheckpointer().restore(begun / "checkpoints" / "1" / "state")
+    reached, silent = set(), set()
+    for path, moment in jax.tree_util.tree_leaves_with_path(state["opt_state"]):
+        keys = [getattr(key, "key", None) for key in path]
+        if "mu" in keys:
+            module, layer, *_ = keys[keys.index("mu") + 1 :]
+            assert np.isfinite(moment).all(), (module, layer)
+            (reached if np.any(moment) else silent).add((module, layer))
+    hidden = {("gccr", layer) for layer in ("camera_norm", "key", "query", "register_norm", "value")}
+    assert silent == {("encoder", "mask_token"), *hidden}
+    assert {module for module, _ in reached} == {"encoder", "aggregator", "camera_head", "depth_head", "gccr"}
 
 
 @pytest.mark.slow

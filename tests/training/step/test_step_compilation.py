@@ -8,8 +8,6 @@ from typing import Any
 
 import jax
 import pytest
-from pixel_program import PIXEL_MODEL, PIXEL_SETTINGS
-from root_programs import RootPrograms
 
 from logvggt_jax.errors import InputError
 from logvggt_jax.training import loop
@@ -111,32 +109,3 @@ def test_only_sizes_that_occur_are_compiled_before_the_first_step_and_the_termin
     assert (
         sum(bool(re.search(r"step for images of 28 x 42 compiled after \d+ s, 1 of 1$", line)) for line in lines) == 2
     )
-
-
-def test_a_second_run_reads_its_steps_from_the_cache(programs: RootPrograms, tmp_path: Path) -> None:
-    # One line for each program that is compiled or read.
-    told = """
-import jax.monitoring
-jax.monitoring.register_event_listener(
-    lambda event, **_: print(event.removeprefix("/jax/compilation_cache/"), file=sys.stderr)
-)
-"""
-    steps = [f"--config.stages.stage_{number}.{one}" for number in (1, 2) for one in ("steps=1", "clip_length=2")]
-    cache = tmp_path / "cache"
-    said = []
-    for run in ("first", "second"):
-        done = programs(
-            "train.py",
-            *PIXEL_SETTINGS,
-            *steps,
-            "--validation_source=none",
-            f"--workdir={tmp_path / run}",
-            f"--compilation_cache={cache}",
-            first=PIXEL_MODEL + told,
-        )
-        assert done.returncode == 0, done.stderr
-        said.append(done.stderr.splitlines())
-        # The step; both stages have the same.
-        assert len(list(cache.glob("jit_on_all_devices-*-cache"))) == 1
-    assert "cache_misses" in said[0]
-    assert "cache_hits" in said[1] and "cache_misses" not in said[1]
