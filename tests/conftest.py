@@ -5,6 +5,7 @@ import gc
 import inspect
 import multiprocessing
 import os
+import pickle
 import resource
 import sys
 import time
@@ -236,11 +237,20 @@ def small_config() -> ModelConfig:
 
 
 @pytest.fixture(scope="session")
-def small_variables(small_config: ModelConfig) -> dict:
+def small_variables(small_config: ModelConfig, tmp_path_factory: pytest.TempPathFactory) -> dict:
     """Parameters of the small model, all of them moved off their initial value: no gate is zero."""
+    # Drawing them takes seconds, which one test process of several spends for all.
+    drawn = tmp_path_factory.getbasetemp().parent / "small_variables.pickle"
+    if "PYTEST_XDIST_WORKER" in os.environ and drawn.exists():
+        return pickle.loads(drawn.read_bytes())
     images = np.zeros((1, 1, 28, 42, 3), np.float32)
     variables = LogVGGT(small_config).init(jax.random.key(0), images)
     generator = np.random.default_rng(0)
-    return jax.tree.map(
+    moved = jax.tree.map(
         lambda x: x + 0.1 * generator.standard_normal(x.shape).astype(np.float32), jax.device_get(variables)
     )
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        own = drawn.with_suffix(f".{os.getpid()}")
+        own.write_bytes(pickle.dumps(moved))
+        own.replace(drawn)
+    return moved
