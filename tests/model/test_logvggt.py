@@ -90,6 +90,7 @@ def test_a_thawed_encoder_is_trained_and_rematerialisation_changes_no_gradient(s
         )
 
 
+@pytest.mark.slow
 def test_training_runs_a_frozen_encoder_once_a_frame(small_config):
     """A deeper encoder makes the gradient dearer by its forward pass alone, rematerialisation or not."""
 

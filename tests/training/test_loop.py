@@ -108,8 +108,8 @@ def _same(a: Any, b: Any) -> None:
     jax.tree.map(np.testing.assert_array_equal, jax.device_get(a), jax.device_get(b))
 
 
-# In the middle of a stage, and just after the next one has begun.
-@pytest.mark.parametrize("kill_at", [4, 5])
+# Just after a stage has begun; in the middle of one, see test_kills.py, where the process is killed.
+@pytest.mark.parametrize("kill_at", [pytest.param(4, marks=pytest.mark.slow), 5])
 def test_killed_run_goes_on_to_the_same_numbers(
     run_config: TrainConfig, straight: tuple[TrainState, Path], tmp_path: Path, kill_at: int
 ) -> None:
