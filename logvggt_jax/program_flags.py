@@ -10,6 +10,9 @@ from ml_collections import config_flags
 
 from logvggt_jax.errors import one_line
 
+# A flag belongs to the program that asks for it here, whose --help lists it.
+flags.disclaim_key_flags()
+
 
 def define_config(program: str, what: str) -> flags.FlagHolder:
     """The flag --config, for whose default the library reads the command line at once: a --flagfile in it may fail."""

@@ -72,9 +72,10 @@ def _backward(saved: tuple[jax.Array, jax.Array], gradient: jax.Array) -> tuple[
 
 
 def _by_convolutions(x: jax.Array, kernel: jax.Array, gradient: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """As JAX differentiates a convolution."""
-    _, pull_back = jax.vjp(lambda x, kernel: _convolve(x, kernel, 1), x, kernel)
-    return pull_back(gradient)
+    """As JAX differentiates a convolution, which is linear in each of the two."""
+    (x_gradient,) = jax.linear_transpose(lambda x: _convolve(x, kernel, 1), x)(gradient)
+    (kernel_gradient,) = jax.linear_transpose(lambda kernel: _convolve(x, kernel, 1), kernel)(gradient)
+    return x_gradient, kernel_gradient
 
 
 def _by_products(x: jax.Array, kernel: jax.Array, gradient: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -62,6 +62,10 @@ def test_what_cannot_be_used_is_one_line(
     assert result.stderr.count("\n") == 1 and message in result.stderr and not output.exists()
 
 
+def test_help_lists_the_configuration(run_eval: Callable) -> None:
+    assert "--config:" in run_eval("--help").stdout
+
+
 def test_ctrl_c_is_one_line(run_eval: Callable, tmp_path: Path) -> None:
     config = tmp_path / "config.py"
     config.write_text("def get_config():\n    raise KeyboardInterrupt\n")

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from logvggt_jax.model.convolution import Convolution
+from logvggt_jax.operations import count_flops
 
 
 def reference(x, kernel, bias, strides):
@@ -62,6 +63,7 @@ def test_gradients_have_the_form_of_the_platform_that_they_are_lowered_for(platf
     gradients = jax.jit(jax.grad(lambda variables, x: (layer.apply(variables, x) ** 2).sum(), argnums=(0, 1)))
     program = gradients.trace(variables, x).lower(lowering_platforms=(platform,)).as_text()
     assert (program.count("stablehlo.convolution"), program.count("stablehlo.dot_general")) == (convolutions, products)
+    assert count_flops(gradients, variables, x) == 3 * count_flops(layer.apply, variables, x)
 
 
 def test_bfloat16_computes_in_bfloat16():

@@ -25,7 +25,8 @@ def lens_of(entry: Mapping[str, Any]) -> Lens | None:
 
     Coefficients may be not finite.
     """
-    model = entry.get("camera_model", "PINHOLE")
+    # instant-ngp's form of the file has a field of its own.
+    model = entry.get("camera_model") or ("OPENCV_FISHEYE" if entry.get("is_fisheye") else "PINHOLE")
     values = {name: float(entry.get(name) or 0.0) for name in _DISTORTION}
     if model not in _MODELS or any(values[name] for name in _DISTORTION if name not in _MODELS[model]):
         return None

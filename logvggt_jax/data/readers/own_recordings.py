@@ -13,6 +13,8 @@ from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.data.readers.folder_dataset import FrameRecord
 from logvggt_jax.errors import InputError
 
+# OpenCV's limit for a side of what it maps.
+_MOST_PIXELS = 2**15 - 1
 PICTURE_SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
 
 
@@ -56,6 +58,11 @@ def without_distortion(
     lens = Lens.of_row(record.lens)
     if lens.is_pinhole or depth.shape != image.shape[:2]:  # which the caller refuses, naming both
         return image, depth, intrinsics
+    if max(depth.shape) >= _MOST_PIXELS:
+        raise InputError(
+            f"{record.image}: {depth.shape[1]} x {depth.shape[0]} pixels with lens distortion, which is taken out of "
+            f"less than {_MOST_PIXELS:,} a side: make it smaller"
+        )
     check_intrinsics(intrinsics, image.shape[:2], record.image, record.calibration)
     found = lens.as_pinhole(image, depth, intrinsics)
     if found is None:

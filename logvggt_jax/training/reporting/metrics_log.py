@@ -64,6 +64,9 @@ class MetricsLog:
         times = workdir / TIMES_NAME
         with disk_errors(workdir):
             workdir.mkdir(parents=True, exist_ok=True)
+            # Before the lines of steps that were lost go: the clock stays set.
+            earlier = read_metrics(times) if times.exists() else []
+            set_by = [entry[_CLOCK_SET] for entry in earlier if _CLOCK_SET in entry]
             _drop_lines(self.path, beginning=0 if anew else first_step + 1)
             # The goodput counts from the first start, whatever its settings were.
             _drop_lines(times, beginning=first_step + 1)
@@ -73,10 +76,14 @@ class MetricsLog:
         known = [entry for entry in read_metrics(times) if {"time", "productive_seconds"} <= entry.keys()]
         if known:
             self._started = known[0]["time"]
-            self._was_set = any(_CLOCK_SET in entry for entry in known)
             self.productive_seconds = known[-1]["productive_seconds"]
         else:
             self.write_times(first_step, {"productive_seconds": 0.0})
+        if set_by:
+            self._was_set = True
+            if not any(_CLOCK_SET in entry for entry in known):
+                kept = {"productive_seconds": self.productive_seconds, _CLOCK_SET: set_by[-1]}
+                self.write_times(first_step, kept)
 
     def __enter__(self) -> MetricsLog:
         return self

@@ -16,7 +16,8 @@ _SHOWN = 16
 def clips_to_blame(
     finite: jax.Array, names: Sequence[str], exchange: Callable[[str], Sequence[str | None]]
 ) -> tuple[list[str], str]:
-    """The clips of an update that was left out, and in words what is wrong with them; the same on all processes.
+    """The clips of an update that was left out, and in words what is wrong with them; the same on all processes
+    that hear one another.
 
     Args:
       finite: bool [B], of `make_train_step`, split over the devices.

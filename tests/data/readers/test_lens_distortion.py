@@ -3,6 +3,8 @@
 import json
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,6 +14,9 @@ from room_views import millimetres, write_image
 
 from logvggt_jax.data import open_dataset
 from logvggt_jax.data.errors import AbsurdIntrinsics
+from logvggt_jax.data.formats.lens import Lens
+from logvggt_jax.data.readers.own_recordings import without_distortion
+from logvggt_jax.errors import InputError
 from logvggt_jax.frames import Frames
 
 SIZE = HEIGHT, WIDTH = 120, 160
@@ -98,6 +103,8 @@ CASES = [
         [0.02, -0.01, 0.003, 0.001],
         True,
     ),
+    # As instant-ngp writes it.
+    ("nerfstudio", nerfstudio(camera_model=None, is_fisheye=True, k1=0.02, k2=-0.01), [0.02, -0.01, 0, 0], True),
     ("tum_recording", tum(k1=-0.1, k2=0.02, p1=0.01, p2=-0.01, k3=0.01), [-0.1, 0.02, 0.01, -0.01, 0.01], False),
 ]
 
@@ -177,3 +184,10 @@ def test_a_resized_copy_is_undistorted_in_its_own_pixels(tmp_path: Path) -> None
 def test_a_lens_that_leaves_nothing_is_named(tmp_path: Path) -> None:
     with pytest.raises(AbsurdIntrinsics, match=r"cameras\.txt: nothing of frame\.png is left without its distortion"):
         read(tmp_path, "colmap", colmap("SIMPLE_RADIAL -1e9"), np.zeros((*SIZE, 3), np.uint8), np.ones(SIZE))
+
+
+def test_a_picture_that_opencv_cannot_map_is_refused() -> None:
+    record: Any = SimpleNamespace(lens=Lens((0.1,)).row, image=Path("wide.png"))
+    picture = np.zeros((2, 2**15, 3), np.uint8)
+    with pytest.raises(InputError, match=r"wide\.png: 32768 x 2 pixels with lens distortion.* make it smaller"):
+        without_distortion(record, picture, np.zeros(picture.shape[:2], np.float32), INTRINSICS)

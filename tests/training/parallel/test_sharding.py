@@ -137,7 +137,7 @@ FROZEN = ("aggregator/*", "depth_head/[!o]*")
 
 def _one_real_step(config: TrainConfig, clips: Clips, *, shard: bool) -> Outcome:
     """A step of LoG-VGGT on two devices, from parameters of which no gate is zero."""
-    optimizer = dataclasses.replace(config.optimizer, frozen=FROZEN, warmup_fraction=0.0)
+    optimizer = dataclasses.replace(config.optimizer, frozen=FROZEN, warmup_fraction=0.0, weight_decay=0.0)
     config = dataclasses.replace(config, optimizer=optimizer, shard_parameters=shard)
     two = {name: value[3:5, :2] for name, value in clips.items() if name != "frame_mask"}
     return steps(LogVGGT(config.model), config, _real_parameters(config.model), two, data_mesh(2), 1)
