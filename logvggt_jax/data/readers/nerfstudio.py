@@ -4,8 +4,8 @@ Layout: the root is such a recording, or holds folders that are. `transforms.jso
 
 - `fl_x`, `fl_y`, `cx`, `cy`, `w`, `h`, for all frames, or in each of them where cameras differ; pixels, the centre of
   the first one at (0.5, 0.5). Of distortion `k1`, `k2`, `k3`, `p1`, `p2`, or with the `camera_model` `OPENCV_FISHEYE`
-  `k1` … `k4`, each 0 where it is left out; other models than `PINHOLE`, `SIMPLE_PINHOLE`, `SIMPLE_RADIAL`, `RADIAL`,
-  `OPENCV` and that are refused;
+  (or instant-ngp's `is_fisheye`) `k1` … `k4`, each 0 where it is left out; other models than `PINHOLE`,
+  `SIMPLE_PINHOLE`, `SIMPLE_RADIAL`, `RADIAL`, `OPENCV` and that are refused;
 - `frames`, each with a `file_path` relative to the recording, a `transform_matrix` (camera-to-world, [4, 4], axes of
   OpenGL: x right, y up, z back) and for depth a `depth_file_path`: 16-bit, thousandths of the poses' unit of length, 0
   where invalid, z and not ray length.

@@ -53,7 +53,8 @@ def without_distortion(
     """What `_read_frame` returns of a frame's stored picture [H, W, 3] and depth [h, w]: as a pinhole takes them, of
     the same size and with the same `intrinsics` [3, 3], see `Lens.as_pinhole`.
 
-    Raises AbsurdIntrinsics naming the calibration where the picture has nothing of that.
+    Raises AbsurdIntrinsics naming the calibration where the picture has nothing of that, InputError naming a picture
+    that is too large for OpenCV.
     """
     lens = Lens.of_row(record.lens)
     if lens.is_pinhole or depth.shape != image.shape[:2]:  # which the caller refuses, naming both

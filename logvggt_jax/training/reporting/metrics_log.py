@@ -64,26 +64,25 @@ class MetricsLog:
         times = workdir / TIMES_NAME
         with disk_errors(workdir):
             workdir.mkdir(parents=True, exist_ok=True)
-            # Before the lines of steps that were lost go: the clock stays set.
             earlier = read_metrics(times) if times.exists() else []
-            set_by = [entry[_CLOCK_SET] for entry in earlier if _CLOCK_SET in entry]
             _drop_lines(self.path, beginning=0 if anew else first_step + 1)
             # The goodput counts from the first start, whatever its settings were.
             _drop_lines(times, beginning=first_step + 1)
             # Without a buffer, which would fail once more when it is closed.
             self._file, self._times = self.path.open("ab", buffering=0), times.open("ab", buffering=0)
         self._events = EventFile(workdir / "tensorboard", purge_step=0 if anew else first_step + 1)
-        known = [entry for entry in read_metrics(times) if {"time", "productive_seconds"} <= entry.keys()]
+        kept = [entry for entry in earlier if entry["step"] <= first_step]
+        known = [entry for entry in kept if {"time", "productive_seconds"} <= entry.keys()]
         if known:
             self._started = known[0]["time"]
             self.productive_seconds = known[-1]["productive_seconds"]
         else:
             self.write_times(first_step, {"productive_seconds": 0.0})
-        if set_by:
-            self._was_set = True
-            if not any(_CLOCK_SET in entry for entry in known):
-                kept = {"productive_seconds": self.productive_seconds, _CLOCK_SET: set_by[-1]}
-                self.write_times(first_step, kept)
+        set_by = [entry[_CLOCK_SET] for entry in earlier if _CLOCK_SET in entry]
+        self._was_set = bool(set_by)
+        # What a lost step's line said of the clock stays true.
+        if set_by and not any(_CLOCK_SET in entry for entry in kept):
+            self.write_times(first_step, {"productive_seconds": self.productive_seconds, _CLOCK_SET: set_by[-1]})
 
     def __enter__(self) -> MetricsLog:
         return self
@@ -102,7 +101,7 @@ class MetricsLog:
 
     def write_times(self, step: int, values: dict[str, float]) -> None:
         """The same for what differs from one machine and session to the next, in a file of its own, with `time`
-        (seconds since 1970), and where the clock was set in this session by how many seconds."""
+        (seconds since 1970), and where the clock was set since this start by how many seconds."""
         if not self.silent:
             jump = self._clock_jump()
             was_set = {_CLOCK_SET: round(jump, 3)} if abs(jump) > _SET_SECONDS else {}
@@ -116,7 +115,7 @@ class MetricsLog:
         return time.time() - self._started
 
     def _clock_jump(self) -> float:
-        """Seconds by which the clock of the day was set since this session began."""
+        """Seconds by which the clock of the day was set since this start of the run."""
         return (time.time() - self._opened) - (_steady_time() - self._opened_steadily)
 
     def show(self, step: int, pictures: Mapping[str, np.ndarray]) -> None:
