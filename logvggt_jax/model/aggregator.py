@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import flax.linen as nn
@@ -13,12 +14,14 @@ import jax.numpy as jnp
 from logvggt_jax.config import ModelConfig
 from logvggt_jax.model.initializers import normal
 from logvggt_jax.model.layers import Block, with_special
-from logvggt_jax.model.memory import LayerMemory, Memory
+from logvggt_jax.model.memory import FixedMemory, LayerMemory, Memory
 from logvggt_jax.model.parameters import given, run
 from logvggt_jax.model.rope import rope_table
 from logvggt_jax.model.shape_check import ShapeCheck
 
 BlockFunction = Callable[..., tuple[jax.Array, LayerMemory | None]]
+# Of layers that hand them out, the outputs [B, K, P, C] of the frame block and of the global block.
+Outputs = list[tuple[jax.Array, jax.Array]]
 
 
 class WindowTokens(NamedTuple):
@@ -42,9 +45,9 @@ class Aggregator(ShapeCheck, nn.Module):
 
     What the memory adds at the key layers is the equation of cross-window attention, see `cross_window.py`.
 
-    Layers run one after the other. Where their parameters come stacked (see `parameters.stack_layers`) they run as
-    loops between the key layers, and each loop's body is compiled once. With `remat` a stacked layer keeps nothing but
-    its input for the backward pass.
+    Layers run one after the other. Where their parameters come stacked (see `parameters.stack_layers`) neighbours of
+    one kind run as a loop, whose body is compiled once: those between two key layers, and key layers without another
+    one between them. With `remat` a stacked layer keeps nothing but its input for the backward pass.
     """
 
     config: ModelConfig
@@ -128,39 +131,44 @@ class Aggregator(ShapeCheck, nn.Module):
             if self.remat:
                 by_parameters = jax.checkpoint(by_parameters, prevent_cse=False)
 
-        def single(
-            layer: int, x: jax.Array, read: LayerMemory | None
-        ) -> tuple[jax.Array, jax.Array, LayerMemory | None]:
-            if stacks is not None:
-                return by_parameters(jax.tree.map(lambda stack: stack[layer], stacks), x, read)
-            names = f"frame_block_{layer}", f"global_block_{layer}"
-            if given(self, names[0]):
-                return by_parameters(tuple(self.get_variable("params", name) for name in names), x, read)
-            return one_layer(block(name=names[0]), block(name=names[1]), x, read)
-
-        def plain(first: int, stop: int, x: jax.Array) -> jax.Array:
-            """Layers first … stop − 1, which read no memory and hand nothing out."""
-            if stacks is None:
-                for layer in range(first, stop):
-                    _, x, _ = single(layer, x, None)
-            elif first < stop:
-                some = jax.tree.map(lambda stack: stack[first:stop], stacks)
-                x, _ = jax.lax.scan(lambda x, params: (by_parameters(params, x)[1], None), x, some)
-            return x
-
-        key_tokens, first = [], 0
-        for layer in range(sizes.depth):
+        def single(layer: int, x: jax.Array, memory: Memory | None) -> tuple[jax.Array, Outputs, Memory | None]:
+            """The layer's output, what it hands out, and the memory after it."""
             read = None if memory is None else memory.at(layer)
-            if read is None and layer not in outlets:
-                continue
-            frame_out, x, left = single(layer, plain(first, layer, x), read)
-            first = layer + 1
+            names = f"frame_block_{layer}", f"global_block_{layer}"
+            if stacks is not None:
+                frame_out, x, left = by_parameters(jax.tree.map(lambda stack: stack[layer], stacks), x, read)
+            elif given(self, names[0]):
+                frame_out, x, left = by_parameters(tuple(self.get_variable("params", name) for name in names), x, read)
+            else:
+                frame_out, x, left = one_layer(block(name=names[0]), block(name=names[1]), x, read)
             if memory is not None and left is not None:
                 memory = memory.updated(layer, left)
-            both = jnp.concatenate([frame_out, x], axis=-1)
-            if layer in sizes.key_layers:
-                key_tokens.append(both.astype(config.dtype))
-        return WindowTokens(jnp.stack(key_tokens, axis=1), both[:, :, :num_special]), memory
+            return x, [(frame_out, x)], memory
+
+        def loop(layers: range, x: jax.Array, memory: Memory | None) -> tuple[jax.Array, Outputs]:
+            """The last layer's output, and what each hands out, if they do."""
+            some = jax.tree.map(lambda stack: stack[layers.start : layers.stop], stacks)
+            reads = [None if memory is None else memory.at(layer) for layer in layers]
+
+            def body(x: jax.Array, layer: tuple[Any, LayerMemory | None]) -> tuple[jax.Array, Any]:
+                frame_out, x, _ = by_parameters(layer[0], x, layer[1])
+                return x, (frame_out, x) if layers[0] in outlets else None
+
+            x, made = jax.lax.scan(body, x, (some, jax.tree.map(lambda *read: jnp.stack(read), *reads)))
+            return x, [] if made is None else list(zip(*made, strict=True))
+
+        key_tokens: list[jax.Array] = []
+        made: Outputs = []
+        for layers in _alike(sizes.depth, outlets, memory, stacked=stacks is not None):
+            if len(layers) == 1:
+                x, made, memory = single(layers[0], x, memory)
+            else:
+                x, made = loop(layers, x, memory)
+            for layer, outputs in zip(layers, made, strict=False):
+                if layer in sizes.key_layers:
+                    key_tokens.append(jnp.concatenate(outputs, axis=-1).astype(config.dtype))
+        last = jnp.concatenate([tokens[:, :, :num_special] for tokens in made[-1]], axis=-1)
+        return WindowTokens(jnp.stack(key_tokens, axis=1), last), memory
 
     def _special_tokens(self, starts_sequence: jax.Array, frames: int, width: int) -> jax.Array:
         """Camera and register tokens [B, K, 5, C]: copy 0 for the sequence's first frame, copy 1 for others."""
@@ -171,3 +179,17 @@ class Aggregator(ShapeCheck, nn.Module):
         copies = jnp.concatenate([camera, register], axis=2)[0]
         is_first = starts_sequence[:, None] & (jnp.arange(frames) == 0)
         return jnp.where(is_first[..., None, None], copies[0], copies[1])
+
+
+def _alike(depth: int, outlets: set[int], memory: Memory | None, *, stacked: bool) -> Iterator[range]:
+    """The layers in runs that can be one loop: all or none of a run hand out what they make, all or none read the
+    memory, and if they do it is one that stays as it is. Layers that are not stacked run one by one."""
+
+    def kind(layer: int) -> Any:
+        if not stacked or not (memory is None or isinstance(memory, FixedMemory)):
+            return layer
+        return layer in outlets, memory is not None and memory.at(layer) is not None
+
+    for _, alike in itertools.groupby(range(depth), kind):
+        layers = list(alike)
+        yield range(layers[0], layers[-1] + 1)

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from logvggt_jax.model.memory import Attend, Keys, LayerMemory, OwnTokens, Project
+from logvggt_jax.model.memory import Attend, FixedMemory, Keys, LayerMemory, OwnTokens, Project
 
 
 @struct.dataclass
@@ -59,7 +59,7 @@ class CachedTokens:
 
 
 @struct.dataclass
-class CrossWindowMemory:
+class CrossWindowMemory(FixedMemory):
     """The caches of all key layers.
 
     Attributes:
@@ -79,11 +79,6 @@ class CrossWindowMemory:
         if layer not in self.key_layers:
             return None
         return CachedTokens(self.tokens[:, self.key_layers.index(layer)], self.length, self.seen)
-
-    def updated(self, layer: int, memory: LayerMemory) -> CrossWindowMemory:
-        """The same: what a window leaves is known when it has run."""
-        del layer, memory
-        return self
 
 
 def _cache_last(own: jax.Array, cached: jax.Array) -> jax.Array:

@@ -19,7 +19,16 @@ from flax import struct
 from logvggt_jax.config import ModelConfig
 from logvggt_jax.model.aggregator import WindowTokens
 from logvggt_jax.model.key_value_cache import CameraMemory, with_registers
-from logvggt_jax.model.memory import Attend, Keys, LayerMemory, Memory, OwnTokens, Project, RoundMemory
+from logvggt_jax.model.memory import (
+    Attend,
+    FixedMemory,
+    Keys,
+    LayerMemory,
+    Memory,
+    OwnTokens,
+    Project,
+    RoundMemory,
+)
 from logvggt_jax.model.parameters import Variables, run
 from logvggt_jax.model.refinement import Refinement
 from logvggt_jax.model.windows import Windows
@@ -27,7 +36,7 @@ from logvggt_jax.types import WindowOutput
 
 
 @struct.dataclass
-class CausalMask:
+class CausalMask(FixedMemory):
     """The mask of a whole sequence of `frames` equally long frames, at every layer: a frame sees itself and all before
     it. It remembers nothing."""
 
@@ -36,11 +45,6 @@ class CausalMask:
     def at(self, layer: int) -> CausalMask:
         """The same mask at every layer."""
         del layer
-        return self
-
-    def updated(self, layer: int, memory: LayerMemory) -> CausalMask:
-        """The same."""
-        del layer, memory
         return self
 
     def attend(self, own: OwnTokens, attention: Attend, project: Project) -> tuple[jax.Array, LayerMemory]:

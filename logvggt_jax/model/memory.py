@@ -8,7 +8,7 @@ is pruned is another, and so is a mask or a merging of the block's own tokens, w
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, Self
 
 import jax
 
@@ -74,6 +74,16 @@ class Memory(Protocol):
     def updated(self, layer: int, memory: LayerMemory) -> Memory:
         """The memory after the block of `layer`, which left `memory`."""
         ...
+
+
+class FixedMemory:
+    """A memory that blocks read and leave as it is, of the same form at all layers that read it: they may run as one
+    loop."""
+
+    def updated(self, layer: int, memory: LayerMemory) -> Self:
+        """The same."""
+        del layer, memory
+        return self
 
 
 class RoundMemory(NamedTuple):

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from logvggt_jax.model.memory import Attend, Keys, LayerMemory, OwnTokens, Project
+from logvggt_jax.model.memory import Attend, FixedMemory, Keys, OwnTokens, Project
 from logvggt_jax.model.precision import product_precision
 
 # Similarities of one block of sources: the whole matrix would be larger than attention's.
@@ -29,7 +29,7 @@ _SEED = 33
 
 
 @struct.dataclass
-class TokenMerging:
+class TokenMerging(FixedMemory):
     """Which of N tokens are merged; see `merging_of`. Token numbers are frame · P + place.
 
     Attributes:
@@ -49,11 +49,6 @@ class TokenMerging:
     def at(self, layer: int) -> TokenMerging:
         """The same for every block."""
         del layer
-        return self
-
-    def updated(self, layer: int, memory: LayerMemory) -> TokenMerging:
-        """The same: nothing is remembered."""
-        del layer, memory
         return self
 
     def attend(self, own: OwnTokens, attention: Attend, project: Project) -> tuple[jax.Array, TokenMerging]:
