@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import pickle
 import resource
+import shutil
 import sys
 import time
 from collections.abc import Iterator
@@ -87,7 +88,19 @@ SPAWNED = ("data.feeding.batches", "data.registry", "evaluation.records", "recon
 MOST_MEMORY = 2_500_000_000
 # Bytes held after a file at which what is compiled is dropped; dropping it after every file took half a minute.
 MUCH_MEMORY = 1_900_000_000
+# Bytes of room for temporary files, of which a whole run writes a third.
+MOST_FILES = 2_000_000_000
 SHARED = Path(os.environ.get("LOGVGGT_SHARED", Path(__file__).parents[2] / "shared"))
+
+
+def pytest_configure() -> None:
+    """Temporary files lie in memory where it has a file system with room for them, from which programs may run:
+    hundreds of small checkpoints would wait for a disk longer than they compute."""
+    memory = Path("/dev/shm")
+    if memory.is_dir() and os.access(memory, os.W_OK):
+        room, runs_programs = shutil.disk_usage(memory).free, not os.statvfs(memory).f_flag & os.ST_NOEXEC
+        if room > MOST_FILES and runs_programs:
+            os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(memory))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
