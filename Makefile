@@ -47,12 +47,12 @@ lint: install
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# Types are checked beside the tests, in the moments in which these leave a core idle.
+# Types are checked beside the tests, mostly while these leave a core idle.
 test: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	@mkdir -p runs/test
-	@nice -n 19 $(BIN)/mypy > runs/test/types.txt 2>&1 & types=$$!; trap 'kill $$types 2> /dev/null; exit 130' INT TERM; \
+	@nice -n 10 $(BIN)/mypy > runs/test/types.txt 2>&1 & types=$$!; trap 'kill $$types 2> /dev/null; exit 130' INT TERM; \
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder --durations=10 --junitxml=runs/test/report.xml; \
 	tests=$$?; wait $$types; typed=$$?; echo "Types:"; cat runs/test/types.txt; \
 	test $$tests -eq 0 || exit $$tests; exit $$typed

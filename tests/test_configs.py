@@ -33,7 +33,7 @@ def _config(name: str, monkeypatch: pytest.MonkeyPatch) -> TrainConfig:
     return TrainConfig.from_dict(importlib.import_module(f"configs.{name}").get_config().to_dict())
 
 
-@pytest.mark.parametrize("name", ["tiny", "demo", "rooms", "small", "h20", "finetune", "distill"])
+@pytest.mark.parametrize("name", ["tiny", "demo", "rooms", "small", "h20", "finetune", "distill", "distill_rooms"])
 def test_configuration_builds_its_run(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     config = _config(name, monkeypatch)
     schedule = learning_rate_schedule(config.optimizer, config.stages)
@@ -105,6 +105,17 @@ def test_what_ships_is_trained_on_by_a_script() -> None:
     shown = subprocess.run(script, cwd=ROOT, env={**os.environ, "PYTHON": "echo"}, capture_output=True, text=True)
     words = shown.stdout.split()
     assert words[:2] == ["train.py", "--config=configs/rooms.py:rooms"] and words[-1] == script[-1]
+
+
+def test_a_student_of_rooms_differs_from_the_half_hour_run_in_what_it_is_told_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    told, taught = (_config(name, monkeypatch) for name in ("tiny", "distill_rooms"))
+    assert taught.teacher is not None and taught.loss == dataclasses.replace(told.loss, name="distillation")
+    assert (taught.model, taught.optimizer, taught.data.sources) == (told.model, told.optimizer, told.data.sources)
+    for stage, alike in zip(taught.stages, told.stages, strict=True):
+        assert dataclasses.replace(stage, max_stride=alike.max_stride) == alike
+        assert (stage.clip_length - 1) * stage.max_stride < taught.teacher.clip_length, "lies within its teacher's"
 
 
 def test_finetuning_takes_sizes_and_pictures_from_the_model_it_starts_from(

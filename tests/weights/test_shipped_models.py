@@ -10,13 +10,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import rooms_teacher
 import ship_model
 
 from logvggt_jax.cli import main
 from logvggt_jax.errors import InputError, MissingInput, OutputExists
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.model.parameters import unstack_layers
+from logvggt_jax.training.config import TeacherConfig
 from logvggt_jax.training.step.initialization import initial_parameters
+from logvggt_jax.training.teaching.teacher import PlainVGGT
 from logvggt_jax.weights import from_pretrained, load_model, read_provenance, resolve, save_model, shipped_models
 from logvggt_jax.weights.half_precision import PARAMETERS_FILE, rounded
 from logvggt_jax.weights.provenance import Provenance, TrainingRecord
@@ -51,6 +54,17 @@ def shipped(shipped_once, tmp_path, monkeypatch):
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     return root / "rooms"
+
+
+def test_what_ships_becomes_a_teacher_without_its_windows(shipped, tmp_path):
+    rooms_teacher.main([str(tmp_path / "teacher")])
+    PlainVGGT(TeacherConfig(str(tmp_path / "teacher"), clip_length=24))
+    with pytest.raises(InputError, match="trained for 'windows', a teacher is plain VGGT"):
+        PlainVGGT(TeacherConfig("rooms", clip_length=24))
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "mine.txt").write_text("mine")
+    with pytest.raises(SystemExit, match=r"^rooms_teacher.py: .*notes"):
+        rooms_teacher.main([str(tmp_path / "notes")])
 
 
 def test_the_shipped_model_is_the_trained_one_at_16_bits(shipped, small_config, small_variables):
