@@ -90,17 +90,16 @@ def test_both_views_look_into_the_room(written: Path) -> None:
         assert left > 500 and abs(left - right) < 0.1 * left
 
 
-def test_a_camera_that_stands_still_makes_a_page_without_its_path(demo: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_camera_that_stands_still_and_a_training_that_only_compiled_make_a_page(
+    demo: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     still = Scaled(demo / "room")
     still.extrinsics[:] = np.eye(4)[:3]
     monkeypatch.setattr(Reconstruction, "open", lambda _: still)
+    (demo / "training" / "metrics.jsonl").write_text(json.dumps({"step": 1, "train/abs_rel": 0.4}) + "\n")
     text = demo_page.write_page(demo).read_text()
     assert "The path could not be laid over the truth" in text and "<td>-</td>" in text
-
-
-def test_a_training_that_only_compiled_makes_a_page(demo: Path) -> None:
-    (demo / "training" / "metrics.jsonl").write_text(json.dumps({"step": 1, "train/abs_rel": 0.4}) + "\n")
-    assert "from 0.400 at step 1 to 0.400 at step 1. Camera" in demo_page.write_page(demo).read_text()
+    assert "from 0.400 at step 1 to 0.400 at step 1. Camera" in text
 
 
 @pytest.mark.parametrize(
