@@ -49,7 +49,7 @@ from logvggt_jax import LogVGGT, ModelConfig  # noqa: E402
 from logvggt_jax.doctor.subject import tiny_config  # noqa: E402
 
 # Tracing makes many objects and little garbage: by default the collector takes an eighth of a tracer's time.
-gc.set_threshold(500_000, 50, 100)
+gc.set_threshold(100_000, 50, 100)
 
 # Grain reads absl flags, which only `app.run` parses.
 if not flags.FLAGS.is_parsed():

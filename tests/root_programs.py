@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[1]
 # A fork leaves the loop, so that its end is the interpreter's own: exit codes, messages and tracebacks as ever.
 _SERVER = """
 import gc
-gc.set_threshold(500_000, 50, 100)  # as in `conftest.py`
+gc.set_threshold(100_000, 50, 100)  # as in `conftest.py`
 import importlib, json, os, runpy, signal, sys, warnings
 for library in sys.argv[1:]:
     importlib.import_module(library)
