@@ -57,10 +57,11 @@ if not flags.FLAGS.is_parsed():
 
 # Files of more than about fifteen seconds of processor time, the dearest first: none is left to one process at the end.
 DEAREST = (
-    # Waits for a process of its own while another worker compiles what the next files initialise parameters with.
+    # Waits for a process of its own.
     "training/test_train_script.py",
-    "model/test_logvggt.py",
+    # Holds the most memory of all: it begins where there is nothing yet.
     "training/parallel/test_sharding.py",
+    "model/test_logvggt.py",
     "streaming/test_frame_methods.py",
     "training/test_loop.py",
     "weights/test_checkpoints.py",
