@@ -3,8 +3,9 @@
     python scripts/rooms_teacher.py runs/teacher
     python train.py --config=configs/distill_rooms.py:runs/teacher --workdir=runs/student
 
-After the colon stands the teacher. Half an hour as `configs/tiny.py`, whose sizes, rooms, schedule and steps it has:
-what that run learns from the truth, this one learns from its teacher's predictions of 24 frames at a time.
+After the colon stands the teacher. It takes half an hour, like `configs/tiny.py`, whose sizes, rooms, schedule and
+steps it has: what that run learns from the truth, this one learns from its teacher's predictions of 24 frames at a
+time. Strides differ a little, since the teacher sees every second frame.
 """
 
 from ml_collections import ConfigDict
@@ -12,7 +13,7 @@ from ml_collections import ConfigDict
 from configs import tiny
 
 
-def get_config(teacher: str = "runs/teacher") -> ConfigDict:
+def get_config(teacher: str = "./runs/teacher") -> ConfigDict:
     """The run; fields as in `configs/tiny.py`."""
     config = tiny.get_config()
     config.teacher = {"weights": teacher, "clip_length": 24, "stride": 2, "validation": True}

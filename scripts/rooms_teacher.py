@@ -3,9 +3,9 @@
     python scripts/rooms_teacher.py runs/teacher
 
 Teachers are plain VGGT: all frames of a clip see one another. The model that ships was trained on windows, and its
-provenance says so. Its parts with one window over all frames are plain VGGT too, and on rooms nearly as good as with
-its own windows (`offline` beside `windows` in docs/methods.md), which makes it the teacher that is at hand without
-downloads. The folder written says that it is to be used so.
+provenance says so. Its parts with one window over all frames are plain VGGT too, on rooms as good in depth as with its
+own windows and worse in position (`offline` beside `windows` in docs/methods.md), which makes it the teacher that is at
+hand without downloads. The folder written says that it is to be used so; an existing one is never replaced.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ NAME = "rooms"
 
 
 def write_teacher(folder: Path) -> None:
-    """Raises OutputExists where `folder` is something else than a model."""
+    """Raises OutputExists where `folder` exists."""
     model, variables = load_model(NAME)
-    provenance = dataclasses.replace(read_provenance(NAME), trained_for="vggt", source=f"{NAME}, without its windows")
-    save_model(folder, model.config, variables["params"], provenance)
+    provenance = dataclasses.replace(read_provenance(NAME), trained_for="vggt", source=f"{NAME}, trained on windows")
+    save_model(folder, model.config, variables["params"], provenance, replace=False)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

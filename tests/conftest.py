@@ -89,19 +89,25 @@ SPAWNED = ("data.feeding.batches", "data.registry", "evaluation.records", "recon
 MOST_MEMORY = 2_500_000_000
 # Bytes held after a file at which what is compiled is dropped; dropping it after every file took half a minute.
 MUCH_MEMORY = 1_900_000_000
-# Bytes of room for temporary files, of which a whole run writes a third.
-MOST_FILES = 2_000_000_000
+# Bytes that have to be free for temporary files, three times what a whole run writes.
+LEAST_ROOM = 2_000_000_000
 SHARED = Path(os.environ.get("LOGVGGT_SHARED", Path(__file__).parents[2] / "shared"))
 
 
 def pytest_configure() -> None:
-    """Temporary files lie in memory where it has a file system with room for them, from which programs may run:
-    hundreds of small checkpoints would wait for a disk longer than they compute."""
+    """Temporary files lie in memory where there is enough of it and programs may run from there, unless the user has
+    said where they belong: hundreds of small checkpoints would wait for a disk longer than they compute."""
     memory = Path("/dev/shm")
-    if memory.is_dir() and os.access(memory, os.W_OK):
+    if "TMPDIR" not in os.environ and memory.is_dir() and os.access(memory, os.W_OK):
         room, runs_programs = shutil.disk_usage(memory).free, not os.statvfs(memory).f_flag & os.ST_NOEXEC
-        if room > MOST_FILES and runs_programs:
+        if room > LEAST_ROOM and _free_memory() > LEAST_ROOM + 2 * MOST_MEMORY and runs_programs:
             os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(memory))
+
+
+def _free_memory() -> int:
+    """Bytes that this machine's programs can still have."""
+    kilobytes = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
+    return 1024 * int(kilobytes["MemAvailable"].split()[0])
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -200,7 +206,8 @@ def abandoned_reads(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """For tests that damage what Orbax reads: when one read fails it drops the others, and each complains of that
     whenever it ends. They end here, not in the middle of a later test."""
     monkeypatch.setattr(sys, "unraisablehook", lambda _: None)
-    # What was there before is not walked through again and again.
+    # What was there before is not walked through again and again; nor is it listed by `gc.get_objects`.
+    gc.collect()
     gc.freeze()
     yield
     end = time.monotonic() + 10

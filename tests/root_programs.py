@@ -20,7 +20,7 @@ gc.set_threshold(100_000, 50, 100)  # as in `conftest.py`
 import importlib, json, os, runpy, signal, sys, warnings
 for library in sys.argv[1:]:
     importlib.import_module(library)
-# What all forks share stays: at its end none walks through a third of a million objects to free them.
+# What all forks share stays: no fork walks through a third of a million objects at its end to free them.
 gc.collect()
 gc.freeze()
 warnings.filterwarnings("ignore", message=r".*os\\.fork")

@@ -46,8 +46,9 @@ class Aggregator(ShapeCheck, nn.Module):
     What the memory adds at the key layers is the equation of cross-window attention, see `cross_window.py`.
 
     Layers run one after the other. Where their parameters come stacked (see `parameters.stack_layers`) neighbours of
-    one kind run as a loop, whose body is compiled once: those between two key layers, and key layers without another
-    one between them. With `remat` a stacked layer keeps nothing but its input for the backward pass.
+    one kind run as a loop, whose body is compiled once: those between two key layers, and key layers that follow one
+    another. With a memory that the layers change they run one by one. With `remat` a stacked layer keeps nothing but
+    its input for the backward pass.
     """
 
     config: ModelConfig

@@ -12,6 +12,7 @@ import pytest
 from pieces import in_pieces
 
 from logvggt_jax import DPTConfig, LogVGGT, ModelConfig
+from logvggt_jax.model.dpt_head import point_activation
 from logvggt_jax.model.initialization import variable_shapes
 from logvggt_jax.model.parameters import in_compute_type, run, stack_layers, unstack_layers
 from logvggt_jax.model.windows import Windows
@@ -115,18 +116,18 @@ def test_training_runs_a_frozen_encoder_once_a_frame(small_config):
 
 @pytest.mark.parametrize("cross_window", [True, False])
 def test_layers_as_a_loop_are_the_layers_one_by_one(small_config, small_variables, cross_window):
-    """The encoder's, and the aggregator's with key layers that are neighbours and one layer that is none: the loops
-    read the cache at some of them."""
-    sizes = dataclasses.replace(small_config.aggregator, depth=5, key_layers=(0, 1, 3, 4))
+    """The encoder's; and the aggregator's, of two key layers that read the cache in one loop, two others in another,
+    and layers that have no neighbour of their kind."""
+    sizes = dataclasses.replace(small_config.aggregator, depth=8, key_layers=(0, 1, 4, 6))
     encoder = dataclasses.replace(small_config.encoder, depth=2)
     windows = dataclasses.replace(small_config.windows, cross_window=cross_window)
     model = LogVGGT(dataclasses.replace(small_config, encoder=encoder, aggregator=sizes, windows=windows))
     params = {part: dict(small_variables["params"][part]) for part in ("encoder", "aggregator")}
     params["encoder"]["block_1"] = jax.tree.map(lambda x: x * 1.1, params["encoder"]["block_0"])
     for kind in ("frame", "global"):
-        params["aggregator"][f"{kind}_block_4"] = jax.tree.map(
-            lambda x: x * 1.1, params["aggregator"][f"{kind}_block_1"]
-        )
+        for layer in range(4, 8):
+            like = params["aggregator"][f"{kind}_block_{layer - 4}"]
+            params["aggregator"][f"{kind}_block_{layer}"] = jax.tree.map(lambda x: x * 1.1, like)
     variables = {"params": params}
     stacks = jax.jit(stack_layers)(variables)
     jax.tree.map(np.testing.assert_array_equal, unstack_layers(jax.device_get(stacks), model.config), variables)
@@ -199,6 +200,8 @@ def test_point_head_is_optional(small_config):
     variables = variable_shapes(config)
     out = jax.eval_shape(LogVGGT(config).apply, variables, video())
     assert out.points.shape == (1, FRAMES, 28, 42, 3) and out.points_confidence.shape == (1, FRAMES, 28, 42)
+    points, confidence = point_activation(np.array([np.log(3.0), -np.log(2.0), 0.0, 0.0], np.float32))
+    np.testing.assert_allclose([*points, confidence], [2.0, -1.0, 0.0, 2.0], rtol=1e-6)
     del variables["params"]["point_head"]
     assert jax.eval_shape(LogVGGT(small_config).apply, variables, video()).points is None
 
