@@ -11,6 +11,7 @@ from logvggt_jax.training.step.costs import bytes_of
 
 _COMPUTATION = re.compile(r"^(ENTRY )?%?([\w.\-]+) \(.*\) -> .* \{$")
 _INSTRUCTION = re.compile(r"^\s+(?:ROOT )?%?([\w.\-]+) = (\([^=]*?\)|\S+) ([\w\-]+)\((.*)$")
+_CALLED = re.compile(r"\b(?:body|to_apply|true_computation|false_computation)=(\S+?),|branch_computations=\{(.*?)\}")
 # What takes no kernel of its own.
 _FREE = {"parameter", "constant", "get-tuple-element", "tuple", "bitcast", "after-all"}
 _PRODUCT = ("__cublas", " dot(")
@@ -26,7 +27,8 @@ class Kernels(NamedTuple):
 def kernels(program: str) -> dict[str, Kernels]:
     """Kernels of one run by what they are: `attention`, `products`, `convolutions` or `others`.
 
-    Loops count as often as they run where the program says how often that is.
+    Loops count as often as they run where the program says how often that is; of the branches of a condition the one
+    that moves the most bytes.
 
     Raises:
       ValueError: a line of the program is not understood.
@@ -40,9 +42,13 @@ def kernels(program: str) -> dict[str, Kernels]:
             entry = name if match[1] else entry
         elif name and line.startswith("  ") and " = " in line:
             bodies[name].append(line)
-    found: dict[str, Kernels] = dict.fromkeys(("attention", "products", "convolutions", "others"), Kernels(0, 0))
 
-    def walk(computation: str, times: int) -> None:
+    def walk(computation: str) -> dict[str, Kernels]:
+        found: dict[str, Kernels] = dict.fromkeys(("attention", "products", "convolutions", "others"), Kernels(0, 0))
+
+        def add(kind: str, count: int, size: int) -> None:
+            found[kind] = Kernels(found[kind].count + count, found[kind].size + size)
+
         sizes: dict[str, int] = {}
         for line in bodies[computation]:
             match = _INSTRUCTION.match(line)
@@ -52,21 +58,22 @@ def kernels(program: str) -> dict[str, Kernels]:
             sizes[result] = bytes_of(shapes)
             if operation in _FREE:
                 continue
-            if operation in ("while", "call"):
+            if operation in ("while", "call", "conditional"):
                 trips = re.search(r'"known_trip_count":\{"n":"(\d+)"', line)
-                (called,) = re.findall(r"(?:body|to_apply)=%?([\w.\-]+)", line)
-                walk(called, times * (int(trips[1]) if trips else 1))
+                times = int(trips[1]) if trips else 1
+                called = re.findall(r"%?([\w.\-]+)", " ".join("".join(names) for names in _CALLED.findall(line)))
+                branches = [walk(name) for name in called]
+                for kind, each in max(branches, key=lambda branch: sum(each.size for each in branch.values())).items():
+                    add(kind, times * each.count, times * each.size)
                 continue
             operands = set(re.findall(r"%?([\w.\-]+)", rest.split(")")[0])) & sizes.keys()
-            called = re.search(r"calls=%?([\w.\-]+)", line)
+            fused = re.search(r"calls=%?([\w.\-]+)", line)
             target = re.search(r'custom_call_target="([^"]+)"', line)
-            kind = _kind((target[1] if target else f" {operation}(") + "".join(bodies[called[1]] if called else ()))
-            count, size = found[kind]
-            moved = sizes[result] + sum(sizes[operand] for operand in operands)
-            found[kind] = Kernels(count + times, size + times * moved)
+            kind = _kind((target[1] if target else f" {operation}(") + "".join(bodies[fused[1]] if fused else ()))
+            add(kind, 1, sizes[result] + sum(sizes[operand] for operand in operands))
+        return found
 
-    walk(entry, 1)
-    return found
+    return walk(entry)
 
 
 def _kind(text: str) -> str:

@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 import functools
-import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from logvggt_jax.config import ModelConfig
 from logvggt_jax.model.initializers import normal
 from logvggt_jax.model.layers import Block, with_special
-from logvggt_jax.model.memory import FixedMemory, LayerMemory, Memory
+from logvggt_jax.model.memory import FixedMemory, LayerMemory, Memory, in_loop
 from logvggt_jax.model.parameters import given, run
 from logvggt_jax.model.rope import rope_table
 from logvggt_jax.model.shape_check import ShapeCheck
 
 BlockFunction = Callable[..., tuple[jax.Array, LayerMemory | None]]
-# Of layers that hand them out, the outputs [B, K, P, C] of the frame block and of the global block.
-Outputs = list[tuple[jax.Array, jax.Array]]
 
 
 class WindowTokens(NamedTuple):
@@ -45,10 +43,11 @@ class Aggregator(ShapeCheck, nn.Module):
 
     What the memory adds at the key layers is the equation of cross-window attention, see `cross_window.py`.
 
-    Layers run one after the other. Where their parameters come stacked (see `parameters.stack_layers`) neighbours of
-    one kind run as a loop, whose body is compiled once: those between two key layers, and key layers that follow one
-    another. With a memory that the layers change they run one by one. With `remat` a stacked layer keeps nothing but
-    its input for the backward pass.
+    Layers run one after the other. Where their parameters come stacked (see `parameters.stack_layers`) all of them are
+    one loop, whose body is compiled once; with a memory that they change they run one by one. The loop is what training
+    wants: by itself a layer on a GPU is faster, by a tenth of a stream's step, and in the loop one that reads a memory
+    is told from others only when it runs. With `remat` a stacked layer keeps nothing but its input for the backward
+    pass.
     """
 
     config: ModelConfig
@@ -96,7 +95,6 @@ class Aggregator(ShapeCheck, nn.Module):
             frame_valid = in_frame.reshape(batch * frames, tokens)
             real = jnp.full(batch, frames) if lengths is None else lengths
             valid = (in_frame & (jnp.arange(frames) < real[:, None])[..., None]).reshape(batch, frames * tokens)
-        outlets = {*sizes.key_layers, sizes.depth - 1}
 
         def block(**options: Any) -> Block:
             return Block(
@@ -120,6 +118,9 @@ class Aggregator(ShapeCheck, nn.Module):
             )
             return frame_out.reshape(shape), x.reshape(shape), left
 
+        def joined(frame_out: jax.Array, global_out: jax.Array) -> jax.Array:
+            return jnp.concatenate([frame_out, global_out], axis=-1)
+
         def by_parameters(
             params: tuple[Any, ...], x: jax.Array, read: LayerMemory | None = None
         ) -> tuple[jax.Array, jax.Array, LayerMemory | None]:
@@ -132,44 +133,45 @@ class Aggregator(ShapeCheck, nn.Module):
             if self.remat:
                 by_parameters = jax.checkpoint(by_parameters, prevent_cse=False)
 
-        def single(layer: int, x: jax.Array, memory: Memory | None) -> tuple[jax.Array, Outputs, Memory | None]:
-            """The layer's output, what it hands out, and the memory after it."""
-            read = None if memory is None else memory.at(layer)
-            names = f"frame_block_{layer}", f"global_block_{layer}"
-            if stacks is not None:
-                frame_out, x, left = by_parameters(jax.tree.map(lambda stack: stack[layer], stacks), x, read)
-            elif given(self, names[0]):
-                frame_out, x, left = by_parameters(tuple(self.get_variable("params", name) for name in names), x, read)
-            else:
-                frame_out, x, left = one_layer(block(name=names[0]), block(name=names[1]), x, read)
-            if memory is not None and left is not None:
-                memory = memory.updated(layer, left)
-            return x, [(frame_out, x)], memory
-
-        def loop(layers: range, x: jax.Array, memory: Memory | None) -> tuple[jax.Array, Outputs]:
-            """The last layer's output, and what each hands out, if they do."""
-            some = jax.tree.map(lambda stack: stack[layers.start : layers.stop], stacks)
-            reads = [None if memory is None else memory.at(layer) for layer in layers]
-
-            def body(x: jax.Array, layer: tuple[Any, LayerMemory | None]) -> tuple[jax.Array, Any]:
-                frame_out, x, _ = by_parameters(layer[0], x, layer[1])
-                return x, (frame_out, x) if layers[0] in outlets else None
-
-            x, made = jax.lax.scan(body, x, (some, jax.tree.map(lambda *read: jnp.stack(read), *reads)))
-            return x, [] if made is None else list(zip(*made, strict=True))
-
-        key_tokens: list[jax.Array] = []
-        made: Outputs = []
-        for layers in _alike(sizes.depth, outlets, memory, stacked=stacks is not None):
-            if len(layers) == 1:
-                x, made, memory = single(layers[0], x, memory)
-            else:
-                x, made = loop(layers, x, memory)
-            for layer, outputs in zip(layers, made, strict=False):
+        def one_by_one(x: jax.Array, memory: Memory | None) -> tuple[WindowTokens, Memory | None]:
+            key: list[jax.Array] = []
+            for layer in range(sizes.depth):
+                read = None if memory is None else memory.at(layer)
+                names = f"frame_block_{layer}", f"global_block_{layer}"
+                if stacks is not None:
+                    frame_out, x, left = by_parameters(jax.tree.map(lambda stack, i=layer: stack[i], stacks), x, read)
+                elif given(self, names[0]):
+                    params: Any = tuple(self.get_variable("params", name) for name in names)
+                    frame_out, x, left = by_parameters(params, x, read)
+                else:
+                    frame_out, x, left = one_layer(block(name=names[0]), block(name=names[1]), x, read)
+                if memory is not None and left is not None:
+                    memory = memory.updated(layer, left)
                 if layer in sizes.key_layers:
-                    key_tokens.append(jnp.concatenate(outputs, axis=-1).astype(config.dtype))
-        last = jnp.concatenate([tokens[:, :, :num_special] for tokens in made[-1]], axis=-1)
-        return WindowTokens(jnp.stack(key_tokens, axis=1), last), memory
+                    key.append(joined(frame_out, x).astype(config.dtype))
+            last = joined(frame_out[:, :, :num_special], x[:, :, :num_special])
+            return WindowTokens(jnp.stack(key, axis=1), last), memory
+
+        def as_loop(x: jax.Array, memory: FixedMemory | None) -> WindowTokens:
+            rows, read = in_loop(memory, sizes.depth)
+            # Every layer writes to the place of the next key layer, whose own tokens come there last.
+            places = np.searchsorted(sizes.key_layers, range(sizes.depth))
+            key = jnp.zeros((batch, places[-1] + 1, *shape[1:-1], 2 * width), config.dtype)
+
+            def body(carry: Any, layer: Any) -> tuple[tuple[jax.Array, jax.Array, jax.Array], None]:
+                x, key, _ = carry
+                params, place, row = layer
+                frame_out, x, _ = by_parameters(params, x, read(row))
+                made = joined(frame_out, x).astype(config.dtype)
+                key = jax.lax.dynamic_update_index_in_dim(key, made, place, axis=1)
+                return (x, key, frame_out[:, :, :num_special]), None
+
+            (x, key, last), _ = jax.lax.scan(body, (x, key, x[:, :, :num_special]), (stacks, places, rows))
+            return WindowTokens(key[:, : len(sizes.key_layers)], joined(last, x[:, :, :num_special]))
+
+        if stacks is not None and (memory is None or isinstance(memory, FixedMemory)):
+            return as_loop(x, memory), memory
+        return one_by_one(x, memory)
 
     def _special_tokens(self, starts_sequence: jax.Array, frames: int, width: int) -> jax.Array:
         """Camera and register tokens [B, K, 5, C]: copy 0 for the sequence's first frame, copy 1 for others."""
@@ -180,17 +182,3 @@ class Aggregator(ShapeCheck, nn.Module):
         copies = jnp.concatenate([camera, register], axis=2)[0]
         is_first = starts_sequence[:, None] & (jnp.arange(frames) == 0)
         return jnp.where(is_first[..., None, None], copies[0], copies[1])
-
-
-def _alike(depth: int, outlets: set[int], memory: Memory | None, *, stacked: bool) -> Iterator[range]:
-    """The layers in runs that can be one loop: all or none of a run hand out what they make, all or none read the
-    memory, and if they do it is one that stays as it is. Layers that are not stacked run one by one."""
-
-    def kind(layer: int) -> Any:
-        if not stacked or not (memory is None or isinstance(memory, FixedMemory)):
-            return layer
-        return layer in outlets, memory is not None and memory.at(layer) is not None
-
-    for _, alike in itertools.groupby(range(depth), kind):
-        layers = list(alike)
-        yield range(layers[0], layers[-1] + 1)

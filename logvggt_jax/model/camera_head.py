@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+from typing import Any
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -10,6 +13,7 @@ from logvggt_jax.config import CameraHeadConfig
 from logvggt_jax.model.initializers import constant
 from logvggt_jax.model.layers import MLP, Block, dense, layer_norm
 from logvggt_jax.model.memory import Memory, RoundMemory
+from logvggt_jax.model.parameters import run
 from logvggt_jax.model.shape_check import ShapeCheck
 
 
@@ -46,6 +50,21 @@ class CameraHead(ShapeCheck, nn.Module):
         empty = self.param("empty_pose_tokens", constant(0.0), (1, 1, 9))
         plain = layer_norm(1e-6, "adaptive_norm", affine=False)(tokens)
 
+        stack = self.get_variable("params", "trunk") if self.has_variable("params", "trunk") else None
+
+        def block(**options: Any) -> Block:
+            return Block(
+                config.num_heads,
+                4,
+                epsilon=1e-5,
+                layer_scale=config.layer_scale,
+                implementation=self.implementation,
+                **options,
+            )
+
+        def one_of_stack(z: jax.Array, params: Any) -> tuple[jax.Array, None]:
+            return run(block(parent=None), params, z, valid=camera_mask)[0], None
+
         def one_round(
             module: CameraHead, carry: tuple[jax.Array, jax.Array, Memory | None], own: Memory | None
         ) -> tuple[tuple[jax.Array, jax.Array, Memory | None], tuple[jax.Array, Memory | None]]:
@@ -55,17 +74,17 @@ class CameraHead(ShapeCheck, nn.Module):
             features = jax.nn.silu(dense(width, "embed_pose")(embedded))
             shift, scale, gate = jnp.split(dense(3 * width, "modulation")(features), 3, axis=-1)
             z = gate * (plain * (1.0 + scale) + shift) + tokens
-            for i in range(config.depth):
-                z, left = Block(
-                    config.num_heads,
-                    4,
-                    epsilon=1e-5,
-                    layer_scale=config.layer_scale,
-                    implementation=self.implementation,
-                    name=f"trunk_{i}",
-                )(z, valid=camera_mask, memory=None if seen is None else seen.at(i))
-                if seen is not None and left is not None:
-                    seen = seen.updated(i, left)
+            if stack is not None and seen is None:
+                z, _ = jax.lax.scan(one_of_stack, z, stack)
+            else:
+                for i in range(config.depth):
+                    if stack is None:
+                        one_block: Any = block(name=f"trunk_{i}")
+                    else:
+                        one_block = functools.partial(run, block(parent=None), jax.tree.map(lambda x, i=i: x[i], stack))
+                    z, left = one_block(z, valid=camera_mask, memory=None if seen is None else seen.at(i))
+                    if seen is not None and left is not None:
+                        seen = seen.updated(i, left)
             z = layer_norm(1e-5, "trunk_norm")(z)
             pose = jax.lax.stop_gradient(pose) + MLP(width // 2, 9, "float32", name="pose_branch")(z)
             emitted = jnp.concatenate([pose[..., :7], jax.nn.relu(pose[..., 7:])], axis=-1)
@@ -75,6 +94,9 @@ class CameraHead(ShapeCheck, nn.Module):
         shape = (*tokens.shape[:2], 9)
         first = jnp.broadcast_to(empty, shape)
         initial = jnp.broadcast_to(jnp.asarray(config.initial_pose, jnp.float32), shape)
+        if not self.is_initializing():
+            # For a backward pass a round keeps what enters it and is run again, which is cheap.
+            one_round = nn.remat(one_round, prevent_cse=False)
         rounds = nn.scan(one_round, variable_broadcast="params", split_rngs={"params": False}, length=config.iterations)
         (_, _, shared), (encodings, each) = rounds(self, (first, initial, memory.shared), memory.each)
         return jnp.moveaxis(encodings, 0, 2), RoundMemory(each, shared)

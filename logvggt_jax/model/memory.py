@@ -7,10 +7,14 @@ is pruned is another, and so is a mask or a merging of the block's own tokens, w
 
 from __future__ import annotations
 
+import abc
 from collections.abc import Callable
-from typing import NamedTuple, Protocol, Self
+from typing import Any, NamedTuple, Protocol, Self
 
 import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
 
 
 class Keys(NamedTuple):
@@ -76,14 +80,56 @@ class Memory(Protocol):
         ...
 
 
-class FixedMemory:
-    """A memory that blocks read and leave as it is, of the same form at all layers that read it: they may run as one
-    loop."""
+class FixedMemory(abc.ABC):
+    """A memory that blocks read and leave as it is, of the same form at all layers that read it: all layers may run as
+    one loop, see `in_loop`."""
+
+    @abc.abstractmethod
+    def at(self, layer: int) -> LayerMemory | None:
+        """What the block of `layer` (0-based) reads; None where it sees its own tokens alone."""
 
     def updated(self, layer: int, memory: LayerMemory) -> Self:
         """The same."""
         del layer, memory
         return self
+
+
+def in_loop(memory: FixedMemory | None, depth: int) -> tuple[Any, Callable[[Any], LayerMemory | None]]:
+    """A memory for `depth` layers that run as one loop: a pytree with a row for each of them, over which the loop runs,
+    and the function that makes of a layer's row what its block reads."""
+    reads = [None if memory is None else memory.at(layer) for layer in range(depth)]
+    there = [read for read in reads if read is not None]
+    if not there:
+        return None, lambda row: None
+    stored = jax.tree.map(lambda *read: jnp.stack(read), *there)
+    if len(there) == depth:
+        return stored, lambda row: row
+    is_there = np.array([read is not None for read in reads])
+    return (np.cumsum(is_there) - is_there, is_there), lambda row: _OfSomeLayers(stored, *row)
+
+
+@struct.dataclass
+class _OfSomeLayers:
+    """What the block of one layer reads in a loop of which some layers alone read anything.
+
+    Attributes:
+      stored: what those layers read, with a leading axis of them.
+      place: int32, the layer's place among them.
+      is_there: bool, whether the layer is one of them.
+    """
+
+    stored: LayerMemory
+    place: jax.Array
+    is_there: jax.Array
+
+    def attend(self, own: OwnTokens, attention: Attend, project: Project) -> tuple[jax.Array, LayerMemory]:
+        """Takes the layer's memory out where it is read, so that other layers have no work with it."""
+
+        def with_memory() -> jax.Array:
+            read: LayerMemory = jax.tree.map(lambda x: x[self.place], self.stored)
+            return read.attend(own, attention, project)[0]
+
+        return jax.lax.cond(self.is_there, with_memory, lambda: attention(own.query, own.keys)), self
 
 
 class RoundMemory(NamedTuple):

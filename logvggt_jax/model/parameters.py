@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from typing import Any
 
 import flax.linen as nn
@@ -21,8 +21,8 @@ from logvggt_jax.config import ModelConfig
 
 Variables = dict[str, Any]
 
-_LAYER = re.compile(r"(.*_)?block_(\d+)")
-_STACK = re.compile(r"(.*_)?blocks")
+_LAYER = re.compile(r"(.*block|trunk)_(\d+)")
+_STACK = re.compile(r"(.*_)?blocks|trunk")
 # The camera head computes in float32 whatever the compute type.
 _COMPUTE_TYPE_PARTS = ("encoder", "aggregator", "depth_head", "point_head", "gccr")
 
@@ -76,8 +76,8 @@ def whole(params: Any) -> Any:
 def stack_layers(tree: Any) -> Any:
     """A tree of parameters (or of an optimiser's moments) with the layers of deep stacks as one.
 
-    `frame_block_0` … `frame_block_23` become `frame_blocks` with a leading axis of layers, likewise `global_blocks` and
-    the encoder's `blocks`; what is stacked already stays.
+    `frame_block_0` … `frame_block_23` become `frame_blocks` with a leading axis of layers; likewise `global_blocks`,
+    the encoder's `blocks` and the camera head's `trunk`. What is stacked already stays.
     """
 
     def stack(node: Any) -> Any:
@@ -87,7 +87,7 @@ def stack_layers(tree: Any) -> Any:
         others: dict[str, Any] = {}
         for name, inner in node.items():
             if match := _LAYER.fullmatch(name):
-                families.setdefault(f"{match[1] or ''}blocks", {})[int(match[2])] = inner
+                families.setdefault(match[1].replace("block", "blocks"), {})[int(match[2])] = inner
             else:
                 others[name] = inner
         for name, layers in families.items():
@@ -97,22 +97,29 @@ def stack_layers(tree: Any) -> Any:
     return jax.tree.map(stack, tree, is_leaf=_has_layers)
 
 
-def unstack_layers(tree: Any, config: ModelConfig, take: Callable[[Any, int], Any] = lambda x, layer: x[layer]) -> Any:
+def unstack_layers(
+    tree: Any,
+    config: ModelConfig,
+    take: Callable[[Any, int], Any] = lambda x, layer: x[layer],
+    *,
+    kept: Container[str] = (),
+) -> Any:
     """Inverse of `stack_layers` for a model of these sizes; `take` makes one layer's leaf of a stacked one.
 
-    Stacks without leaves, which an optimiser's state has for what is frozen, come apart as well.
+    Stacks without leaves, which an optimiser's state has for what is frozen, come apart as well; those of the names
+    `kept` stay as they are.
     """
+    depths = {"blocks": config.encoder.depth, "trunk": config.camera_head.depth}
 
     def unstack(node: Any) -> Any:
         if not _is_stacked(node):
             return node
         layers: dict[str, Any] = {}
         for name, inner in node.items():
-            if not _STACK.fullmatch(name):
+            if name in kept or not is_stack(name):
                 layers[name] = inner
                 continue
-            depth = config.encoder.depth if name == "blocks" else config.aggregator.depth
-            for layer in range(depth):
+            for layer in range(depths.get(name, config.aggregator.depth)):
                 layers[f"{name.removesuffix('s')}_{layer}"] = jax.tree.map(lambda x, i=layer: take(x, i), inner)
         return layers
 
@@ -129,7 +136,7 @@ def _has_layers(node: Any) -> bool:
 
 
 def _is_stacked(node: Any) -> bool:
-    return isinstance(node, dict) and any(_STACK.fullmatch(name) for name in node)
+    return isinstance(node, dict) and any(map(is_stack, node))
 
 
 def in_compute_type(variables: Variables, config: ModelConfig) -> Variables:

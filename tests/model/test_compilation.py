@@ -87,14 +87,16 @@ def test_lowers_and_compiles_for_a_cpu_within_a_minute() -> None:
 
 
 def test_kernels_are_counted_as_often_as_they_run() -> None:
-    def step(carried: tuple[jax.Array, ...], _: None) -> tuple[tuple[jax.Array, ...], None]:
-        return tuple(jnp.sin(x @ x) for x in carried), None
+    def step(carried: tuple[jax.Array, ...], dear: jax.Array) -> tuple[tuple[jax.Array, ...], None]:
+        last = jax.lax.cond(dear, lambda x: jnp.sin(x @ x), jnp.sin, carried[-1])
+        return (*(jnp.sin(x @ x) for x in carried[:-1]), last), None
 
     factors = tuple(jnp.eye(64) * (1 + i) for i in range(6))
-    program = jax.jit(lambda x: jax.lax.scan(step, x, None, length=5)[0]).lower(factors).compile().as_text()
+    which = jnp.arange(5) == 2
+    program = jax.jit(lambda x: jax.lax.scan(step, x, which)[0]).lower(factors).compile().as_text()
     assert "/*index=5*/" in program, "a tuple so wide that XLA numbers it"
     found = kernels(program)
-    assert found["products"].count == 6 * 5
+    assert found["products"].count == 6 * 5, "a condition as its dearest branch"
     # Two operands, which are one array, and the result.
     assert found["products"].size >= 6 * 5 * 2 * 4 * 64 * 64
     assert found["attention"] == (0, 0) == found["convolutions"]

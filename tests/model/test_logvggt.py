@@ -114,20 +114,30 @@ def test_training_runs_a_frozen_encoder_once_a_frame(small_config):
     assert gradient == pytest.approx(forward, rel=1e-3)
 
 
-@pytest.mark.parametrize("cross_window", [True, False])
-def test_layers_as_a_loop_are_the_layers_one_by_one(small_config, small_variables, cross_window):
-    """The encoder's; and the aggregator's, of two key layers that read the cache in one loop, two others in another,
-    and layers that have no neighbour of their kind."""
-    sizes = dataclasses.replace(small_config.aggregator, depth=8, key_layers=(0, 1, 4, 6))
+@pytest.mark.parametrize(
+    ("key_layers", "cross_window"), [((0, 1, 3, 4), True), ((0, 1, 3, 5), True), ((0, 1, 3, 4), False)]
+)
+def test_layers_as_a_loop_are_the_layers_one_by_one(small_config, small_variables, key_layers, cross_window):
+    """The encoder's; the aggregator's, of which some read the cache, the last one or not, or none; the trunk's."""
+    sizes = dataclasses.replace(small_config.aggregator, depth=6, key_layers=key_layers)
     encoder = dataclasses.replace(small_config.encoder, depth=2)
+    head = dataclasses.replace(small_config.camera_head, depth=3)
     windows = dataclasses.replace(small_config.windows, cross_window=cross_window)
-    model = LogVGGT(dataclasses.replace(small_config, encoder=encoder, aggregator=sizes, windows=windows))
-    params = {part: dict(small_variables["params"][part]) for part in ("encoder", "aggregator")}
-    params["encoder"]["block_1"] = jax.tree.map(lambda x: x * 1.1, params["encoder"]["block_0"])
-    for kind in ("frame", "global"):
-        for layer in range(4, 8):
-            like = params["aggregator"][f"{kind}_block_{layer - 4}"]
-            params["aggregator"][f"{kind}_block_{layer}"] = jax.tree.map(lambda x: x * 1.1, like)
+    model = LogVGGT(
+        dataclasses.replace(small_config, encoder=encoder, aggregator=sizes, camera_head=head, windows=windows)
+    )
+
+    def deeper(part: str, family: str, depth: int) -> None:
+        first = sum(name.startswith(family) and name[len(family) :].isdigit() for name in params[part])
+        for layer in range(first, depth):
+            like = params[part][f"{family}{layer % first}"]
+            params[part][f"{family}{layer}"] = jax.tree.map(lambda x: x * 1.1, like)
+
+    params = {part: dict(small_variables["params"][part]) for part in ("encoder", "aggregator", "camera_head")}
+    deeper("encoder", "block_", 2)
+    deeper("aggregator", "frame_block_", 6)
+    deeper("aggregator", "global_block_", 6)
+    deeper("camera_head", "trunk_", 3)
     variables = {"params": params}
     stacks = jax.jit(stack_layers)(variables)
     jax.tree.map(np.testing.assert_array_equal, unstack_layers(jax.device_get(stacks), model.config), variables)
@@ -140,7 +150,12 @@ def test_layers_as_a_loop_are_the_layers_one_by_one(small_config, small_variable
         shapes,
     )
     tokens = generator.standard_normal((1, 4, *state.patch_tokens.shape[2:]), np.float32)
-    for function, inputs in ((model.windows.encode, (video(),)), (model.windows.attend, (state, tokens))):
+    cameras, count = generator.standard_normal((1, 5, 2 * tokens.shape[-1]), np.float32), np.array([4], np.int32)
+    for function, inputs in (
+        (model.windows.encode, (video(),)),
+        (model.windows.attend, (state, tokens)),
+        (model.refinement.decode_cameras, (cameras, count)),
+    ):
         loop, one_by_one = (jax.jit(function)(each, *inputs) for each in (stacks, variables))
         jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=2e-5, atol=2e-5), loop, one_by_one)
 

@@ -12,11 +12,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from logvggt_jax.config import ModelConfig
 from logvggt_jax.model.aggregator import WindowTokens
 from logvggt_jax.model.initialization import variable_shapes
 from logvggt_jax.model.logvggt import LogVGGT
-from logvggt_jax.model.parameters import Variables, stack_layers
 from logvggt_jax.model.refinement import Span, num_triggers
 from logvggt_jax.model.windows import num_windows
 from logvggt_jax.operations import count_flops
@@ -48,12 +46,6 @@ class PartTime:
     temporary_bytes: int | None
 
 
-def loop_shapes(config: ModelConfig) -> Variables:
-    """Shapes of a model's parameters with deep stacks as loops: the same operations, of which each is traced once."""
-    shapes: Variables = jax.eval_shape(stack_layers, variable_shapes(config))
-    return shapes
-
-
 def sequence_parts(model: LogVGGT, num_frames: int, image_size: tuple[int, int]) -> list[Part]:
     """Everything that a sequence of `num_frames` frames of `image_size` (H, W) runs, as `LogVGGT.apply` does.
 
@@ -62,7 +54,7 @@ def sequence_parts(model: LogVGGT, num_frames: int, image_size: tuple[int, int])
     config = model.config
     stride, overlap = config.windows.stride, config.windows.size - config.windows.stride
     windows = num_windows(num_frames, config.windows.size, stride)
-    variables = loop_shapes(model.config)
+    variables = variable_shapes(model.config)
 
     def images(count: int) -> jax.ShapeDtypeStruct:
         return jax.ShapeDtypeStruct((1, count, *image_size, 3), jnp.uint8)
@@ -98,7 +90,7 @@ def _refinement_parts(model: LogVGGT, num_frames: int) -> list[Part]:
     triggers = num_triggers(num_frames, size)
     # The last trigger has its full size, see `Refinement.fire_all`.
     count = triggers * size
-    variables = loop_shapes(model.config)
+    variables = variable_shapes(model.config)
     tokens = jax.ShapeDtypeStruct((1, count, width), jnp.float32)
     scalar, lengths = jax.ShapeDtypeStruct((), jnp.int32), jax.ShapeDtypeStruct((1,), jnp.int32)
     span = Span(scalar, scalar, lengths, lengths)  # type: ignore[arg-type]
@@ -119,7 +111,7 @@ def flops_by_part(model: LogVGGT, num_frames: int, image_size: tuple[int, int]) 
     Attention is counted in its XLA form, of whose products the other kernels do no fewer.
     """
     model = LogVGGT(dataclasses.replace(model.config, attention="xla"))
-    variables = loop_shapes(model.config)
+    variables = variable_shapes(model.config)
     counts = dict.fromkeys(PARTS, 0.0)
     for part in sequence_parts(model, num_frames, image_size):
         counts[part.name] += part.calls * count_flops(part.function, variables, *part.arguments)

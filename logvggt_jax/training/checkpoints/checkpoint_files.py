@@ -22,7 +22,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 from logvggt_jax.compile import out_of_device_memory
 from logvggt_jax.errors import InputError, disk_errors, one_line
 from logvggt_jax.files import atomic_folder, to_disk
-from logvggt_jax.model.parameters import stack_layers, unstack_layers
+from logvggt_jax.model.parameters import is_stack, stack_layers, unstack_layers
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.step.state import TrainState
 from logvggt_jax.weights.checkpoints import read_arrays, write_arrays, writing_with_orbax
@@ -95,8 +95,8 @@ class StoredCheckpoint:
                 if found != meta["digest"]:
                     raise InputError(f"{self.where} is damaged: position and settings differ from their digest")
         self._digests: Mapping[str, Any] = meta["digests"]
-        # Earlier versions kept every layer's parameters and moments by themselves.
-        self._stacked = meta.get("layers") == "stacked"
+        # Earlier versions kept the layers of some stacks, or of all, by themselves.
+        self._stacks = {part for name in self._digests["params"] for part in name.split("/") if is_stack(part)}
         self.step, self.position, self.config = meta["step"], Position(meta["stage"], data), meta["config"]
 
     def read(self, like: TrainState, config: TrainConfig) -> TrainState:
@@ -104,7 +104,7 @@ class StoredCheckpoint:
 
         Raises DamagedCheckpoint where it cannot be read.
         """
-        params, rest = _parts(like if self._stacked else unstack_layers(like, config.model, _one_layer))
+        params, rest = _parts(unstack_layers(like, config.model, _one_layer, kept=self._stacks))
         parts = {"params": params, "state": rest}
         with self._damage():
             read = {name: read_arrays(self._folder / name, _abstract(tree)) for name, tree in parts.items()}
@@ -119,7 +119,7 @@ class StoredCheckpoint:
         for name, tree in zip(("params", "state"), _parts(state), strict=True):
             with self._damage():
                 verify_digests(tree, self._digests[name], self.where)
-        return state if self._stacked else stack_layers(state)
+        return stack_layers(state)
 
     @contextlib.contextmanager
     def _damage(self) -> Iterator[None]:

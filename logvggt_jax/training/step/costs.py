@@ -14,6 +14,7 @@ from jax.sharding import Mesh
 
 from logvggt_jax.compile import out_of_device_memory
 from logvggt_jax.config import ModelConfig
+from logvggt_jax.model.initialization import variable_shapes
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.operations import count_flops
 from logvggt_jax.training.config import TrainConfig
@@ -70,9 +71,9 @@ def abstract_clips(
 def step_flops(config: ModelConfig, clips: tuple[int, ...]) -> float:
     """Operations of a step on clips [B, T, H, W] over all devices: forward and gradient, nothing computed twice."""
     model = LogVGGT(dataclasses.replace(config, attention="xla"))
-    params, images = abstract_parameters(config), jax.ShapeDtypeStruct((*clips, 3), jnp.uint8)
-    forward = count_flops(lambda p, x: model.apply({"params": p}, x), params, images)
-    encoder = count_flops(lambda p, x: model.windows.encode({"params": p}, x), params, images)
+    # Layer by layer: in a loop a layer that reads the cache would stand for all.
+    variables, images = variable_shapes(config), jax.ShapeDtypeStruct((*clips, 3), jnp.uint8)
+    forward, encoder = (count_flops(function, variables, images) for function in (model.apply, model.windows.encode))
     # The gradient of a product is two of the kind; a frozen encoder has none.
     return 3 * forward - 2 * encoder if config.encoder.frozen else 3 * forward
 

@@ -1,7 +1,7 @@
 """Parameters that do not move, chosen by patterns of their names.
 
 A name is the path in the tree that is trained, in which deep stacks are one: `encoder/blocks/mlp/fc1/kernel`,
-`aggregator/global_blocks/attention/query/kernel`, `camera_head/trunk_0/norm1/scale`. Patterns have the wildcards of
+`aggregator/global_blocks/attention/query/kernel`, `camera_head/trunk/norm1/scale`. Patterns have the wildcards of
 `fnmatch`, where `*` stands for slashes too: `encoder/*` is the whole encoder.
 """
 

@@ -13,7 +13,6 @@ from logvggt_jax.evaluation.costs.parts import (
     Part,
     flops_by_part,
     live_device_bytes,
-    loop_shapes,
     sequence_parts,
     time_part,
 )
@@ -60,7 +59,7 @@ def test_parts_add_up_to_the_whole_model(small_config: ModelConfig, options: dic
 def test_gccr_is_below_a_hundredth_of_vggt_1b() -> None:
     """On shapes alone: a thousand frames of 392 x 518, GCCR against the backbone, the largest part."""
     model = LogVGGT(ModelConfig(dtype="bfloat16", attention="xla"))
-    variables = loop_shapes(model.config)
+    variables = variable_shapes(model.config)
     parts = [part for part in sequence_parts(model, 1000, (392, 518)) if part.name in ("backbone", "GCCR")]
     counts = dict.fromkeys(("backbone", "GCCR"), 0.0)
     for part in parts:

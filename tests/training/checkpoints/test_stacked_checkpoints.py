@@ -1,4 +1,4 @@
-"""Checkpoints of earlier versions, whose every layer stood by itself."""
+"""Checkpoints of earlier versions, in which layers stood by themselves: all of them, or those of the trunk."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import orbax.checkpoint as ocp
+import pytest
 
 from logvggt_jax.model.parameters import stack_layers
 from logvggt_jax.training.checkpoints.checkpoint_files import Position
@@ -17,10 +18,12 @@ from logvggt_jax.training.step.state import TrainState, initial_state
 from logvggt_jax.weights.checkpoints import digests
 
 
+@pytest.mark.parametrize("blocks", ["apart", "stacked"])
 def test_a_checkpoint_layer_by_layer_is_taken_up_as_stacks(
-    run_config: TrainConfig, optimizer_config: OptimizerConfig, tmp_path: Path
+    blocks: str, run_config: TrainConfig, optimizer_config: OptimizerConfig, tmp_path: Path
 ) -> None:
     generator = np.random.default_rng(0)
+    depth = run_config.model.camera_head.depth
 
     def layer() -> dict[str, np.ndarray]:
         return {"kernel": generator.standard_normal((3, 4)).astype(np.float32)}
@@ -28,8 +31,10 @@ def test_a_checkpoint_layer_by_layer_is_taken_up_as_stacks(
     params = {
         "encoder": {"block_0": layer(), "norm": layer()},
         "aggregator": {f"{kind}_block_{i}": layer() for kind in ("frame", "global") for i in range(4)},
-        "camera_head": layer(),
+        "camera_head": {"trunk_norm": layer(), **{f"trunk_{i}": layer() for i in range(depth)}},
     }
+    if blocks == "stacked":
+        params |= {part: stack_layers(params[part]) for part in ("encoder", "aggregator")}
     optimizer = make_optimizer(optimizer_config, params, frozen=("encoder/*",))
     state = initial_state(params, optimizer)
     state = jax.tree.map(lambda x: x + generator.standard_normal(x.shape).astype(x.dtype), state)
@@ -40,6 +45,7 @@ def test_a_checkpoint_layer_by_layer_is_taken_up_as_stacks(
         "config": run_config.to_dict(),
         "digests": {"params": digests(state.params), "state": digests(rest)},
         "libraries": {},
+        **({"layers": "stacked"} if blocks == "stacked" else {}),
     }
     # They were written by Orbax's manager, with files of its own beside ours.
     with ocp.CheckpointManager(tmp_path / "checkpoints") as manager:
@@ -59,4 +65,5 @@ def test_a_checkpoint_layer_by_layer_is_taken_up_as_stacks(
         restored, position = checkpoints.restore(like)
     assert position == Position(1, {})
     assert restored.params["aggregator"]["global_blocks"]["kernel"].shape == (4, 3, 4)
+    assert restored.params["camera_head"]["trunk"]["kernel"].shape == (depth, 3, 4)
     jax.tree.map(np.testing.assert_array_equal, restored, wanted)
