@@ -22,6 +22,7 @@ GROUND_FLOOR = {
     "terminal",
     "page",
     "program_flags",
+    "program_text",
 }
 # What each part may import besides itself and the ground floor.
 ALLOWED: dict[str, set[str]] = {

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import re
 import time
 from typing import Any
@@ -17,15 +16,15 @@ from logvggt_jax.config import ModelConfig
 from logvggt_jax.model.initialization import variable_shapes
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.operations import count_flops
+from logvggt_jax.program_text import ProgramText, bytes_of
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.parallel.sharding import split
 from logvggt_jax.training.step.program import abstract_parameters, make_program
 
+# What is exchanged in the background is counted where it ends, with the result's own shape.
 _COLLECTIVE = re.compile(
-    r"= (.*?) (all-reduce|all-gather|reduce-scatter|all-to-all|collective-permute)(?:-start)?\(", re.MULTILINE
+    r" = (.*?) (all-reduce|all-gather|reduce-scatter|all-to-all|collective-permute|ragged-all-to-all)(?:-done)?\("
 )
-
-_ARRAY = re.compile(r"([a-z]+)(\d*)[a-z0-9]*\[([\d,]*)\]")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +34,7 @@ class StepCosts:
     Attributes:
       arguments: bytes of parameters, moments and the batch; the new state takes the old one's place.
       temporaries: bytes at the most.
-      collectives: exchanges between devices, by name: how many and the bytes of their results.
+      collectives: exchanges between devices in a step, by name: how many and the bytes of their results.
       compilation: seconds.
     """
 
@@ -105,22 +104,16 @@ def step_costs(
 
 
 def collectives(program: str) -> dict[str, tuple[int, int]]:
-    """Number and bytes of the exchanges between devices in a compiled program's text, by name.
+    """Number and bytes of the exchanges between devices in a run of a compiled program, from its text, by name.
 
-    One in a loop counts once. The training step exchanges its sums outside of all loops; parameters in parts are put
-    together within them.
+    One in a loop counts as often as the loop runs, see `ProgramText.runs`: the training step exchanges its sums outside
+    of all loops, while parameters in parts are put together within them.
     """
     found: dict[str, tuple[int, int]] = {}
-    for shapes, name in _COLLECTIVE.findall(program):
-        count, total = found.get(name, (0, 0))
-        found[name] = count + 1, total + bytes_of(shapes)
+    text = ProgramText(program)
+    for computation, times in text.runs().items():
+        for line in text.lines[computation]:
+            if match := _COLLECTIVE.search(line):
+                count, total = found.get(match[2], (0, 0))
+                found[match[2]] = count + times, total + times * bytes_of(match[1])
     return found
-
-
-def bytes_of(shapes: str) -> int:
-    """Bytes of the arrays whose types and shapes a compiled program's text has, such as `(bf16[2,3]{1,0}, pred[])`."""
-    size = 0
-    for kind, bits, shape in _ARRAY.findall(shapes):
-        items = math.prod(int(side) for side in shape.split(",") if side)
-        size += items * (1 if kind == "pred" else max(1, int(bits) // 8))
-    return size

@@ -47,14 +47,33 @@ def test_what_the_compiler_refuses_does_not_fit(
     assert step_costs(run_config, data_mesh(1), 1, 2, SIZE) is None
 
 
-def test_collectives_are_read_from_the_program() -> None:
+def test_collectives_are_counted_as_often_as_they_run() -> None:
     program = """
-      %all-reduce.1 = (f32[10,2]{1,0}, bf16[3]{0}) all-reduce(%a, %b), replica_groups={{0,1}}
-      %all-reduce-start = f32[] all-reduce-start(%c)
-      %all-reduce-done = f32[] all-reduce-done(%all-reduce-start)
-      ROOT %g = pred[7]{0} all-gather(%d)
-    """
-    assert collectives(program) == {"all-reduce": (2, 80 + 6 + 4), "all-gather": (1, 7)}
+%body (p: f32[8]) -> f32[8] {
+  %p = f32[8]{0} parameter(0)
+  %start = (f32[2]{0}, f32[8]{0}) all-gather-start(%p)
+  ROOT %done = f32[8]{0} all-gather-done(%start)
+}
+
+%fused (q: f32[8]) -> f32[4] {
+  %q = f32[8]{0} parameter(0)
+  ROOT %r = f32[4]{0} reduce-scatter(%q)
+}
+
+ENTRY %main (a: f32[8]) -> f32[] {
+  %a = f32[8]{0} parameter(0)
+  %all-reduce.1 = (f32[10,2]{1,0}, bf16[3]{0}) all-reduce(%a, %b), replica_groups={{0,1}}
+  %loop = f32[8]{0} while(%a), condition=%c, body=%body, backend_config={"known_trip_count":{"n":"24"}}
+  %parts = f32[4]{0} fusion(%loop), kind=kCustom, calls=%fused
+  %all-reduce-start = f32[] all-reduce-start(%parts)
+  ROOT %all-reduce-done = f32[] all-reduce-done(%all-reduce-start)
+}
+"""
+    assert collectives(program) == {
+        "all-reduce": (2, 80 + 6 + 4),
+        "all-gather": (24, 24 * 32),
+        "reduce-scatter": (1, 16),
+    }
 
 
 def test_clips_have_the_shapes_of_a_batch() -> None:
