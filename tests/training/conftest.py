@@ -1,6 +1,7 @@
 """A model that compiles at once, clips with uneven masks, and the settings of a short run."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -62,10 +63,20 @@ def pixel_parameters() -> dict[str, Any]:
     }
 
 
-def use_pixel_model(loop: Any) -> None:
-    """Gives a process's `training.loop` the model that compiles at once, whatever its settings say."""
-    params = pixel_parameters()
-    loop.LogVGGT = PixelModel
+def layered_parameters() -> dict[str, Any]:
+    """Parameters of `parallel_runs.LayeredModel`: four layers, sixteen wide."""
+    generator = np.random.default_rng(3)
+
+    def normal(*shape: int) -> np.ndarray:
+        return (0.2 * generator.standard_normal(shape)).astype(np.float32)
+
+    blocks = {"kernel": normal(4, 16, 16), "bias": normal(4, 16)}
+    return {**pixel_parameters(), "aggregator": {"embed": {"kernel": normal(3, 16)}, "frame_blocks": blocks}}
+
+
+def use_model(loop: Any, model: Callable[[ModelConfig], Any], params: dict[str, Any]) -> None:
+    """Gives a process's `training.loop` this model and its first parameters, whatever its settings say."""
+    loop.LogVGGT = model
     loop.initial_parameters = lambda *_, **__: jax.tree.map(jnp.array, params)
     loop.abstract_parameters = lambda _: jax.eval_shape(lambda: params)
 
@@ -84,15 +95,8 @@ def layered(small_config: ModelConfig, pixel_model: PixelModel) -> Any:
 
 
 @pytest.fixture(scope="session")
-def layered_params(pixel_params: Any) -> dict[str, Any]:
-    """Parameters of `LayeredModel`: four layers, sixteen wide."""
-    generator = np.random.default_rng(3)
-
-    def normal(*shape: int) -> np.ndarray:
-        return (0.2 * generator.standard_normal(shape)).astype(np.float32)
-
-    blocks = {"kernel": normal(4, 16, 16), "bias": normal(4, 16)}
-    return {**pixel_params, "aggregator": {"embed": {"kernel": normal(3, 16)}, "frame_blocks": blocks}}
+def layered_params() -> dict[str, Any]:
+    return layered_parameters()
 
 
 @pytest.fixture(scope="session")

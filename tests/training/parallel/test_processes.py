@@ -3,7 +3,6 @@
 import platform
 import re
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -12,7 +11,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from pixel_program import PIXEL_MODEL, PIXEL_SETTINGS
+from pixel_program import PixelRuns, free_port
 from root_programs import RootPrograms
 
 from logvggt_jax.errors import InputError
@@ -75,59 +74,6 @@ def test_half_an_address_is_refused() -> None:
         join_processes(coordinator="localhost:1234")
     with pytest.raises(InputError, match="--coordinator=localhost: expected HOST:PORT"):
         join_processes(coordinator="localhost", num_processes=2, process_id=1)
-
-
-class PixelRuns:
-    """Two processes of `train.py` with the model that compiles at once; ended when the block is left.
-
-    `patches` are Python statements for each process, run before training.
-    """
-
-    def __init__(
-        self, programs: RootPrograms, *workdirs: Path, patches: tuple[str, str] = ("", ""), flags: tuple[str, ...] = ()
-    ) -> None:
-        address = f"localhost:{_free_port()}"
-        self.processes = [
-            programs.start(
-                "train.py",
-                *PIXEL_SETTINGS,
-                f"--workdir={workdir}",
-                "--distributed",
-                f"--coordinator={address}",
-                "--num_processes=2",
-                f"--process_id={number}",
-                *flags,
-                first=f"{PIXEL_MODEL}\n{patch}",
-            )
-            for number, (workdir, patch) in enumerate(zip(workdirs, patches, strict=True))
-        ]
-
-    def __enter__(self) -> "PixelRuns":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for process in self.processes:
-            process.send_signal(signal.SIGKILL)
-            process.wait()
-
-    def training(self) -> None:
-        """Waits for a line of a step after the first."""
-        output, end = self.processes[0].output, time.monotonic() + 600
-        while not (output.exists() and "\nstep 10/" in output.read_text()):
-            assert time.monotonic() < end, self.processes[0].error.read_text()
-            time.sleep(0.05)
-
-    def errors(self, process: int) -> str:
-        """What a process said on standard error until its end, without what the libraries say at the start."""
-        self.processes[process].wait()
-        lines = self.processes[process].error.read_text().splitlines(keepends=True)
-        return "".join(line for line in lines if not line.startswith(("[Gloo]", "rendering rooms")))
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("localhost", 0))
-        return int(probe.getsockname()[1])
 
 
 @pytest.mark.parametrize("lost", [1, pytest.param(0, marks=pytest.mark.slow)])
@@ -278,7 +224,7 @@ def test_a_process_that_never_joins_is_waited_for_as_long_as_stated(programs: Ro
 
 @pytest.mark.slow
 def test_two_processes_train_one_model(tmp_path: Path) -> None:
-    address = f"localhost:{_free_port()}"
+    address = f"localhost:{free_port()}"
     together = [
         started(
             tmp_path / "two",
