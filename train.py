@@ -33,7 +33,14 @@ with one_line_at_ctrl_c("train.py"):
     from logvggt_jax.training.config import TrainConfig
     from logvggt_jax.training.dry_run import described_mesh, dry_run
     from logvggt_jax.training.loop import NonFiniteTraining, train
-    from logvggt_jax.training.parallel.joining import JOIN_SECONDS, LOSS_SECONDS, check_processes, join_processes
+    from logvggt_jax.training.parallel.agreement import EndedElsewhere
+    from logvggt_jax.training.parallel.joining import (
+        ENDING_SECONDS,
+        JOIN_SECONDS,
+        LOSS_SECONDS,
+        check_processes,
+        join_processes,
+    )
     from logvggt_jax.training.parallel.lifeline import Lifeline
     from logvggt_jax.training.parallel.sharding import data_mesh, use_cpu_cores
     from logvggt_jax.training.preflight import preflight
@@ -134,9 +141,11 @@ def _fail(error: BaseException, watched: Lifeline | None) -> NoReturn:
         raise error
     if several:
         if watched is not None:
+            # Most often because another process is gone, which the lifeline then says in a line.
             if isinstance(error, jax.errors.JaxRuntimeError):
-                # Most often because another process is gone, which the lifeline then says in a line.
                 watched.wait(LOSS_SECONDS)
+            elif isinstance(error, EndedElsewhere):
+                watched.wait(ENDING_SECONDS)
             watched.fail(f"{type(error).__name__}: {one_line(error):.500}")
         # At once: the others wait for this process's share of a step, and it would wait for them at the exit.
         print(f"process {os.getpid()} on {platform.node()}: {message}", file=sys.stderr, flush=True)

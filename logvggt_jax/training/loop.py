@@ -23,7 +23,13 @@ from logvggt_jax.training.checkpoints.run_checkpoints import RunCheckpoints
 from logvggt_jax.training.config import StageConfig, TrainConfig
 from logvggt_jax.training.feeding.batches import stage_batches
 from logvggt_jax.training.feeding.device_batches import DeviceBatches
-from logvggt_jax.training.parallel.agreement import Vote, any_process, check_agreement, check_shared
+from logvggt_jax.training.parallel.agreement import (
+    Vote,
+    any_process,
+    check_agreement,
+    check_shared,
+    raise_together,
+)
 from logvggt_jax.training.parallel.sharding import check_batch_size
 from logvggt_jax.training.parallel.watchdog import Watchdog
 from logvggt_jax.training.reporting.intervals import report_interval
@@ -42,6 +48,9 @@ from logvggt_jax.training.steps_in_flight import StepsInFlight
 from logvggt_jax.training.teaching.run_data import open_data
 from logvggt_jax.training.validation.earlier import VALIDATION_SET, is_best, is_validated, validation_digest
 from logvggt_jax.training.validation.validation import Validation, validation_line
+
+# Of a process, in words.
+NO_CLIPS = "can read no more clips"
 
 
 class NonFiniteTraining(RuntimeError):
@@ -180,7 +189,7 @@ class _Run:
         for index, stage, end, source in left:
             with (
                 source,
-                DeviceBatches(source, self.mesh) as batches,
+                DeviceBatches(source, self.mesh, ahead=self.vote.notice + 1) as batches,
                 memory_explained(stage, self.mesh, self.programs.values()),
             ):
                 self._compile(stage, source.sizes, log)
@@ -205,20 +214,11 @@ class _Run:
     ) -> tuple[int, bool]:
         """Steps up to `end`, or fewer if the run is to stop; the number of steps done, and whether it is to stop."""
         config = self.config
-        logged = saved = step
         self.times.begin()
+        raise_together(self._data_failure(batches, end - step), NO_CLIPS)
         while step < end:
-            try:
-                with self.times.waiting():
-                    batch = next(batches)
-            except Exception:
-                # Of several processes the others wait in a step that this one has no share for.
-                if jax.process_count() == 1 and step > saved:
-                    self.in_flight.finish()
-                    if step > logged:
-                        self._log(step, end, stage, batches.broken_clips, log)
-                    self._save(Position(index, batches.get_state()))
-                raise
+            with self.times.waiting():
+                batch = next(batches)
             program = self.programs[batch["images"].shape]
             self.profiler.before(step + 1)
             self.state, metrics, finite = program(self.state, batch)
@@ -229,24 +229,25 @@ class _Run:
                 self.in_flight.finish()
                 self.profiler.stop()
 
-            ending = self._reason_to_end(stop)
+            ending, failure = self._reason_to_end(stop, batches, end - step)
             saving = step % config.save_every == 0 or step == end or ending is not None
             # Intervals begin anew after a save, where a run that is killed goes on.
             if step % config.log_every == 0 or step == 1 or saving or self._failing():
                 self.in_flight.finish()
                 self._log(step, end, stage, batches.broken_clips, log)
-                logged = step
             self.checkpoints.check()
             position = Position(index, batches.get_state())
             if self._failing():
                 self._fail(step, position)
             if saving:
                 self._save(position)
-                saved = step
             if self._validation_is_due(step):
                 self._validate(step, log)
             if ending is not None:
                 log.say(f"stopping after step {step}: {ending}; run the same command to go on")
+                with self.watchdog.other("the save"):
+                    self.checkpoints.wait()
+                raise_together(failure, NO_CLIPS)
                 return step, True
         return step, False
 
@@ -337,11 +338,25 @@ class _Run:
         self.checkpoints.wait()
         return f", the best {name} so far"
 
-    def _reason_to_end(self, stop: StopRequest) -> str | None:
-        reason = None
+    def _data_failure(self, batches: DeviceBatches, left: int) -> BaseException | None:
+        """What keeps this process from one of the batches that it needs until all can have stopped; waits for them.
+
+        Those of the `left` steps of the stage, no later ones.
+        """
+        with self.times.waiting():
+            return batches.failure(min(self.vote.notice + 1, left))
+
+    def _reason_to_end(
+        self, stop: StopRequest, batches: DeviceBatches, left: int
+    ) -> tuple[str | None, BaseException | None]:
+        """Why the run ends after this step, in words, None where it does not; what keeps this process from going on."""
+        reason, failure = None, None
         if stop.reason is not None:
             reason = f"received {stop.reason}"
         elif self.deadline is not None and time.monotonic() > self.deadline:
             reason = f"max_minutes={self.config.max_minutes} are over"
+        elif (failure := self._data_failure(batches, left)) is not None:
+            reason = "no more clips can be read"
         # A process that left alone would let the others wait for its share of the next step for ever.
-        return (reason or "another process is to stop") if self.vote(reason is not None) else None
+        ending = (reason or "another process is to stop") if self.vote(reason is not None) else None
+        return ending, failure

@@ -22,6 +22,16 @@ conftest.use_model(
     loop, lambda config: LayeredModel(config, conftest.PixelModel(config)), conftest.layered_parameters()
 )
 """
+# Likewise: no batch of this process can be read after so many examples, as where its readers are killed.
+READERS_KILLED = """
+from logvggt_jax.data.feeding import batches
+read = batches.BatchIterator._read
+def killed(stream):
+    if stream.get_state()["examples"] == {}:
+        raise batches.InputError("reading workers were killed")
+    return read(stream)
+batches.BatchIterator._read = killed
+"""
 # Flags of a run that does not end by itself; a test may add others, of which the last counts.
 PIXEL_SETTINGS = (
     "--config=configs/tiny.py",

@@ -1,6 +1,7 @@
 """Runs: interrupted ones end like uninterrupted ones; damaged or foreign checkpoints are refused by name."""
 
 import dataclasses
+import multiprocessing
 import os
 import re
 import shutil
@@ -18,6 +19,7 @@ import pytest
 from dazzled_model import DazzledModel
 from jax.sharding import Mesh
 
+from logvggt_jax.data.feeding.batches import BatchIterator
 from logvggt_jax.data.feeding.clips import ClipReader
 from logvggt_jax.data.registry import open_dataset
 from logvggt_jax.errors import InputError
@@ -28,7 +30,6 @@ from logvggt_jax.training.checkpoints import run_checkpoints
 from logvggt_jax.training.checkpoints.checkpoint_files import Position
 from logvggt_jax.training.checkpoints.run_checkpoints import RunCheckpoints
 from logvggt_jax.training.config import VALIDATION_METRICS, SourceConfig, StageConfig, TrainConfig, ValidationConfig
-from logvggt_jax.training.feeding.device_batches import DeviceBatches
 from logvggt_jax.training.loop import NonFiniteTraining, train
 from logvggt_jax.training.parallel.sharding import data_mesh
 from logvggt_jax.training.reporting.metrics_log import MetricsLog, read_metrics
@@ -316,19 +317,41 @@ def test_a_work_folder_that_is_a_file_is_refused_before_data_are_read(
 def test_data_that_fail_leave_a_checkpoint(
     run_config: TrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    draw = DeviceBatches.__next__
-    calls: list[int] = []
+    draw = BatchIterator.__next__
 
-    def fail(batches: DeviceBatches) -> Any:
-        calls.append(1)
-        if len(calls) == 3:
+    def fail(batches: BatchIterator) -> Any:
+        if batches.get_state()["examples"] == 2 * run_config.stages[0].batch_size:
             raise InputError("the disk is gone")
         return draw(batches)
 
-    monkeypatch.setattr(DeviceBatches, "__next__", fail)
+    monkeypatch.setattr(BatchIterator, "__next__", fail)
     with pytest.raises(InputError, match="the disk is gone"):
         train(run_config, tmp_path, mesh=data_mesh(2))
     assert RunCheckpoints(tmp_path, run_config).steps[-1] == 2
+
+
+@pytest.mark.usefixtures("forked_workers")
+def test_a_reading_process_that_is_killed_leaves_a_checkpoint(
+    run_config: TrainConfig, straight: tuple[TrainState, Path], tmp_path: Path
+) -> None:
+    def kill_readers() -> None:
+        for child in multiprocessing.active_children():
+            if "grain" in child.name and child.pid is not None:
+                os.kill(child.pid, signal.SIGKILL)
+
+    workers = dataclasses.replace(run_config, data=dataclasses.replace(run_config.data, worker_count=1))
+    error = r"reading workers were killed 1 times .*exit code -9"
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(InputError, match=error):
+        patch.setattr("logvggt_jax.data.feeding.batches._MOST_RESTARTS", 0)
+        _at_step(patch, 1, kill_readers)
+        train(workers, tmp_path, mesh=data_mesh(2))
+    with RunCheckpoints(tmp_path, run_config) as checkpoints:
+        last = checkpoints.steps[-1]
+    # Those that had been read by then, the save of step 3 apart.
+    assert 1 <= last < run_config.stages[0].steps
+    assert [entry["step"] for entry in _numbers(tmp_path)] == [*range(1, last + 1)]
+    _same(train(run_config, tmp_path, mesh=data_mesh(2)), straight[0])
+    assert _numbers(tmp_path) == _numbers(straight[1])
 
 
 def test_a_line_shows_the_mean_of_its_interval(

@@ -29,6 +29,10 @@ SHARED_SECONDS = 60.0
 ANSWER_SECONDS = 60.0
 
 
+class EndedElsewhere(InputError):
+    """The run ends for an error of another process, which says there what it is."""
+
+
 def any_process(wants: bool) -> bool:
     """Whether this is true of at least one process; all processes have to ask at the same point."""
     return bool(np.any(from_all(np.array(wants))))
@@ -39,6 +43,16 @@ def from_all(values: np.ndarray) -> np.ndarray:
     if jax.process_count() == 1:
         return values[None]
     return np.asarray(multihost_utils.process_allgather(values))
+
+
+def raise_together(failure: BaseException | None, what: str) -> None:
+    """Raises this process's `failure`, or EndedElsewhere where only others have one; all processes have to ask at the
+    same point. `what` says of a process that it fails, in words."""
+    failed = np.flatnonzero(from_all(np.array(failure is not None)))
+    if failure is not None:
+        raise failure
+    if failed.size:
+        raise EndedElsewhere(f"{', '.join(f'process {process}' for process in failed)} {what}; its output says why")
 
 
 class Exchange:
@@ -84,20 +98,24 @@ class Vote:
 
     All processes cast a vote in the same steps, and each reads the answer `delay` steps later, when the devices are
     done with it: so all of them stop after the same step.
+
+    Attributes:
+      notice: steps that follow the one in whose vote a process was for stopping, and that it has to take part in.
     """
 
     def __init__(self, mesh: Mesh, *, delay: int) -> None:
-        self._mesh, self._delay = mesh, delay
+        self._mesh = mesh
+        self.notice = 0 if jax.process_count() == 1 else delay
         self._any = jax.jit(jnp.any, out_shardings=replicated(mesh))
         self._cast: deque[jax.Array] = deque()
 
     def __call__(self, wants: bool) -> bool:
-        """Casts this step's vote; whether one was for stopping `delay` steps ago. A process alone has its own way."""
+        """Casts this step's vote; whether one was for stopping `notice` steps ago. A process alone has its own way."""
         if jax.process_count() == 1:
             return wants
         local = np.full(len(self._mesh.local_devices), wants)
         self._cast.append(self._any(jax.make_array_from_process_local_data(split(self._mesh), local)))
-        return len(self._cast) > self._delay and bool(self._cast.popleft())
+        return len(self._cast) > self.notice and bool(self._cast.popleft())
 
 
 def check_agreement(what: str, value: Any) -> None:

@@ -18,6 +18,8 @@ JOIN_SECONDS = 120.0
 HEARTBEAT_SECONDS = SHUTDOWN_SECONDS = 60
 # An operation with the others fails at once when one is lost; so long it takes at most to hear which.
 LOSS_SECONDS = 2.0
+# A process that has an error ends its reading processes before it tells the others.
+ENDING_SECONDS = 30.0
 _LIFELINE_KEY = "logvggt/lifeline"
 
 

@@ -14,7 +14,7 @@ class Failing(Rooms):
     """Rooms of which one cannot be read."""
 
     def read(self, sequence, indices):
-        if sequence == self.sequences[0]:
+        if sequence == self.sequences[1]:
             raise OSError(f"{sequence}: cannot be read")
         return super().read(sequence, indices)
 
@@ -26,9 +26,10 @@ def source(rooms: type[Rooms] = Rooms, renderer: str = "host") -> BatchIterator:
     return training_batches({"rooms": read}, **options)
 
 
-def test_reading_ahead_changes_neither_batches_nor_state() -> None:
+@pytest.mark.parametrize("ahead", [1, 3])
+def test_reading_ahead_changes_neither_batches_nor_state(ahead: int) -> None:
     mesh = data_mesh(2)
-    with source() as plain, source() as ahead, DeviceBatches(ahead, mesh) as batches:
+    with source() as plain, source() as read, DeviceBatches(read, mesh, ahead=ahead) as batches:
         assert batches.get_state() == plain.get_state()
         for _ in range(5):
             expected, found = next(plain), next(batches)
@@ -61,16 +62,24 @@ def test_each_device_draws_its_own_clips() -> None:
                 np.testing.assert_array_equal(value, following[name])
 
 
-def test_an_error_waits_for_the_batch_that_it_belongs_to() -> None:
+@pytest.mark.parametrize("ahead", [1, 3])
+def test_an_error_is_known_ahead_and_waits_for_the_batch_that_it_belongs_to(ahead: int) -> None:
     with source(Failing) as plain:
         good = 0
         with pytest.raises(OSError, match="cannot be read"):
             while True:
                 next(plain)
                 good += 1
-    with source(Failing) as ahead, DeviceBatches(ahead, data_mesh(1)) as batches:
-        for _ in range(good):
+    assert good == 3
+    with source(Failing) as read, DeviceBatches(read, data_mesh(1), ahead=ahead) as batches:
+        for left in range(good, 0, -1):
+            assert batches.failure(min(ahead, left)) is None
+            assert isinstance(batches.failure(ahead), OSError if left < ahead else type(None))
             next(batches)
         assert batches.get_state()["examples"] == 2 * good
-        with pytest.raises(OSError, match="cannot be read"):
-            next(batches)
+        # However often: no later batch comes in its place.
+        for _ in range(2):
+            assert isinstance(batches.failure(1), OSError)
+            with pytest.raises(OSError, match="cannot be read"):
+                next(batches)
+        assert batches.get_state()["examples"] == 2 * good

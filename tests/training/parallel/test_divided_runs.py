@@ -10,7 +10,7 @@ import jax
 import numpy as np
 import pytest
 from orbax.checkpoint import StandardCheckpointer
-from pixel_program import LAYERED_MODEL, PIXEL_MODEL, PIXEL_SETTINGS, PixelRuns
+from pixel_program import LAYERED_MODEL, PIXEL_MODEL, PIXEL_SETTINGS, READERS_KILLED, PixelRuns
 from root_programs import RootPrograms
 
 from logvggt_jax.training.reporting.metrics_log import read_metrics
@@ -106,6 +106,13 @@ def _parameters(workdir: Path) -> Any:
     return StandardCheckpointer().restore(workdir / "model" / "params")
 
 
+def _same_end(run: Path, alone: Path) -> None:
+    """To the last bit."""
+    ours, theirs = ((folder / "metrics.jsonl").read_bytes() for folder in (run, alone))
+    assert ours == theirs and ours.count(b"loss/total") == 5
+    assert digests(_parameters(run)) == digests(_parameters(alone))
+
+
 def test_two_processes_restore_the_parts_that_they_saved(programs: RootPrograms, tmp_path: Path) -> None:
     patch = ONE_DEVICE + RESTORED
     with PixelRuns(programs, tmp_path, tmp_path, patches=(patch, patch), flags=SETTINGS) as runs:
@@ -122,9 +129,21 @@ def test_two_processes_go_on_from_their_parts_as_if_none_had_been_killed(
     programs: RootPrograms, folder: Path, alone: Path, killed: Path
 ) -> None:
     resumed = _finished_by_two(programs, shutil.copytree(killed, folder / "two"))
-    ours, theirs = ((run / "metrics.jsonl").read_bytes() for run in (resumed, alone))
-    assert ours == theirs and ours.count(b"loss/total") == 5
-    assert digests(_parameters(resumed)) == digests(_parameters(alone))
+    _same_end(resumed, alone)
+
+
+@pytest.mark.slow
+def test_two_processes_go_on_from_where_the_clips_of_one_ended(
+    programs: RootPrograms, folder: Path, alone: Path
+) -> None:
+    workdir = folder / "ended"
+    # The fourth of four batches of four clips.
+    patches = (ONE_DEVICE, ONE_DEVICE + READERS_KILLED.format(12))
+    with PixelRuns(programs, workdir, workdir, patches=patches, flags=_flags(workdir)) as runs:
+        assert [process.wait() for process in runs.processes] == [1, 1]
+        assert "it ended with: InputError: reading workers were killed" in runs.errors(0)
+    assert (workdir / "checkpoints" / "3").is_dir()
+    _same_end(_finished_by_two(programs, workdir), alone)
 
 
 @pytest.mark.slow

@@ -11,10 +11,11 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from pixel_program import PixelRuns, free_port
+from pixel_program import READERS_KILLED, PixelRuns, free_port
 from root_programs import RootPrograms
 
 from logvggt_jax.errors import InputError
+from logvggt_jax.training.checkpoints.checkpoint_files import StoredCheckpoint
 from logvggt_jax.training.parallel import agreement
 from logvggt_jax.training.parallel.agreement import any_process, check_agreement
 from logvggt_jax.training.parallel.joining import check_processes, join_processes
@@ -122,6 +123,24 @@ loop.MetricsLog.write = stop
         # As docs/clusters.md promises: three later at most.
         assert int(found[1]) == 10 + 3
         assert (tmp_path / "checkpoints" / found[1]).is_dir()
+
+
+@pytest.mark.parametrize("batches", [12, 1])
+def test_all_save_where_the_clips_of_one_process_end(batches: int, programs: RootPrograms, tmp_path: Path) -> None:
+    # One that cannot make its first three steps makes none: what they would do is saved as well where it begins.
+    steps = batches if batches >= 3 else 0
+    patches = ("", READERS_KILLED.format(2 * batches))
+    with PixelRuns(programs, tmp_path, tmp_path, patches=patches, flags=("--validation_source=none",)) as runs:
+        errors = [runs.errors(number) for number in range(2)]
+        assert [process.returncode for process in runs.processes] == [1, 1], errors
+        output = runs.processes[0].output.read_text()
+    error = "reading workers were killed"
+    where = re.escape(platform.node())
+    assert re.fullmatch(rf"process \d+ on {where}: train\.py: {error}\n", errors[1]), errors[1]
+    assert errors[0] == f"train.py: process 1 on {platform.node()} was lost, it ended with: InputError: {error}\n"
+    assert (f"stopping after step {steps}: another process is to stop" in output) == (steps > 0), output
+    saved = StoredCheckpoint(tmp_path / "checkpoints" / str(steps))
+    assert saved.step == steps and saved.position.data["examples"] == 2 * steps
 
 
 def test_clips_of_one_process_that_make_an_update_useless_are_named_by_all(
