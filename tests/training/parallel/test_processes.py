@@ -92,15 +92,30 @@ def test_the_loss_of_a_process_ends_the_other_with_one_line(lost: int, programs:
         assert (re.fullmatch if lost else re.search)(line, errors), errors
 
 
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        ("KeyError('a bug')", "KeyError: 'a bug'"),
+        # It may be the consequence of a loss elsewhere, for whose line it waits first.
+        ("jax.errors.JaxRuntimeError('INTERNAL: a bug')", "JaxRuntimeError: INTERNAL: a bug"),
+    ],
+)
 def test_any_exception_ends_its_process_with_a_traceback_and_the_other_with_a_line(
-    programs: RootPrograms, tmp_path: Path
+    error: str, told: str, programs: RootPrograms, tmp_path: Path
 ) -> None:
-    patch = "def fail(run, step, *_):\n    raise KeyError('a bug')\nloop._Run._validate = fail"
+    patch = f"""
+import time, jax
+def fail(*_):
+    print(time.monotonic(), flush=True)
+    raise {error}
+loop._Run._validate = fail
+"""
     with PixelRuns(programs, tmp_path, tmp_path, patches=("", patch), flags=("--config.validation.every=10",)) as runs:
         assert "Traceback" in runs.errors(1) and runs.processes[1].returncode == 1
         errors = runs.errors(0)
+        assert time.monotonic() - float(runs.processes[1].output.read_text().split()[-1]) < 10
         assert runs.processes[0].returncode == 1
-        assert re.fullmatch(r"train.py: process 1 on \S+ was lost, it ended with: KeyError: 'a bug'\n", errors)
+        assert re.fullmatch(rf"train.py: process 1 on \S+ was lost, it ended with: {told}\n", errors), errors
 
 
 def test_a_stop_signal_for_one_process_stops_all_after_the_same_step(programs: RootPrograms, tmp_path: Path) -> None:
