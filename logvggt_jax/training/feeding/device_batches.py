@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -69,7 +68,8 @@ class DeviceBatches(Iterator[Batch]):
     def failure(self, count: int) -> BaseException | None:
         """What keeps one of the next `count` batches, no more than are read ahead, from being handed out; waits until
         that is known."""
-        for batch in itertools.islice((self._following(), *self._later), count):
+        coming: list[Future[Any]] = [self._following(), *self._later]
+        for batch in coming[:count]:
             if (failure := batch.exception()) is not None:
                 return failure
         return None
