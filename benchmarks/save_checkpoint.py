@@ -3,8 +3,8 @@
     python benchmarks/save_checkpoint.py --folder /scratch --step_seconds 2.0
 
 Saves the state of a model whose parameters and two moments have about `--megabytes`, a few times, as training does:
-with digests, and the model folder beside it. The steps wait while the state is copied to the host; the rest happens in
-a thread. `--step_seconds` is what a step of the run in question takes, of which an epoch has 800 (`configs/h20.py`).
+with digests, the model folder beside it, and that kept as the best model, which a validation may find it. The steps
+wait while the state is copied to the host; the rest happens in a thread. `--step_seconds` is what a step of the run in question takes, of which an epoch has 800 (`configs/h20.py`).
 """
 
 from __future__ import annotations
@@ -74,7 +74,9 @@ def main() -> None:
     ):
         for number in range(options.saves):
             begun, used = time.perf_counter(), time.process_time()
-            checkpoints.save(state._replace(step=state.step + number), Position(0, {}))
+            saved = state._replace(step=state.step + number)
+            checkpoints.save(saved, Position(0, {}))
+            checkpoints.save_best(saved)
             waited.append(time.perf_counter() - begun)
             own = time.process_time() - used
             checkpoints.wait()

@@ -46,7 +46,7 @@ from logvggt_jax.training.step.program import abstract_parameters, make_program
 from logvggt_jax.training.step.state import TrainState
 from logvggt_jax.training.steps_in_flight import StepsInFlight
 from logvggt_jax.training.teaching.run_data import open_data
-from logvggt_jax.training.validation.earlier import VALIDATION_SET, is_best, is_validated, validation_digest
+from logvggt_jax.training.validation.earlier import VALIDATION_SET, is_best, validation_digest, validation_of
 from logvggt_jax.training.validation.validation import Validation, validation_line
 
 # Of a process, in words.
@@ -181,11 +181,14 @@ class _Run:
         if step == 0:
             self._save(Position(0, left[0][3].get_state()))
             self.checkpoints.wait()
-        # After a save, and again where the run was killed between the two.
-        if self._validation_is_due(step) and any_process(
-            not log.silent and not is_validated(read_metrics(log.path), step)
-        ):
-            self._validate(step, log)
+        if self._validation_is_due(step):
+            # After a save; the run may have been killed between the two, or before the best model was on the disk.
+            found = None if log.silent else validation_of(read_metrics(log.path), step)
+            if any_process(not log.silent and found is None):
+                self._validate(step, log)
+            else:
+                known = found is not None and found.get(VALIDATION_SET) == validation_digest(self.config)
+                self._keep_if_best(step, found if found is not None and known else {}, log)
         for index, stage, end, source in left:
             with (
                 source,
@@ -310,7 +313,6 @@ class _Run:
         with self.times.other("validation"), self.watchdog.other("the validation"):
             with validation_memory_explained(self.config.validation, self.mesh):
                 values, pictures = self.validation(self.state.averaged)
-            # Before the line of this validation: a run that is killed between the two validates again.
             best = self._keep_if_best(step, values, log)
         log.show(step, pictures)
         log.write(step, values, **{VALIDATION_SET: validation_digest(self.config)})
@@ -323,19 +325,16 @@ class _Run:
         name = None if self.config.validation is None else self.config.validation.best
         if name is None:
             return ""
+        held = self.checkpoints.best_step
         # Process 0 has the earlier values and decides.
-        better = not log.silent and is_best(
-            read_metrics(log.path),
-            step,
-            name,
-            values,
-            held=self.checkpoints.models.best_step,
-            digest=validation_digest(self.config),
+        better = (
+            not log.silent
+            and held != step
+            and is_best(read_metrics(log.path), step, name, values, held=held, digest=validation_digest(self.config))
         )
         if not any_process(better):
             return ""
         self.checkpoints.save_best(self.state)
-        self.checkpoints.wait()
         return f", the best {name} so far"
 
     def _data_failure(self, batches: DeviceBatches, left: int) -> BaseException | None:

@@ -23,6 +23,7 @@ from logvggt_jax.files import check_writable, user_path
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.training.checkpoints.checkpoint_files import Position
 from logvggt_jax.training.checkpoints.run_checkpoints import RunCheckpoints
+from logvggt_jax.training.checkpoints.work_folder import PREFLIGHT
 from logvggt_jax.training.config import SourceConfig, StageConfig, TeacherConfig, TrainConfig, ValidationConfig
 from logvggt_jax.training.feeding.batches import stage_batches
 from logvggt_jax.training.feeding.sources import open_source, open_sources
@@ -204,7 +205,7 @@ def _checkpoint(config: TrainConfig, workdir: Path, mesh: Mesh) -> str:
     shapes = abstract_parameters(config.model)
     program = make_program(LogVGGT(config.model), config, shapes, mesh)
     state = program.initial_state(jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes))
-    folder = workdir / "preflight"
+    folder = workdir / PREFLIGHT
     try:
         with RunCheckpoints(folder, config) as checkpoints:
             started = time.perf_counter()

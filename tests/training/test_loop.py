@@ -610,6 +610,31 @@ def test_a_run_that_is_killed_between_its_best_model_and_the_line_about_it_shows
     assert training is not None and training.steps == min(errors, key=lambda step: errors[step])
 
 
+def test_a_best_model_that_a_kill_kept_from_the_disk_is_made_up_for(run_config: TrainConfig, tmp_path: Path) -> None:
+    values = {f"validation/{name}": 0.0 for name in (*VALIDATION_METRICS, "constant_abs_rel", "identity_rotation")}
+
+    def judge(patch: pytest.MonkeyPatch, *errors: float) -> None:
+        judged = iter(errors)
+        patch.setattr(
+            loop, "Validation", lambda *_: lambda _: Judgement({**values, "validation/abs_rel": next(judged)}, {})
+        )
+
+    config = _validated(run_config, best="abs_rel")
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyError, match="crash"):
+        judge(patch, 0.5, 0.2)
+        keep = RunCheckpoints.save_best
+        patch.setattr(
+            RunCheckpoints, "save_best", lambda self, state: keep(self, state) if int(state.step) == 0 else None
+        )
+        _at_step(patch, 4, _crash)
+        train(config, tmp_path, mesh=data_mesh(2))
+    assert RunCheckpoints(tmp_path, config).best_step == 0
+    with pytest.MonkeyPatch.context() as patch:
+        judge(patch, 0.3)  # what was validated is not validated again
+        train(config, tmp_path, mesh=data_mesh(2))
+    assert RunCheckpoints(tmp_path, config).best_step == 3
+
+
 def test_a_validation_that_fails_has_its_checkpoint_and_is_made_up_for(
     run_config: TrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

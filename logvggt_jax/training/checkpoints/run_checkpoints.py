@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -47,7 +48,10 @@ class RunCheckpoints:
         self._honoured = self.folder / "resumed.json"
         self._lock: FolderLock | None = None
         self._writer = ThreadPoolExecutor(1, "checkpoints")
-        self._pending: Future[None] | None = None
+        self._pending: list[Future[None]] = []
+        # Steps of the last save and of the last best model, on their way or done.
+        self._saved: int | None = None
+        self._best: int | None = None
         # A model without checkpoints is this run's if it was killed before its first one was complete.
         if not self.steps:
             self.models.check_own()
@@ -72,7 +76,7 @@ class RunCheckpoints:
     def __exit__(self, *_: Any) -> None:
         """Ends after the last save; whoever must know how it went calls `wait` before."""
         self._writer.shutdown(wait=True)
-        if self._pending is not None and (failure := self._pending.exception()) is not None:
+        for failure in filter(None, (saving.exception() for saving in self._pending)):
             logging.error("the last save failed: %s", one_line(failure))
         if self._lock is not None:
             self._lock.release()
@@ -82,6 +86,11 @@ class RunCheckpoints:
         """Steps that have a complete checkpoint, oldest first."""
         return sorted(int(entry.name) for entry in self.folder.glob("*") if entry.name.isdecimal())
 
+    @property
+    def best_step(self) -> int | None:
+        """The step of the model in `best`, or of the one that is on its way there; None without either."""
+        return self.models.best_step if self._best is None else self._best
+
     def save(self, state: TrainState, position: Position, *, in_place_of: int | None = None) -> None:
         """Begins to replace the model folder and to write the checkpoint of `state.step`, and returns.
 
@@ -89,31 +98,41 @@ class RunCheckpoints:
         the save before from being written, see `wait`. The checkpoint `in_place_of` goes when this one is complete.
         """
         self.wait()
-        copies = self._copied(state)
-        if jax.process_index() == 0:
-            self._pending = self._writer.submit(self._write, copies, position, in_place_of)
+        copies, self._saved = self._copied(state), int(state.step)
+        self._begin(self._write, copies, position, in_place_of)
 
     def save_best(self, state: TrainState) -> None:
-        """Begins to replace the model folder `best` by this state's parameters, and returns; as `save`."""
-        self.wait()
-        params, step = self._copied(state.averaged), int(state.step)
-        if jax.process_index() == 0:
-            self._pending = self._writer.submit(self._write_best, params, step)
+        """Begins to replace the model folder `best` by this state's parameters, and returns; as `save`, but after the
+        save before and not instead of waiting for it.
+
+        Where that was of the same step, nothing is copied or written: `best` then has the files of `model`.
+        """
+        self._best = step = int(state.step)
+        if step == self._saved:
+            self._begin(self._newest_is_best, step)
+        else:
+            self._begin(self._write_best, self._copied(state.averaged), step)
 
     def check(self) -> None:
         """Raises on process 0 what kept a save from being written, as soon as that is known; waits for nothing."""
-        if self._pending is not None and self._pending.done() and self._pending.exception() is not None:
-            self._pending.result()
+        for saving in self._pending:
+            if saving.done():
+                saving.result()
 
     def wait(self) -> None:
-        """Returns when the last save is complete; raises on every process what kept process 0 from writing it.
+        """Returns when all saves are complete; raises on every process what kept process 0 from writing one.
 
         All processes have to call this at the same point.
         """
-        pending, self._pending = self._pending, None
-        failure = None if pending is None else pending.exception()
+        pending, self._pending = self._pending, []
+        failure = next(filter(None, [saving.exception() for saving in pending]), None)
         if any_process(failure is not None):
             raise failure or DiskError(f"process 0 could not save to {self.folder}; its output says why")
+
+    def _begin(self, write: Callable[..., None], *given: Any) -> None:
+        """Has the writer do this after what it was given before, on process 0."""
+        if jax.process_index() == 0:
+            self._pending.append(self._writer.submit(write, *given))
 
     def restore(self, like: TrainState, *, step: int | None = None) -> tuple[TrainState, Position]:
         """The state at `step` (None: the latest that is not damaged), with the shapes and placement of `like`.
@@ -246,6 +265,11 @@ class RunCheckpoints:
             leaving = self.folder / f".{old}.old"
             (self.folder / str(old)).rename(leaving)
             shutil.rmtree(leaving, ignore_errors=True)
+
+    def _newest_is_best(self, step: int) -> None:
+        # It is not where its save has failed, as `wait` will say.
+        if self.models.newest_step == step:
+            self.models.keep_newest_as_best()
 
     def _write_best(self, params: Any, step: int) -> None:
         _check_room(self.models.best, params)

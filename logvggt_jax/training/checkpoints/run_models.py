@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import os
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import jax
 
-from logvggt_jax.errors import InputError, OutputExists
+from logvggt_jax.errors import InputError, OutputExists, disk_errors
+from logvggt_jax.files import atomic_folder
 from logvggt_jax.model.parameters import unstack_layers
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.weights.checkpoints import check_destination, read_licence, read_provenance, save_model
@@ -36,8 +39,12 @@ class RunModels:
     @property
     def best_step(self) -> int | None:
         """The step of the model in `best`; None without one."""
-        record = read_provenance(self.best).training if is_model_folder(self.best) else None
-        return None if record is None else record.steps
+        return _step_of(self.best)
+
+    @property
+    def newest_step(self) -> int | None:
+        """The step of the model in `model`; None without one."""
+        return _step_of(self.newest)
 
     def check_own(self) -> None:
         """Raises OutputExists for a model that another run or a conversion wrote, by its provenance."""
@@ -52,6 +59,12 @@ class RunModels:
     def write(self, folder: Path, params: Any, step: int) -> None:
         """Replaces one of the folders by these parameters, which are on the host, deep stacks as one."""
         save_model(folder, self._config.model, unstack_layers(params, self._config.model), self._provenance(step))
+
+    def keep_newest_as_best(self) -> None:
+        """Replaces `best` by the very files of `model`, which nobody writes to once they are there; by copies where the
+        file system has no hard links."""
+        with atomic_folder(self.best, replace=True) as fresh, disk_errors(self.best):
+            shutil.copytree(self.newest, fresh, copy_function=_linked_or_copied, dirs_exist_ok=True)
 
     @property
     def _here(self) -> str:
@@ -87,6 +100,19 @@ class RunModels:
             device=f"{jax.device_count()} x {jax.devices()[0].device_kind}",
         )
         return Provenance("windows", longer_edge, self._licence, self._source, record)
+
+
+def _step_of(folder: Path) -> int | None:
+    record = read_provenance(folder).training if is_model_folder(folder) else None
+    return None if record is None else record.steps
+
+
+def _linked_or_copied(source: str, target: str) -> str:
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copy2(source, target)
+    return target
 
 
 def _made_of(configuration: Mapping[str, Any]) -> tuple[Any, Any]:

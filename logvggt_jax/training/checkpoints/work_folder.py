@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 from pathlib import Path
 
-from logvggt_jax.errors import disk_errors
+from logvggt_jax.errors import InputError, disk_errors
+from logvggt_jax.files import FolderLock
+
+# Where `--preflight` writes its checkpoint, within the work folder.
+PREFLIGHT = "preflight"
 
 
 def remove_scratch(workdir: Path) -> None:
-    """Removes what killed saves left in `workdir`: models and checkpoints under temporary names.
+    """Removes what killed saves left in `workdir`, models and checkpoints under temporary names, and what a killed
+    preflight did.
 
     A model that was moved aside for a new one which never came takes its place again. The caller has the folder's lock.
     """
@@ -21,5 +27,9 @@ def remove_scratch(workdir: Path) -> None:
             if aside and not model.exists():
                 aside.pop().rename(model)
         half += [*aside, *workdir.glob(f"{model.name}.*.partial")]
+    if (workdir / PREFLIGHT / ".lock").is_file():
+        with contextlib.suppress(InputError):  # of one that is still at work
+            FolderLock(workdir / PREFLIGHT, "wait").release()
+            half.append(workdir / PREFLIGHT)
     for path in half:
         shutil.rmtree(path, ignore_errors=True)

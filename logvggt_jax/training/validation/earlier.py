@@ -26,16 +26,16 @@ def validation_digest(config: TrainConfig) -> str:
     return json_digest([chosen, settings["teacher"] if labelled else None])
 
 
-def is_validated(lines: Sequence[Mapping[str, Any]], step: int) -> bool:
-    """Whether there is a validation of this step."""
-    return any(line["step"] == step and "validation/abs_rel" in line for line in lines)
+def validation_of(lines: Sequence[Mapping[str, Any]], step: int) -> Mapping[str, Any] | None:
+    """The line of the validation of this step; None where there is none."""
+    return next((line for line in lines if line["step"] == step and "validation/abs_rel" in line), None)
 
 
 def is_best(
     lines: Sequence[Mapping[str, Any]],
     step: int,
     metric: str,
-    values: Mapping[str, float],
+    values: Mapping[str, float | None],
     *,
     held: int | None,
     digest: str,
@@ -55,4 +55,6 @@ def is_best(
         if line["step"] < step and line.get(name) is not None and line.get(VALIDATION_SET, digest) == digest
     }
     rivals = [] if held is None else [known[held]] if held in known else known.values()
-    return math.isfinite(values[name]) and sign * values[name] > max(rivals, default=-math.inf)
+    found = values.get(name)
+    # A line has none for what is no number.
+    return found is not None and math.isfinite(found) and sign * found > max(rivals, default=-math.inf)

@@ -20,6 +20,7 @@ import pytest
 
 from logvggt_jax.config import from_mapping
 from logvggt_jax.errors import DiskError, InputError, OutputExists
+from logvggt_jax.files import FolderLock
 from logvggt_jax.training.checkpoints import checkpoint_files, run_checkpoints
 from logvggt_jax.training.checkpoints import run_models as module
 from logvggt_jax.training.checkpoints.checkpoint_files import Position
@@ -314,6 +315,27 @@ def test_a_best_model_of_a_later_step_is_moved_aside_when_the_run_goes_back(
     assert (saved / "best.aside").is_dir() and not (saved / "best").exists()
 
 
+@pytest.mark.parametrize("links", [True, False])
+def test_a_best_model_of_the_step_that_is_saved_has_the_files_of_the_newest(
+    links: bool, run_config: TrainConfig, state: TrainState, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "unstack_layers", lambda tree, *_: tree)
+    saved = tmp_path / "run"
+    if not links:
+        monkeypatch.setattr(os, "link", lambda *_: (_ for _ in ()).throw(OSError(errno.EOPNOTSUPP, "no links here")))
+    with RunCheckpoints(saved, run_config) as checkpoints:
+        checkpoints.save(_at(state, 2), POSITION)
+        checkpoints.save_best(_at(state, 2))
+        checkpoints.wait()
+        names = sorted(path.relative_to(saved / "best") for path in (saved / "best").rglob("*") if path.is_file())
+        assert names and all((saved / "best" / name).samefile(saved / "model" / name) == links for name in names)
+        before = {name: (saved / "best" / name).read_bytes() for name in names}
+        checkpoints.save(_at(state, 3), POSITION)
+        checkpoints.wait()
+        assert checkpoints.models.best_step == 2 == checkpoints.best_step and checkpoints.models.newest_step == 3
+    assert {name: (saved / "best" / name).read_bytes() for name in names} == before
+
+
 def test_a_best_model_without_room_is_one_line(
     run_config: TrainConfig, state: TrainState, saved: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -422,9 +444,14 @@ def test_what_killed_saves_left_goes_when_the_run_comes_back(
         (saved / name / "params").mkdir(parents=True)
     (saved / "model" / "params").mkdir(parents=True)
     (saved / "notes").mkdir()
+    # Of a preflight that is at work nothing is taken away.
+    lock = FolderLock(saved / "preflight", "wait")
+    with RunCheckpoints(saved, run_config):
+        assert (saved / "preflight").is_dir()
+    lock.release()
     with RunCheckpoints(saved, run_config) as checkpoints:
         assert checkpoints.steps == [0]
-        assert not any((saved / name).exists() for name in left)
+        assert not any((saved / name).exists() for name in (*left, "preflight"))
         assert (saved / "model" / "params").is_dir() and (saved / "notes").is_dir()
     # Killed between two renamings: the old model is the only one.
     (saved / "model").rename(saved / ".model.7-ab.old")
