@@ -15,6 +15,7 @@ from typing import Any
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from logvggt_jax.config import ModelConfig
@@ -77,8 +78,11 @@ def stack_layers(tree: Any) -> Any:
     """A tree of parameters (or of an optimiser's moments) with the layers of deep stacks as one.
 
     `frame_block_0` … `frame_block_23` become `frame_blocks` with a leading axis of layers; likewise `global_blocks`,
-    the encoder's `blocks` and the camera head's `trunk`. What is stacked already stays.
+    the encoder's `blocks` and the camera head's `trunk`. What is stacked already stays. Arrays of numpy stay on the host.
     """
+
+    def stacked(*layers: Any) -> Any:
+        return np.stack(layers) if all(isinstance(layer, np.ndarray) for layer in layers) else jnp.stack(layers)
 
     def stack(node: Any) -> Any:
         if not _has_layers(node):
@@ -91,7 +95,7 @@ def stack_layers(tree: Any) -> Any:
             else:
                 others[name] = inner
         for name, layers in families.items():
-            others[name] = jax.tree.map(lambda *x: jnp.stack(x), *[layers[i] for i in range(len(layers))])
+            others[name] = jax.tree.map(stacked, *[layers[i] for i in range(len(layers))])
         return others
 
     return jax.tree.map(stack, tree, is_leaf=_has_layers)

@@ -142,6 +142,9 @@ def test_layers_as_a_loop_are_the_layers_one_by_one(small_config, small_variable
     stacks = jax.jit(stack_layers)(variables)
     jax.tree.map(np.testing.assert_array_equal, unstack_layers(jax.device_get(stacks), model.config), variables)
     assert stack_layers(stacks)["params"].keys() == stacks["params"].keys()
+    on_host = stack_layers(jax.device_get(variables))
+    assert all(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(on_host)), "no device is asked for room"
+    jax.tree.map(np.testing.assert_array_equal, on_host, stacks)
 
     generator, shapes = np.random.default_rng(0), jax.eval_shape(model.start, variables, video(2))
     # After a window, which has left a cache.

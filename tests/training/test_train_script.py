@@ -1,5 +1,6 @@
 """`train.py` itself: one step of a real model, its validation and its files; and what it says when it ends badly."""
 
+import re
 import shutil
 import subprocess
 from collections.abc import Callable
@@ -93,6 +94,24 @@ def test_the_same_command_goes_on_with_parameters_in_parts(run_train: Callable, 
     earlier, (_, first, second, validation) = (read_metrics(at / "metrics.jsonl") for at in (begun, workdir))
     assert first == earlier[1] and second["step"] == 2
     assert np.isfinite([second["loss/total"], validation["validation/abs_rel"]]).all()
+
+
+@pytest.mark.slow
+def test_a_preflight_tries_all_that_a_run_of_the_real_model_needs(run_train: Callable, tmp_path: Path) -> None:
+    finished = run_train(tmp_path / "run", *batches_of(1), "--preflight")
+    assert finished.returncode == 0, finished.stderr
+    tries = re.findall(
+        r"^(?:all-reduce|work folder|data sets|rooms|validation|checkpoint|step of stage_\d): (.*)$",
+        finished.stdout,
+        re.MULTILINE,
+    )
+    assert len(tries) == 8 and all(re.search(r"\(\d+\.\d s\)$", line) for line in tries)
+    *_, checkpoint, first, second = tries
+    assert re.match(r"0\.\d+ GiB with the model written to .* and deleted", checkpoint)
+    assert re.match(r"1 clips a device of 4 frames at 56x70, 0\.\d+ GiB, compiled", first)
+    assert re.match(r"1 clips a device of 4 frames at 56x70, 0\.\d+ GiB, compiled", second)
+    assert finished.stdout.endswith("preflight: all is well\n")
+    assert not (tmp_path / "run" / "preflight").exists()
 
 
 @pytest.mark.parametrize(
