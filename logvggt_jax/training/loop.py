@@ -78,7 +78,9 @@ def train(
     ends, see `Watchdog`.
 
     Raises InputError for settings, data or a checkpoint that do not fit, in one line, and NonFiniteTraining where
-    `config.max_skipped_in_a_row` updates in a row were not finite; a run that is started again goes on past them.
+    `config.max_skipped_in_a_row` updates in a row were not finite; a run that is started again goes on past them. Where
+    a process can read no more clips all of them save first; it raises what kept it from reading, the others
+    EndedElsewhere.
     """
     for stage in config.stages:
         check_batch_size(stage, mesh, accumulate=config.accumulate)
