@@ -142,7 +142,7 @@ loop.MetricsLog.write = stop
 
 @pytest.mark.parametrize("batches", [12, 1])
 def test_all_save_where_the_clips_of_one_process_end(batches: int, programs: RootPrograms, tmp_path: Path) -> None:
-    # One that cannot make its first three steps makes none: what they would do is saved as well where it begins.
+    # A run that could not save after one of its first three steps makes none of them.
     steps = batches if batches >= 3 else 0
     patches = ("", READERS_KILLED.format(2 * batches))
     with PixelRuns(programs, tmp_path, tmp_path, patches=patches, flags=("--validation_source=none",)) as runs:
@@ -154,6 +154,7 @@ def test_all_save_where_the_clips_of_one_process_end(batches: int, programs: Roo
     assert re.fullmatch(rf"process \d+ on {where}: train\.py: {error}\n", errors[1]), errors[1]
     assert errors[0] == f"train.py: process 1 on {platform.node()} was lost, it ended with: InputError: {error}\n"
     assert (f"stopping after step {steps}: another process is to stop" in output) == (steps > 0), output
+    assert max((entry["step"] for entry in read_metrics(tmp_path / "metrics.jsonl")), default=0) == steps
     saved = StoredCheckpoint(tmp_path / "checkpoints" / str(steps))
     assert saved.step == steps and saved.position.data["examples"] == 2 * steps
 
