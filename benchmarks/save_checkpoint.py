@@ -4,7 +4,8 @@
 
 Saves the state of a model whose parameters and two moments have about `--megabytes`, a few times, as training does:
 with digests, the model folder beside it, and that kept as the best model, which a validation may find it. The steps
-wait while the state is copied to the host; the rest happens in a thread. `--step_seconds` is what a step of the run in question takes, of which an epoch has 800 (`configs/h20.py`).
+wait while the state is copied to the host; the rest happens in a thread. `--step_seconds` is what a step of the run in
+question takes, of which an epoch has 800 (`configs/h20.py`).
 """
 
 from __future__ import annotations

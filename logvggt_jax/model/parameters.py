@@ -78,7 +78,8 @@ def stack_layers(tree: Any) -> Any:
     """A tree of parameters (or of an optimiser's moments) with the layers of deep stacks as one.
 
     `frame_block_0` … `frame_block_23` become `frame_blocks` with a leading axis of layers; likewise `global_blocks`,
-    the encoder's `blocks` and the camera head's `trunk`. What is stacked already stays. Arrays of numpy stay on the host.
+    the encoder's `blocks` and the camera head's `trunk`. What is stacked already stays. Arrays of numpy stay
+    numpy's.
     """
 
     def stacked(*layers: Any) -> Any:
