@@ -88,7 +88,8 @@ def main(arguments: Sequence[str]) -> None:
         sys.exit(f"train.py: unknown argument {arguments[1]!r}; settings are given as --config.NAME=VALUE")
     watched: Lifeline | None = None
     try:
-        enable_compilation_cache(_CACHE.value)
+        # What is compiled for devices that are not here cannot be read back.
+        enable_compilation_cache("none" if _DESCRIBED.value else _CACHE.value)
         config = TrainConfig.from_dict(with_sources(_CONFIG.value.to_dict(), _SOURCES.value, _VALIDATION_SOURCE.value))
         profile = ProfiledSteps.parse(_PROFILE.value) if _PROFILE.value else None
         use_cpu_cores(config, num_processes=_NUM_PROCESSES.value or 1)

@@ -132,7 +132,7 @@ def test_twelve_kills_change_nothing(run_config: TrainConfig, pixel_params: Any,
 
     started = time.monotonic()
     finish(start(tmp_path / "alone"))
-    length, generator = time.monotonic() - started, random.Random(0)
+    length, generator, in_a_save = time.monotonic() - started, random.Random(0), 0
     for _ in range(int(os.environ.get("LOGVGGT_KILLS", "12"))):
         run = start(tmp_path / "killed")
         assert run.stdout is not None
@@ -141,6 +141,10 @@ def test_twelve_kills_change_nothing(run_config: TrainConfig, pixel_params: Any,
         time.sleep(generator.uniform(0.0, length / 2))
         run.send_signal(signal.SIGKILL)
         run.communicate()
+        in_a_save += any(
+            next((tmp_path / "killed").glob(half), None) for half in ("*.partial", "checkpoints/*.partial")
+        )
+    assert in_a_save, "no kill fell into a save"
     finish(start(tmp_path / "killed"))
     ends = [pickle.loads((tmp_path / name / "ended.pickle").read_bytes()) for name in ("alone", "killed")]
     assert digests(ends[0]) == digests(ends[1])
