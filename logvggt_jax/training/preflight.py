@@ -206,17 +206,18 @@ def _checkpoint(config: TrainConfig, workdir: Path, mesh: Mesh) -> str:
     program = make_program(LogVGGT(config.model), config, shapes, mesh)
     state = program.initial_state(jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes))
     folder = workdir / PREFLIGHT
-    try:
-        with RunCheckpoints(folder, config) as checkpoints:
+    with RunCheckpoints(folder, config) as checkpoints:
+        # Within its lock: the folder of another preflight is not this one's to delete.
+        try:
             started = time.perf_counter()
             checkpoints.save(state, Position(0, {}))
             checkpoints.wait()
             seconds = time.perf_counter() - started
-        size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-    finally:
-        any_process(False)  # The others may still look at it.
-        if jax.process_index() == 0:
-            shutil.rmtree(folder, ignore_errors=True)
+            size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+        finally:
+            any_process(False)  # The others may still look at it.
+            if jax.process_index() == 0:
+                shutil.rmtree(folder, ignore_errors=True)
     return f"{size / _GIB:.2f} GiB with the model written to {folder} in {seconds:.1f} s, and deleted"
 
 

@@ -140,9 +140,10 @@ def check_destination(path: Path) -> None:
         raise OutputExists(f"{path}: exists and is not a model folder; give another path or remove it") from error
 
 
-def load_model(path: str | Path) -> tuple[LogVGGT, dict[str, Any]]:
+def load_model(path: str | Path, *, on_host: bool = False) -> tuple[LogVGGT, dict[str, Any]]:
     """The model in a folder and its variables {"params": …}, float32, on the default device until put elsewhere: they
-    are committed to none, so that a program over a mesh takes them as they are.
+    are committed to none, so that a program over a mesh takes them as they are. With `on_host` they are numpy
+    arrays that no device has seen.
 
     `path` is a folder of `save_model`, `logvggt convert` or training (`<workdir>/model`, or `<workdir>` for short), or
     the name of a model that ships with the package: `rooms`, unless a model folder of that name is here.
@@ -166,7 +167,7 @@ def load_model(path: str | Path) -> tuple[LogVGGT, dict[str, Any]]:
     params = restore(path, parameter_shapes(config))
     verify_digests(params, description["digests"], str(path))
     check_finite(params, str(path))
-    return model, {"params": jax.device_put(params)}
+    return model, {"params": params if on_host else jax.device_put(params)}
 
 
 def read_provenance(path_or_repo: str | Path) -> Provenance:
@@ -210,7 +211,7 @@ def read_config(path: str | Path, *, dtype: str | None = None, point_head: bool 
 
 
 def from_pretrained(
-    path_or_repo: str | Path, *, dtype: str | None = None, point_head: bool = False
+    path_or_repo: str | Path, *, dtype: str | None = None, point_head: bool = False, on_host: bool = False
 ) -> tuple[LogVGGT, dict[str, Any]]:
     """A model and its variables from whatever holds weights.
 
@@ -222,6 +223,7 @@ def from_pretrained(
         `owner/name` (`resolve`).
       dtype: Compute type of the model, `float32` or `bfloat16`; None keeps the checkpoint's (VGGT: float32).
       point_head: Keep VGGT's point head. A model folder has it or not.
+      on_host: Give numpy arrays, which no device has seen. Those of a VGGT checkpoint are so in any case.
 
     Raises:
       FileNotFoundError, ValueError: As `load_model`, `open_state_dict` and `params_from_vggt`; one line naming the
@@ -229,7 +231,7 @@ def from_pretrained(
     """
     path = resolve(path_or_repo)
     if path.is_dir() and is_model_folder(path):
-        model, variables = load_model(path)
+        model, variables = load_model(path, on_host=on_host)
         if point_head and model.config.point_head is None:
             raise InputError(f"{path}: the model has no point head; convert VGGT with point_head, or leave it out")
     else:

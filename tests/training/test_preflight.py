@@ -14,6 +14,7 @@ from logvggt_jax.errors import DiskError, InputError
 from logvggt_jax.training import preflight as module
 from logvggt_jax.training.checkpoints.checkpoint_files import Position, write_checkpoint
 from logvggt_jax.training.checkpoints.run_checkpoints import RunCheckpoints
+from logvggt_jax.training.checkpoints.work_folder import PREFLIGHT
 from logvggt_jax.training.config import TeacherConfig, TrainConfig, ValidationConfig
 from logvggt_jax.training.parallel.sharding import data_mesh
 from logvggt_jax.training.preflight import preflight
@@ -171,6 +172,13 @@ def test_all_that_fails_is_named_at_the_end(
     assert "checkpoint: FAILED on process 0: no space left on device" in lines
     assert any("do not fit the memory of a device" in line for line in lines)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_preflight_leaves_the_folder_of_another_one_alone(run_config: TrainConfig, tmp_path: Path) -> None:
+    tried = tmp_path / PREFLIGHT
+    with RunCheckpoints(tried, run_config), pytest.raises(InputError, match="another run is using this folder"):
+        module._checkpoint(run_config, tmp_path, data_mesh(1))
+    assert tried.is_dir()
 
 
 def test_a_source_with_many_broken_clips_fails(run_config: TrainConfig) -> None:

@@ -19,17 +19,18 @@ def initial_parameters(config: ModelConfig, *, seed: int, weights: str | None = 
     """Random parameters, or those of `weights` (a path or hub repository that `from_pretrained` reads); deep stacks as
     one, see `stack_layers`.
 
-    They are made on the host, where JAX has it as a device, and stacked there in any case: devices are for the state
-    alone. Raises what `from_pretrained` does, and InputError naming the first leaf in which they do not fit `config`.
+    They are numpy arrays. Random ones are drawn on the host where JAX has it as a device; where it was told to use the
+    accelerators alone the first of them draws, and keeps nothing. Weights are read and stacked without any device.
+    Raises what `from_pretrained` does, and InputError naming the first leaf in which they do not fit `config`.
     """
-    with _on_host():
-        if weights is None:
-            patch = config.encoder.patch_size
-            model, images = LogVGGT(config), jnp.zeros((1, 1, patch, patch, 3))
-            return stack_layers(jax.device_get(model.init(jax.random.key(seed), images)["params"]))
-        params = from_pretrained(weights, point_head=config.point_head is not None)[1]["params"]
+    if weights is not None:
+        params = from_pretrained(weights, point_head=config.point_head is not None, on_host=True)[1]["params"]
         _check_fit(params, config, weights)
-        return stack_layers(jax.device_get(params))
+        return stack_layers(params)
+    with _on_host():
+        patch = config.encoder.patch_size
+        model, images = LogVGGT(config), jnp.zeros((1, 1, patch, patch, 3))
+        return stack_layers(jax.device_get(model.init(jax.random.key(seed), images)["params"]))
 
 
 def check_weights(config: ModelConfig, weights: str) -> None:
