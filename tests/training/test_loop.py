@@ -281,6 +281,37 @@ def test_checkpoint_of_another_configuration_is_refused(run_config: TrainConfig,
         train(other, finished, mesh=data_mesh(2))
 
 
+def test_a_checkpoint_of_another_model_is_refused_and_stays_as_it_is(
+    run_config: TrainConfig, pixel_params: Any, finished: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Its parameters have other shapes too: it is the settings that are named, not the first array that does not fit.
+    wider = {**pixel_params, "camera_head": {"kernel": np.zeros((5, 9), np.float32), "bias": np.zeros(9, np.float32)}}
+    monkeypatch.setattr(loop, "abstract_parameters", lambda _: jax.eval_shape(lambda: wider))
+    monkeypatch.setattr(loop, "make_program", make_program)
+    model = dataclasses.replace(
+        run_config.model,
+        aggregator=dataclasses.replace(run_config.model.aggregator, depth=6, key_layers=(0, 1, 2, 5)),
+        encoder=dataclasses.replace(run_config.model.encoder, embed_dim=64),
+    )
+    before = _contents(finished)
+    assert {name.parts[0] for name in before} >= {"checkpoints", "model", "metrics.jsonl"}
+    with pytest.raises(InputError) as refused:
+        train(dataclasses.replace(run_config, model=model), finished, mesh=data_mesh(2))
+    message = str(refused.value)
+    assert message.startswith(f"checkpoint of step 6 in {finished}") and "\n" not in message
+    assert (
+        "other settings: model.aggregator.depth=4, now 6; model.aggregator.key_layers[3]=3, now 5; "
+        "model.encoder.embed_dim=32, now 64. Set them back" in message
+    )
+    assert _contents(finished) == before
+
+
+def _contents(folder: Path) -> dict[Path, bytes]:
+    """All files of a folder."""
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return {path.relative_to(folder): path.read_bytes() for path in files}
+
+
 def test_a_run_does_not_go_on_with_sequences_that_grew(
     run_config: TrainConfig, finished: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
