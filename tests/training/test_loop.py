@@ -8,6 +8,7 @@ import shutil
 import signal
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -417,7 +418,14 @@ def test_goodput_counts_earlier_sessions(
 
 def test_a_trace_of_some_steps_is_written(run_config: TrainConfig, tmp_path: Path) -> None:
     train(run_config, tmp_path, mesh=data_mesh(2), profile=ProfiledSteps.parse("3:4"))
-    assert list((tmp_path / "profile").rglob("*.xplane.pb"))
+    (trace,) = (tmp_path / "profile").rglob("*.xplane.pb")
+    profile = jax.profiler.ProfileData.from_file(str(trace))
+    names = [event.name for plane in profile.planes for line in plane.lines for event in line.events]
+    # On the host two steps and no third: the tracer names a function by its file and line.
+    assert len([name for name in names if re.fullmatch(r"\$steps_in_flight\.py:\d+ add", name)]) == 2
+    # On each device two runs of the step's program.
+    runs = Counter(name.split()[0] for name in names if re.fullmatch(r"\[\d+\] .* \(jit_on_all_devices\)", name))
+    assert runs == {"[0]": 2, "[1]": 2}
     with pytest.raises(InputError, match=r"--profile=4:3: expected the first and the last step, such as 20:25"):
         ProfiledSteps.parse("4:3")
 
