@@ -10,7 +10,6 @@ import pytest
 from jax.sharding import Mesh
 from parallel_runs import first_gradient
 
-from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.training.config import LossConfig, OptimizerConfig, StageConfig
 from logvggt_jax.training.parallel.sharding import check_batch_size, data_mesh, parameter_layout, put_batch, replicated
 from logvggt_jax.training.step.optimizer import learning_rate_schedule, make_optimizer
@@ -174,18 +173,3 @@ def test_a_clip_whose_finite_predictions_overflow_its_loss_is_told_from_the_othe
 def test_batches_have_to_split_over_the_devices() -> None:
     with pytest.raises(ValueError, match="stage 'only': batch_size=8 does not split over 3 devices"):
         check_batch_size(STAGES[0], data_mesh(3))
-
-
-@pytest.mark.slow
-def test_real_model_gives_one_gradient_on_any_number_of_devices(
-    small_config: ModelConfig, small_variables: Any, loss_config: LossConfig, clips: Clips
-) -> None:
-    config = dataclasses.replace(small_config, encoder=dataclasses.replace(small_config.encoder, frozen=False))
-    model, params = LogVGGT(config), small_variables["params"]
-    one = _gradients(model, loss_config, data_mesh(1), params, clips)
-    four = _gradients(model, loss_config, data_mesh(4), params, clips)
-    assert four[0]["loss/total"] == pytest.approx(one[0]["loss/total"], rel=1e-5)
-    for module, gradients in one[1].items():
-        difference = jax.tree.map(np.subtract, four[1][module], gradients)
-        norms = [np.sqrt(sum((leaf**2).sum() for leaf in jax.tree.leaves(tree))) for tree in (difference, gradients)]
-        assert norms[0] < 1e-3 * norms[1], module
