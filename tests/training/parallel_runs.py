@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import pickle
+import re
 import socket
 import subprocess
 import sys
@@ -21,9 +22,9 @@ from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 
 from logvggt_jax import LogVGGT, ModelConfig, Predictions
-from logvggt_jax.model.parameters import whole
+from logvggt_jax.model.parameters import is_stack, whole
 from logvggt_jax.training.config import LossConfig, TrainConfig
-from logvggt_jax.training.parallel.sharding import data_mesh, parameter_layout, put_batch
+from logvggt_jax.training.parallel.sharding import Layout, data_mesh, parameter_layout, put_batch
 from logvggt_jax.training.step.program import make_program
 from logvggt_jax.training.step.train_step import loss_and_gradients, make_loss_terms
 from logvggt_jax.weights.digests import whole_array
@@ -55,11 +56,13 @@ class LayeredModel:
 
 
 class Outcome(NamedTuple):
-    """The gradient of the first step and the parameters after the last one, on the host, and the loss of every step."""
+    """The gradient of the first step and the parameters after the last one, on the host, the loss of every step, and
+    the step's program as the compiler tells it."""
 
     gradient: Any
     losses: list[float]
     params: Any
+    program: str
 
 
 def first_gradient(
@@ -94,7 +97,31 @@ def steps(model: Any, config: TrainConfig, params: Any, clips: Clips, mesh: Mesh
             adams = [x for x in jax.tree.leaves(state.opt_state, is_leaf=_is_adam) if _is_adam(x)]
             moments = {name: tree for adam in adams for name, tree in adam.mu.items() if jax.tree.leaves(tree)}
             gradient = jax.tree.map(lambda x: np.asarray(whole_array(x)) / (1 - config.optimizer.b1), moments)
-    return Outcome(gradient, losses, jax.tree.map(lambda x: np.asarray(whole_array(x)), state.params))
+    params = jax.tree.map(lambda x: np.asarray(whole_array(x)), state.params)
+    return Outcome(gradient, losses, params, step.as_text() or "")
+
+
+def exchanged(program: str, kind: str) -> set[tuple[int, ...]]:
+    """Shapes of the arrays that exchanges of this `kind` (`all-gather`, …) of a compiled program give a device."""
+    results = re.findall(rf" = (.*?) {kind}(?:-done)?\(", program)
+    return {
+        tuple(int(side) for side in shape.split(",") if side)
+        for result in results
+        for shape in re.findall(r"\[([\d,]*)\]", result)
+    }
+
+
+def layers_in_parts(params: Any, layout: Layout) -> tuple[set[tuple[int, ...]], set[tuple[int, ...]]]:
+    """Shapes of the parameters that are split, whole and as a device has them; of a stack those of one layer."""
+    found: tuple[set[tuple[int, ...]], set[tuple[int, ...]]] = (set(), set())
+    for path, leaf in jax.tree_util.tree_leaves_with_path(params):
+        names = tuple(str(entry.key) for entry in path)
+        if names in layout.axes:
+            shape = list(leaf.shape[1:] if any(map(is_stack, names)) else leaf.shape)
+            found[0].add(tuple(shape))
+            shape[layout.axes[names]] //= layout.mesh.size
+            found[1].add(tuple(shape))
+    return found
 
 
 def _is_adam(state: Any) -> bool:

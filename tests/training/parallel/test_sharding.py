@@ -11,7 +11,15 @@ import jax
 import numpy as np
 import pytest
 from jax.sharding import PartitionSpec as P
-from parallel_runs import LayeredModel, Outcome, first_gradient, steps, steps_of_processes
+from parallel_runs import (
+    LayeredModel,
+    Outcome,
+    exchanged,
+    first_gradient,
+    layers_in_parts,
+    steps,
+    steps_of_processes,
+)
 
 from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.model.parameters import stack_layers
@@ -28,6 +36,7 @@ from logvggt_jax.training.parallel.sharding import (
     use_cpu_cores,
 )
 from logvggt_jax.training.parallel.watchdog import Watchdog
+from logvggt_jax.training.step.costs import collectives
 from logvggt_jax.training.step.freezing import ENCODER, frozen_leaves
 from logvggt_jax.training.step.program import abstract_parameters, make_program
 from logvggt_jax.training.step.state import TrainState
@@ -172,6 +181,12 @@ def test_a_step_of_the_real_model_in_parts_is_that_of_whole_parameters(
     in_parts = _one_real_step(run_config, clips, shard=True)
     _same_gradient(in_parts, real_step)
     assert in_parts.losses == pytest.approx(real_step.losses, rel=1e-5)
+    # What is put together is one parameter, of a stack that of one layer.
+    params = abstract_parameters(run_config.model)
+    layers, parts = layers_in_parts(params, parameter_layout(params, data_mesh(2), shard=True))
+    gathered, scattered = (exchanged(in_parts.program, kind) for kind in ("all-gather", "reduce-scatter"))
+    assert gathered <= layers and scattered <= parts
+    assert (32, 128) in gathered and (32, 64) in scattered, "a stack's first product, and one of GCCR"
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=2e-5), in_parts.params, real_step.params)
 
 
@@ -195,6 +210,26 @@ def test_twenty_steps_of_the_real_model_are_the_same_on_all_devices_and_in_two_p
     for shard, accumulate in ((False, 1), (True, 2)):
         changed = dataclasses.replace(config, shard_parameters=shard, accumulate=accumulate)
         _same_run(steps_of_processes(changed, params, short, 20, tmp_path, layered=False), alone)
+
+
+def test_a_step_gathers_one_layer_at_a_time_and_scatters_its_gradient(
+    run_config: TrainConfig, layered: LayeredModel, layered_params: Any, clips: Clips
+) -> None:
+    sharded, mesh = dataclasses.replace(run_config, shard_parameters=True), data_mesh(4)
+    layers, parts = layers_in_parts(layered_params, parameter_layout(layered_params, mesh, shard=True))
+    program = steps(layered, sharded, layered_params, clips, mesh, 1).program
+    found = collectives(program)
+    assert layers == {(3, 16), (16, 16)} and exchanged(program, "all-gather") == layers
+    assert exchanged(program, "reduce-scatter") == parts
+    # Forward and again backward, where what was put together is not kept, in each of four rounds of a loop.
+    embed, layer = 4 * 3 * 16, 4 * 16 * 16
+    assert found["all-gather"] == (1 + 2 * 4, embed + 2 * 4 * layer)
+    assert found["reduce-scatter"] == (1 + 4, (embed + 4 * layer) // 4)
+    # Sums over the devices are of what is whole on each, besides some numbers for the log: of no gradient twice.
+    trained = {name: layered_params[name] for name in ("camera_head", "depth_head")}
+    whole = sum(x.nbytes for x in jax.tree.leaves((trained, layered_params["aggregator"]["frame_blocks"]["bias"])))
+    assert whole <= found["all-reduce"][1] < whole + embed
+    assert found.keys() == {"all-gather", "reduce-scatter", "all-reduce"}
 
 
 def _agree(found: Any, expected: Any, *, rel: float) -> None:
