@@ -264,6 +264,43 @@ def test_objective_and_teacher_belong_together(run_config: TrainConfig, tmp_path
     assert TrainConfig.from_dict(kept.to_dict()) == kept
 
 
+@pytest.mark.parametrize("moment", ["weights", "labels"])
+def test_a_teacher_that_does_not_fit_the_device_is_one_line(
+    moment: str,
+    small_config: ModelConfig,
+    small_variables: dict[str, Any],
+    run_config: TrainConfig,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def full(*_: Any, **__: Any) -> None:
+        raise jax.errors.JaxRuntimeError(
+            "RESOURCE_EXHAUSTED: Out of memory while trying to allocate 5 bytes.\nBuffers:"
+        )
+
+    weights = str(tmp_path / "teacher")
+    save_model(Path(weights), small_config, small_variables["params"], Provenance("vggt", 42))
+    config = dataclasses.replace(
+        run_config,
+        loss=dataclasses.replace(run_config.loss, name="distillation"),
+        data=dataclasses.replace(run_config.data, cache_dir=str(tmp_path / "cache")),
+        teacher=TeacherConfig(weights, clip_length=4),
+    )
+    if moment == "weights":
+        monkeypatch.setattr(jax, "device_put", full)
+        said = rf"teacher\.weights={weights} did not fit the memory of cpu: give a smaller teacher"
+    else:
+        monkeypatch.setattr("logvggt_jax.streaming.offline.predict_plain", full)
+        said = (
+            rf"teacher\.weights={weights}: full attention over 4 frames of 28 x 42 pixels did not fit .*clip_length=4"
+        )
+    with pytest.raises(InputError, match=said) as raised:
+        loop.train(config, tmp_path / "run", mesh=data_mesh(1))
+    assert "trying to allocate 5 bytes" in str(raised.value) and "\n" not in str(raised.value)
+    assert not list((tmp_path / "cache").glob("teacher/*")), "no clip of it is taken for labelled"
+    assert not list((tmp_path / "run").glob("checkpoints/*"))
+
+
 def test_errors_count_relative_to_the_teachers_confidence() -> None:
     target, valid = np.ones((2, 1, 2, 2), np.float32), np.ones((2, 1, 2, 2), bool)
     depth = target.copy()

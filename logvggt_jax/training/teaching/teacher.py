@@ -5,8 +5,9 @@ from typing import Protocol
 import numpy as np
 
 from logvggt_jax.errors import InputError
-from logvggt_jax.streaming import open_predictor
+from logvggt_jax.streaming import PredictionError, open_predictor
 from logvggt_jax.streaming.offline import OfflineSettings
+from logvggt_jax.streaming.results import device_memory
 from logvggt_jax.training.config import TeacherConfig
 from logvggt_jax.training.teaching.labels import Labels
 from logvggt_jax.weights.checkpoints import from_pretrained, read_provenance
@@ -29,7 +30,8 @@ class Teacher(Protocol):
 
 
 class PlainVGGT:
-    """The teacher of a run, on the default device. Raises InputError for weights that are not plain VGGT's."""
+    """The teacher of a run, on the default device. Raises InputError for weights that are not plain VGGT's or that do
+    not fit the device's memory."""
 
     def __init__(self, config: TeacherConfig) -> None:
         kind = read_provenance(config.weights).trained_for
@@ -38,15 +40,24 @@ class PlainVGGT:
                 f"teacher.weights={config.weights}: trained for {kind!r}, a teacher is plain VGGT ('vggt'): give "
                 "VGGT-1B as `logvggt convert` writes it, or a checkpoint of it"
             )
-        self._weights = config.weights
-        self._model, self._variables = from_pretrained(config.weights)
-        parts = {"config": self._model.config.to_dict(), "method": METHOD, "params": digests(self._variables["params"])}
-        self.digest = json_digest(parts)
+        self._config = config
+        with device_memory(
+            f"teacher.weights={config.weights}", "give a smaller teacher, or train on devices with more"
+        ):
+            self._model, self._variables = from_pretrained(config.weights)
+            params = digests(self._variables["params"])
+        self.digest = json_digest({"config": self._model.config.to_dict(), "method": METHOD, "params": params})
 
     def label(self, images: np.ndarray) -> Labels:
         """As of `Teacher`. Raises PredictionError where the clip does not fit the device's memory."""
         predictor = open_predictor(METHOD, self._model, self._variables, OfflineSettings(max_frames=None))
-        frames = [*predictor.push(images), *predictor.close()]
+        try:
+            frames = [*predictor.push(images), *predictor.close()]
+        except PredictionError as error:
+            weights, length = self._config.weights, self._config.clip_length
+            raise PredictionError(
+                f"teacher.weights={weights}: {error}; lower teacher.clip_length={length} or the stages' sizes"
+            ) from error
         cameras = predictor.cameras()
         extrinsics = np.tile(np.eye(4, dtype=np.float32), (len(frames), 1, 1))
         extrinsics[:, :3] = cameras.extrinsics
@@ -58,5 +69,7 @@ class PlainVGGT:
         )
         for name, values in labels._asdict().items():
             if not np.isfinite(values).all():
-                raise InputError(f"teacher.weights={self._weights}: its {name} is not finite: it teaches nothing")
+                raise InputError(
+                    f"teacher.weights={self._config.weights}: its {name} is not finite: it teaches nothing"
+                )
         return labels
