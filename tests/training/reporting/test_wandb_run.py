@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 from rich.console import Console
 
 from logvggt_jax.errors import InputError, MissingPackage
@@ -83,3 +84,31 @@ def test_what_keeps_it_from_beginning_is_one_line(
     monkeypatch.setitem(sys.modules, "wandb", None)
     with pytest.raises(MissingPackage, match=r'pip install "logvggt-jax\[wandb\]"'):
         WandbRun("rooms", tmp_path, {})
+
+
+@pytest.mark.slow
+def test_the_real_library_keeps_a_run_on_the_disk_until_it_is_synced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("wandb")
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    workdir, picture = tmp_path / "run", np.arange(72, dtype=np.uint8).reshape(4, 6, 3)
+    for first in (0, 1):
+        with (
+            WandbRun("rooms", workdir, {"seed": 1234567}) as run,
+            MetricsLog(workdir, first_step=first, console=Console(quiet=True), wandb=run) as log,
+        ):
+            log.write(first + 1, {"loss/total": 0.5})
+            log.write_times(first + 1, {"productive_seconds": 1.0})
+            log.show(first + 1, {"validation/rooms/clip": picture})
+    identity = (workdir / "wandb_id").read_text()
+    folders = list((workdir / "wandb").glob("offline-run-*"))
+    assert folders and all(folder.name.endswith(f"-{identity}") for folder in folders)
+    records = b"".join((folder / f"run-{identity}.wandb").read_bytes() for folder in folders)
+    for written in (b"rooms", b"1234567", b"loss/total", b"times/productive_seconds", b"validation/rooms/clip"):
+        assert written in records
+    shown = [path for folder in folders for path in (folder / "files").rglob("*.png")]
+    assert {path.name.rpartition("_")[0] for path in shown} == {"clip_1", "clip_2"}
+    for path in shown:
+        np.testing.assert_array_equal(np.asarray(Image.open(path)), picture)
