@@ -44,10 +44,15 @@ from logvggt_jax.weights.checkpoints import digests, load_model, read_provenance
 
 @pytest.fixture(autouse=True)
 def quick(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, pixel_model: Any, pixel_params: Any) -> None:
-    """Runs use the model that compiles at once, but for the slow ones."""
-    if request.node.get_closest_marker("slow") is None:
+    """Runs use the model that compiles at once, but for those of tests that ask for the `real_model`."""
+    if "real_model" not in request.fixturenames:
         _use(monkeypatch, pixel_model, pixel_params)
         monkeypatch.setattr(loop, "make_program", _program)
+
+
+@pytest.fixture
+def real_model() -> None:
+    """Runs use LoG-VGGT."""
 
 
 @pytest.fixture(scope="module")
@@ -778,6 +783,7 @@ def test_a_run_goes_on_when_its_initial_weights_are_gone(
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("real_model")
 def test_real_model_trains_and_leaves_a_model_folder(run_config: TrainConfig, tmp_path: Path) -> None:
     state = train(run_config, tmp_path, mesh=data_mesh(1))
     model, variables = load_model(tmp_path / "model")
