@@ -59,7 +59,7 @@ test: install
 	@echo "Test report: runs/test/report.xml"
 
 test-all: test
-	$(BIN)/python -m pip install --quiet "libtpu>=0.0.30"
+	$(BIN)/python -m pip install --quiet "libtpu>=0.0.30" wandb
 	$(BIN)/python -m pytest -m slow --durations=20 -rA --junitxml=runs/test-all/report.xml
 	@echo "Test reports: runs/test/report.xml, and of the slow tests runs/test-all/report.xml"
 

@@ -78,7 +78,9 @@ _DESCRIBED = flags.DEFINE_string(
     "described", None, "Devices to compile for in place of those at hand, such as v5p:2x2x4 or h100:16; with --dry_run."
 )
 _CACHE = flags.DEFINE_string(
-    "compilation_cache", None, "Folder that keeps compiled programs, `none` for none; by default the user's cache."
+    "compilation_cache",
+    None,
+    "Folder that keeps compiled programs, `none` for none; by default the user's cache. Not for --described.",
 )
 
 
@@ -142,7 +144,7 @@ def _fail(error: BaseException, watched: Lifeline | None) -> NoReturn:
         raise error
     if several:
         if watched is not None:
-            # Most often because another process is gone, which the lifeline then says in a line.
+            # The lifeline says in a line what became of another process, which is most often why.
             if isinstance(error, jax.errors.JaxRuntimeError):
                 watched.wait(LOSS_SECONDS)
             elif isinstance(error, EndedElsewhere):

@@ -11,7 +11,7 @@ _TRIPS = re.compile(r'"known_trip_count":\{"n":"(\d+)"')
 _LOOP = re.compile(r"\bbody=%?([\w.\-]+)")
 _CALL = re.compile(r" call\(.*\bto_apply=%?([\w.\-]+)")
 _FUSED = re.compile(r"\bcalls=%?([\w.\-]+)")
-_CONDITION = re.compile(r"\b(?:true_computation|false_computation|branch_computations)=(\{[^}]*\}|\S+?),")
+_CONDITION = re.compile(r"\b(?:true_computation|false_computation|branch_computations)=(\{[^}]*\}|[^\s,]+)")
 _NAME = re.compile(r"%?([\w.\-]+)")
 _ARRAY = re.compile(r"([a-z]+)(\d*)[a-z0-9]*\[([\d,]*)\]")
 

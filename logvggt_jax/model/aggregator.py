@@ -45,9 +45,9 @@ class Aggregator(ShapeCheck, nn.Module):
 
     Layers run one after the other. Where their parameters come stacked (see `parameters.stack_layers`) all of them are
     one loop, whose body is compiled once; with a memory that they change they run one by one. The loop is what training
-    wants: by itself a layer on a GPU is faster, by a tenth of a stream's step, and in the loop one that reads a memory
-    is told from others only when it runs. With `remat` a stacked layer keeps nothing but its input for the backward
-    pass.
+    wants: by itself a layer on a GPU is faster, by a tenth of a stream's step (README.md), and in the loop one that
+    reads a memory is told from others only when it runs. With `remat` a stacked layer keeps nothing but its input for
+    the backward pass.
     """
 
     config: ModelConfig

@@ -90,6 +90,8 @@ def train(
         check_writable(workdir.expanduser().absolute() / "checkpoints")
     check_shared(workdir)
     with contextlib.ExitStack() as stack:
+        if resume_step is None:
+            RunCheckpoints(workdir, config).resumed_step()  # another configuration's are refused before any work
         # Before gigabytes of weights are read, and unwatched: to label all clips, or to list a disk, takes hours.
         datasets, validated = open_data(config)
         watched = stack.enter_context(Watchdog(watchdog))
@@ -220,7 +222,10 @@ class _Run:
         """Steps up to `end`, or fewer if the run is to stop; the number of steps done, and whether it is to stop."""
         config = self.config
         self.times.begin()
-        raise_together(self._data_failure(batches, end - step), NO_CLIPS)
+        failure = self._data_failure(batches, end - step)
+        with self.watchdog.other("the save"):  # of the stage before: who raises may end the others in the middle of it
+            self.checkpoints.wait()
+        raise_together(failure, NO_CLIPS)
         while step < end:
             with self.times.waiting():
                 batch = next(batches)
@@ -246,6 +251,9 @@ class _Run:
                 self._fail(step, position)
             if saving:
                 self._save(position)
+            if ending is not None:
+                with self.watchdog.other("the save"):
+                    self.checkpoints.wait()
             if self._validation_is_due(step):
                 self._validate(step, log)
             if ending is not None:
@@ -327,13 +335,11 @@ class _Run:
         name = None if self.config.validation is None else self.config.validation.best
         if name is None:
             return ""
-        held = self.checkpoints.best_step
+        better = False
         # Process 0 has the earlier values and decides.
-        better = (
-            not log.silent
-            and held != step
-            and is_best(read_metrics(log.path), step, name, values, held=held, digest=validation_digest(self.config))
-        )
+        if not log.silent and (held := self.checkpoints.best_step) != step:
+            earlier = read_metrics(log.path)
+            better = is_best(earlier, step, name, values, held=held, digest=validation_digest(self.config))
         if not any_process(better):
             return ""
         self.checkpoints.save_best(self.state)

@@ -60,7 +60,7 @@ def preflight(config: TrainConfig, workdir: Path, mesh: Mesh, say: Callable[[str
         started, problem = time.perf_counter(), None
         try:
             found = check()
-        except (InputError, OSError) as error:
+        except (InputError, OSError, jax.errors.JaxRuntimeError) as error:
             found = problem = one_line(error)
         # Whatever the others found: they go on to the next together.
         if any_process(problem is not None):

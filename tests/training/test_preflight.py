@@ -163,12 +163,18 @@ def test_all_that_fails_is_named_at_the_end(
     def full(*_: object, **__: object) -> None:
         raise DiskError("no space left on device")
 
+    def out_of_memory(*_: object) -> None:
+        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: out of memory")
+
     monkeypatch.setattr(RunCheckpoints, "save", full)
     monkeypatch.setattr(module, "device_bytes", lambda device: 2**30)
     monkeypatch.setattr(module, "_read_clips", full)
+    monkeypatch.setattr(module, "_all_reduce", out_of_memory)
     lines: list[str] = []
-    with pytest.raises(InputError, match="4 of the tries failed: rooms, checkpoint, step of first, step of second"):
+    named = "all-reduce, rooms, checkpoint, step of first, step of second"
+    with pytest.raises(InputError, match=f"5 of the tries failed: {named}"):
         preflight(run_config, tmp_path, data_mesh(2), lines.append)
+    assert "all-reduce: FAILED on process 0: RESOURCE_EXHAUSTED: out of memory" in lines
     assert "checkpoint: FAILED on process 0: no space left on device" in lines
     assert any("do not fit the memory of a device" in line for line in lines)
     assert not list(tmp_path.iterdir())

@@ -94,9 +94,9 @@ class StoredCheckpoint:
                 found = json_digest([{name: value for name, value in meta.items() if name != "digest"}, data])
                 if found != meta["digest"]:
                     raise InputError(f"{self.where} is damaged: position and settings differ from their digest")
-        self._digests: Mapping[str, Any] = meta["digests"]
-        # Earlier versions kept the layers of some stacks, or of all, by themselves.
-        self._stacks = {part for name in self._digests["params"] for part in name.split("/") if is_stack(part)}
+            self._digests: Mapping[str, Any] = meta["digests"]
+            # Earlier versions kept the layers of some stacks, or of all, by themselves.
+            self._stacks = {part for name in self._digests["params"] for part in name.split("/") if is_stack(part)}
         self.step, self.position, self.config = meta["step"], Position(meta["stage"], data), meta["config"]
 
     def read(self, like: TrainState, config: TrainConfig) -> TrainState:

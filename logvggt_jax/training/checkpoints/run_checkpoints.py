@@ -102,15 +102,16 @@ class RunCheckpoints:
         self._begin(self._write, copies, position, in_place_of)
 
     def save_best(self, state: TrainState) -> None:
-        """Begins to replace the model folder `best` by this state's parameters, and returns; as `save`, but after the
-        save before and not instead of waiting for it.
+        """Begins to replace the model folder `best` by this state's parameters, and returns.
 
-        Where that was of the same step, nothing is copied or written: `best` then has the files of `model`.
+        Where the save before was of the same step, nothing is copied or written, nor is that save waited for: `best`
+        gets the files of `model` after it. Otherwise as `save`.
         """
         self._best = step = int(state.step)
         if step == self._saved:
             self._begin(self._newest_is_best, step)
         else:
+            self.wait()  # the host holds one save at a time
             self._begin(self._write_best, self._copied(state.averaged), step)
 
     def check(self) -> None:

@@ -9,8 +9,8 @@ from pathlib import Path
 from logvggt_jax.errors import InputError, disk_errors
 from logvggt_jax.files import FolderLock
 
-# Where `--preflight` writes its checkpoint, within the work folder.
-PREFLIGHT = "preflight"
+# Where `--preflight` writes its checkpoint, within the work folder; no run is given this name.
+PREFLIGHT = ".preflight.partial"
 
 
 def remove_scratch(workdir: Path) -> None:

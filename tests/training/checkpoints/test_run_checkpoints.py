@@ -26,6 +26,7 @@ from logvggt_jax.training.checkpoints import run_models as module
 from logvggt_jax.training.checkpoints.checkpoint_files import Position
 from logvggt_jax.training.checkpoints.run_checkpoints import RunCheckpoints
 from logvggt_jax.training.checkpoints.run_models import RunModels
+from logvggt_jax.training.checkpoints.work_folder import PREFLIGHT
 from logvggt_jax.training.config import OptimizerConfig, TeacherConfig, TrainConfig
 from logvggt_jax.training.step.optimizer import make_optimizer
 from logvggt_jax.training.step.state import TrainState, initial_state
@@ -445,13 +446,13 @@ def test_what_killed_saves_left_goes_when_the_run_comes_back(
     (saved / "model" / "params").mkdir(parents=True)
     (saved / "notes").mkdir()
     # Of a preflight that is at work nothing is taken away.
-    lock = FolderLock(saved / "preflight", "wait")
+    lock = FolderLock(saved / PREFLIGHT, "wait")
     with RunCheckpoints(saved, run_config):
-        assert (saved / "preflight").is_dir()
+        assert (saved / PREFLIGHT).is_dir()
     lock.release()
     with RunCheckpoints(saved, run_config) as checkpoints:
         assert checkpoints.steps == [0]
-        assert not any((saved / name).exists() for name in (*left, "preflight"))
+        assert not any((saved / name).exists() for name in (*left, PREFLIGHT))
         assert (saved / "model" / "params").is_dir() and (saved / "notes").is_dir()
     # Killed between two renamings: the old model is the only one.
     (saved / "model").rename(saved / ".model.7-ab.old")

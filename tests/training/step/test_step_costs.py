@@ -76,6 +76,28 @@ ENTRY %main (a: f32[8]) -> f32[] {
     }
 
 
+@pytest.mark.parametrize(
+    "branches", ["branch_computations={%none, %all}", "true_computation=%all, false_computation=%none"]
+)
+def test_of_a_condition_the_longest_branch_is_counted(branches: str) -> None:
+    program = f"""
+%none (a: f32[8]) -> f32[8] {{
+  ROOT %a = f32[8]{{0}} parameter(0)
+}}
+
+%all (b: f32[8]) -> f32[8] {{
+  %b = f32[8]{{0}} parameter(0)
+  ROOT %c = f32[8]{{0}} all-reduce(%b)
+}}
+
+ENTRY %main (x: f32[8], p: s32[]) -> f32[8] {{
+  %x = f32[8]{{0}} parameter(0)
+  ROOT %y = f32[8]{{0}} conditional(%p, %x, %x), {branches}
+}}
+"""
+    assert collectives(program) == {"all-reduce": (1, 32)}
+
+
 def test_clips_have_the_shapes_of_a_batch() -> None:
     batch = abstract_clips(2, 3, SIZE)
     assert {name: value.shape[:2] for name, value in batch.items()} == dict.fromkeys(batch, (2, 3))
