@@ -221,11 +221,10 @@ class _Run:
     ) -> tuple[int, bool]:
         """Steps up to `end`, or fewer if the run is to stop; the number of steps done, and whether it is to stop."""
         config = self.config
-        self.times.begin()
-        failure = self._data_failure(batches, end - step)
         with self.watchdog.other("the save"):  # of the stage before: who raises may end the others in the middle of it
             self.checkpoints.wait()
-        raise_together(failure, NO_CLIPS)
+        self.times.begin()
+        raise_together(self._data_failure(batches, end - step), NO_CLIPS)
         while step < end:
             with self.times.waiting():
                 batch = next(batches)
@@ -239,8 +238,10 @@ class _Run:
                 self.in_flight.finish()
                 self.profiler.stop()
 
-            ending, failure = self._reason_to_end(stop, batches, end - step)
-            saving = step % config.save_every == 0 or step == end or ending is not None
+            due = step % config.save_every == 0 or step == end
+            # After a save that is due: clips that are late do not keep it from beginning.
+            ending, failure = (None, None) if due else self._reason_to_end(stop, batches, end - step)
+            saving = due or ending is not None
             # Intervals begin anew after a save, where a run that is killed goes on.
             if step % config.log_every == 0 or step == 1 or saving or self._failing():
                 self.in_flight.finish()
@@ -251,6 +252,8 @@ class _Run:
                 self._fail(step, position)
             if saving:
                 self._save(position)
+            if due:
+                ending, failure = self._reason_to_end(stop, batches, end - step)
             if ending is not None:
                 with self.watchdog.other("the save"):
                     self.checkpoints.wait()

@@ -23,7 +23,7 @@ from logvggt_jax.errors import DiskError, InputError, OutputExists
 from logvggt_jax.files import FolderLock
 from logvggt_jax.training.checkpoints import checkpoint_files, run_checkpoints
 from logvggt_jax.training.checkpoints import run_models as module
-from logvggt_jax.training.checkpoints.checkpoint_files import Position
+from logvggt_jax.training.checkpoints.checkpoint_files import DamagedCheckpoint, Position
 from logvggt_jax.training.checkpoints.run_checkpoints import RunCheckpoints
 from logvggt_jax.training.checkpoints.run_models import RunModels
 from logvggt_jax.training.checkpoints.work_folder import PREFLIGHT
@@ -126,8 +126,12 @@ def test_a_changed_position_and_a_changed_setting_are_refused(
 def test_a_checkpoint_from_before_the_digest_is_restored(
     run_config: TrainConfig, state: TrainState, saved: Path
 ) -> None:
-    _edit(saved / "checkpoints" / "0" / "meta" / "metadata", lambda meta: meta.pop("digest"))
+    metadata = saved / "checkpoints" / "0" / "meta" / "metadata"
+    _edit(metadata, lambda meta: meta.pop("digest"))
     assert _restore(saved, run_config, state)[1] == POSITION
+    _edit(metadata, lambda meta: meta["digests"].pop("params"))
+    with pytest.raises(DamagedCheckpoint, match=r"checkpoint of step 0 in .* cannot be read"):
+        _restore(saved, run_config, state)
 
 
 def test_a_checkpoint_with_settings_of_an_earlier_form_is_restored(
