@@ -1,8 +1,11 @@
 """`train.py` itself: one step of a real model, its validation and its files; and what it says when it ends badly."""
 
+import json
 import re
 import shutil
+import signal
 import subprocess
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,7 +13,7 @@ import jax
 import numpy as np
 import pytest
 from orbax.checkpoint import StandardCheckpointer
-from root_programs import RootPrograms
+from root_programs import RootPrograms, Running
 
 from logvggt_jax.training.reporting.metrics_log import read_metrics
 from logvggt_jax.weights.checkpoints import load_model, read_provenance
@@ -94,6 +97,47 @@ def test_the_same_command_goes_on_with_parameters_in_parts(run_train: Callable, 
     earlier, (_, first, second, validation) = (read_metrics(at / "metrics.jsonl") for at in (begun, workdir))
     assert first == earlier[1] and second["step"] == 2
     assert np.isfinite([second["loss/total"], validation["validation/abs_rel"]]).all()
+
+
+# A run that stands still once the line of step 3 is written: there it is killed, however fast the machine is.
+STANDS_STILL = """
+import time
+from logvggt_jax.training import loop
+write = loop.MetricsLog.write
+def stand_still(log, step, *given, **words):
+    write(log, step, *given, **words)
+    if step == 3:
+        time.sleep(600)
+loop.MetricsLog.write = stand_still
+"""
+
+
+@pytest.mark.slow
+def test_a_killed_run_of_the_real_model_ends_as_one_that_was_left_alone(programs: RootPrograms, tmp_path: Path) -> None:
+    steps = ("--config.stages.stage_1.steps=4", "--config.save_every=2", "--config.log_every=1")
+
+    def start(name: str, *, first: str = "") -> Running:
+        folders = (f"--workdir={tmp_path / name}", f"--compilation_cache={tmp_path / 'cache'}")
+        return programs.start("train.py", *SETTINGS, *batches_of(1), *steps, *folders, first=first)
+
+    killed = start("killed", first=STANDS_STILL)
+    written, saved = tmp_path / "killed" / "metrics.jsonl", tmp_path / "killed" / "checkpoints" / "2"
+    end = time.monotonic() + 300
+    while not (saved.is_dir() and b'{"step": 3,' in written.read_bytes()):
+        assert time.monotonic() < end, killed.error.read_text()
+        time.sleep(0.05)
+    killed.send_signal(signal.SIGKILL)
+    assert killed.wait() == -signal.SIGKILL
+    resumed = start("killed")
+    assert resumed.wait() == 0, resumed.error.read_text()
+    assert "2/5 steps done, results in" in resumed.output.read_text()
+    alone = start("alone")
+    assert alone.wait() == 0, alone.error.read_text()
+    ends = [tmp_path / name for name in ("alone", "killed")]
+    lines = [(folder / "metrics.jsonl").read_bytes() for folder in ends]
+    assert lines[0] == lines[1] and lines[0].count(b"loss/total") == 5
+    states = [json.loads((folder / "checkpoints" / "5" / "meta" / "metadata").read_text()) for folder in ends]
+    assert states[0]["digests"] == states[1]["digests"]
 
 
 @pytest.mark.slow
