@@ -90,8 +90,10 @@ def train(
         check_writable(workdir.expanduser().absolute() / "checkpoints")
     check_shared(workdir)
     with contextlib.ExitStack() as stack:
+        earlier = RunCheckpoints(workdir, config)
+        earlier.check_unused()
         if resume_step is None:
-            RunCheckpoints(workdir, config).resumed_step()  # another configuration's are refused before any work
+            earlier.resumed_step()  # checkpoints of another configuration are refused before any work
         # Before gigabytes of weights are read, and unwatched: to label all clips, or to list a disk, takes hours.
         datasets, validated = open_data(config)
         watched = stack.enter_context(Watchdog(watchdog))

@@ -682,6 +682,14 @@ def test_a_best_model_that_a_kill_kept_from_the_disk_is_made_up_for(run_config: 
     assert RunCheckpoints(tmp_path, config).best_step == 3
 
 
+def test_a_folder_in_use_is_refused_before_any_data_are_looked_at(
+    run_config: TrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(loop, "open_data", lambda _: pytest.fail("the data were opened"))
+    with RunCheckpoints(tmp_path, run_config), pytest.raises(InputError, match="another run is using this folder"):
+        train(run_config, tmp_path, mesh=data_mesh(2))
+
+
 def test_a_validation_that_fails_has_its_checkpoint_and_is_made_up_for(
     run_config: TrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -30,6 +30,7 @@ from logvggt_jax.training.step.state import TrainState
 from logvggt_jax.weights.digests import is_divided, whole_array
 
 _BEGIN_ANEW = "start a new --workdir"
+_ELSEWHERE = "start in another --workdir; processes of one run are started with --distributed"
 
 
 class RunCheckpoints:
@@ -61,10 +62,7 @@ class RunCheckpoints:
         failure: InputError | None = None
         if jax.process_index() == 0:
             try:
-                self._lock = FolderLock(
-                    self.folder.parent,
-                    "start in another --workdir; processes of one run are started with --distributed",
-                )
+                self._lock = FolderLock(self.folder.parent, _ELSEWHERE)
                 remove_scratch(self.folder.parent)
             except InputError as error:
                 failure = error
@@ -72,6 +70,17 @@ class RunCheckpoints:
             self.__exit__()
             raise failure or InputError(f"process 0 cannot use {self.folder.parent}; its output says why")
         return self
+
+    def check_unused(self) -> None:
+        """Raises InputError, on every process, where another run uses the folder now; makes none."""
+        failure: InputError | None = None
+        if jax.process_index() == 0 and self.folder.parent.is_dir():
+            try:
+                FolderLock(self.folder.parent, _ELSEWHERE).release()
+            except InputError as error:
+                failure = error
+        if any_process(failure is not None):
+            raise failure or InputError(f"process 0 cannot use {self.folder.parent}; its output says why")
 
     def __exit__(self, *_: Any) -> None:
         """Ends after the last save; whoever must know how it went calls `wait` before."""

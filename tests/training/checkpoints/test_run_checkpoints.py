@@ -474,8 +474,9 @@ def test_a_folder_that_another_run_uses_is_refused(run_config: TrainConfig, save
     ) as other:
         assert other.stdout is not None and other.stdout.readline() == "held\n"
         (saved / "model.1-a.partial").mkdir()
-        with pytest.raises(InputError, match=rf"another run is using this folder \(process {other.pid} on "):
-            RunCheckpoints(saved, run_config).__enter__()
+        for use in (RunCheckpoints.__enter__, RunCheckpoints.check_unused):
+            with pytest.raises(InputError, match=rf"another run is using this folder \(process {other.pid} on "):
+                use(RunCheckpoints(saved, run_config))
         assert (saved / "model.1-a.partial").is_dir(), "it may be writing that"
         other.kill()
     with RunCheckpoints(saved, run_config):
