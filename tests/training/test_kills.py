@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from killed_runs import kill, standing_still
 from orbax.checkpoint import StandardCheckpointer
 from pixel_program import PIXEL_MODEL, PIXEL_SETTINGS
 from root_programs import RootPrograms, Running
@@ -63,16 +64,6 @@ jax.monitoring.register_event_listener(
     lambda event, **_: print(event.removeprefix("/jax/compilation_cache/"), file=sys.stderr)
 )
 """
-# A run that stands still once the line of step 6 is written: there it is killed, however fast the machine is.
-STANDS_STILL = """
-import time
-write = loop.MetricsLog.write
-def stand_still(log, step, *given, **words):
-    write(log, step, *given, **words)
-    if step == 6:
-        time.sleep(600)
-loop.MetricsLog.write = stand_still
-"""
 
 
 def test_a_killed_run_ends_as_one_that_was_left_alone(programs: RootPrograms, tmp_path: Path) -> None:
@@ -80,14 +71,8 @@ def test_a_killed_run_ends_as_one_that_was_left_alone(programs: RootPrograms, tm
         own = (f"--workdir={tmp_path / name}", f"--compilation_cache={tmp_path / 'cache'}")
         return programs.start("train.py", *SHORT, *own, first=PIXEL_MODEL + TOLD + patch)
 
-    killed = start("killed", patch=STANDS_STILL)
-    written, saved = tmp_path / "killed" / "metrics.jsonl", tmp_path / "killed" / "checkpoints" / "4"
-    end = time.monotonic() + 300
-    while not (saved.is_dir() and b'{"step": 6,' in written.read_bytes()):
-        assert time.monotonic() < end, killed.error.read_text()
-        time.sleep(0.02)
-    killed.send_signal(signal.SIGKILL)
-    assert killed.wait() == -signal.SIGKILL
+    killed = start("killed", patch=standing_still(6))
+    kill(killed, tmp_path / "killed", step=6, saved=4)
     resumed, alone = start("killed"), start("alone")
     assert [resumed.wait(), alone.wait()] == [0, 0], resumed.error.read_text() + alone.error.read_text()
     # The step, of which both stages have the same, is compiled once and read twice.

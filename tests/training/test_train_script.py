@@ -3,15 +3,14 @@
 import json
 import re
 import shutil
-import signal
 import subprocess
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
+from killed_runs import kill, standing_still
 from orbax.checkpoint import StandardCheckpointer
 from root_programs import RootPrograms, Running
 
@@ -99,19 +98,6 @@ def test_the_same_command_goes_on_with_parameters_in_parts(run_train: Callable, 
     assert np.isfinite([second["loss/total"], validation["validation/abs_rel"]]).all()
 
 
-# A run that stands still once the line of step 3 is written: there it is killed, however fast the machine is.
-STANDS_STILL = """
-import time
-from logvggt_jax.training import loop
-write = loop.MetricsLog.write
-def stand_still(log, step, *given, **words):
-    write(log, step, *given, **words)
-    if step == 3:
-        time.sleep(600)
-loop.MetricsLog.write = stand_still
-"""
-
-
 @pytest.mark.slow
 def test_a_killed_run_of_the_real_model_ends_as_one_that_was_left_alone(programs: RootPrograms, tmp_path: Path) -> None:
     steps = ("--config.stages.stage_1.steps=4", "--config.save_every=2", "--config.log_every=1")
@@ -120,14 +106,7 @@ def test_a_killed_run_of_the_real_model_ends_as_one_that_was_left_alone(programs
         folders = (f"--workdir={tmp_path / name}", f"--compilation_cache={tmp_path / 'cache'}")
         return programs.start("train.py", *SETTINGS, *batches_of(1), *steps, *folders, first=first)
 
-    killed = start("killed", first=STANDS_STILL)
-    written, saved = tmp_path / "killed" / "metrics.jsonl", tmp_path / "killed" / "checkpoints" / "2"
-    end = time.monotonic() + 300
-    while not (saved.is_dir() and b'{"step": 3,' in written.read_bytes()):
-        assert time.monotonic() < end, killed.error.read_text()
-        time.sleep(0.05)
-    killed.send_signal(signal.SIGKILL)
-    assert killed.wait() == -signal.SIGKILL
+    kill(start("killed", first=standing_still(3)), tmp_path / "killed", step=3, saved=2)
     resumed = start("killed")
     assert resumed.wait() == 0, resumed.error.read_text()
     assert "2/5 steps done, results in" in resumed.output.read_text()
