@@ -41,9 +41,11 @@ from logvggt_jax.training.reporting.wandb_run import WandbRun, load_wandb
 from logvggt_jax.training.step.compilation import compiled_steps
 from logvggt_jax.training.step.costs import step_flops
 from logvggt_jax.training.step.device_memory import memory_explained, validation_memory_explained
+from logvggt_jax.training.step.finite_check import non_finite_clips
 from logvggt_jax.training.step.initialization import initial_parameters
 from logvggt_jax.training.step.program import abstract_parameters, make_program
 from logvggt_jax.training.step.state import TrainState
+from logvggt_jax.training.step.train_step import Batch
 from logvggt_jax.training.steps_in_flight import StepsInFlight
 from logvggt_jax.training.teaching.run_data import open_data
 from logvggt_jax.training.validation.earlier import VALIDATION_SET, is_best, validation_digest, validation_of
@@ -167,6 +169,7 @@ class _Run:
             skipped=int(self.state.skipped),
             in_a_row=int(self.state.skipped_in_a_row),
             step_ended=self.watchdog.step_ended,
+            non_finite_clips=self._non_finite_clips,
         )
         self.times = RunTimes(self.config, productive=log.productive_seconds, peak=self.peak)
         left: list[tuple[int, StageConfig, int, BatchIterator]] = []
@@ -235,7 +238,7 @@ class _Run:
             self.state, metrics, finite = program(self.state, batch)
             step += 1
             self.times.count(self.operations.get(batch["images"].shape, 0.0))
-            self.in_flight.add(step, metrics, finite, batches.names)
+            self.in_flight.add(step, metrics, finite, batch, batches.names)
             if self.profiler.is_last(step):
                 self.in_flight.finish()
                 self.profiler.stop()
@@ -268,6 +271,11 @@ class _Run:
                 raise_together(failure, NO_CLIPS)
                 return step, True
         return step, False
+
+    def _non_finite_clips(self, batch: Batch) -> np.ndarray:
+        """bool [B]: the clips of a step whose update was left out that by themselves have a non-finite gradient."""
+        with self.times.other("search for clips"), self.watchdog.other("the search for clips"):
+            return non_finite_clips(self.program.finite_check, self.state.params, batch, self.program.layout)
 
     def _failing(self) -> bool:
         return self.in_flight.longest_skip >= self.config.max_skipped_in_a_row

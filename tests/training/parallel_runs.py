@@ -11,6 +11,7 @@ import re
 import socket
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -129,11 +130,18 @@ def _is_adam(state: Any) -> bool:
 
 
 def steps_of_processes(
-    config: TrainConfig, params: Any, clips: Clips, count: int, folder: Path, *, layered: bool, processes: int = 2
-) -> Outcome:
-    """`steps` of real processes with two devices each, as the first one sees it."""
+    configs: Sequence[TrainConfig],
+    params: Any,
+    clips: Clips,
+    count: int,
+    folder: Path,
+    *,
+    layered: bool,
+    processes: int = 2,
+) -> list[Outcome]:
+    """`steps` of each configuration by real processes with two devices each, as the first one sees them."""
     given = folder / "given.pickle"
-    given.write_bytes(pickle.dumps((config.to_dict(), params, clips, count, layered)))
+    given.write_bytes(pickle.dumps(([config.to_dict() for config in configs], params, clips, count, layered)))
     with socket.socket() as probe:
         probe.bind(("localhost", 0))
         address = f"localhost:{probe.getsockname()[1]}"
@@ -148,7 +156,7 @@ def steps_of_processes(
     ]
     outputs = [process.communicate(timeout=1200)[0] for process in started]
     assert [process.returncode for process in started] == [0] * processes, outputs
-    return Outcome(*pickle.loads((folder / "outcome.pickle").read_bytes()))
+    return [Outcome(*each) for each in pickle.loads((folder / "outcomes.pickle").read_bytes())]
 
 
 def _main(given: Path, number: int, processes: int, address: str) -> None:
@@ -157,13 +165,14 @@ def _main(given: Path, number: int, processes: int, address: str) -> None:
     jax.config.update("jax_num_cpu_devices", 2)
     jax.distributed.initialize(address, processes, number)
     settings, params, clips, count, layered = pickle.loads(given.read_bytes())
-    config = TrainConfig.from_dict(settings)
     share = len(clips["images"]) // processes
     own = {name: value[number * share : (number + 1) * share] for name, value in clips.items()}
-    model = LayeredModel(config.model, PixelModel(config.model)) if layered else LogVGGT(config.model)
-    outcome = steps(model, config, params, own, data_mesh(), count)
+    outcomes = []
+    for config in map(TrainConfig.from_dict, settings):
+        model = LayeredModel(config.model, PixelModel(config.model)) if layered else LogVGGT(config.model)
+        outcomes.append(tuple(steps(model, config, params, own, data_mesh(), count)))
     if number == 0:
-        (given.parent / "outcome.pickle").write_bytes(pickle.dumps(tuple(outcome)))
+        (given.parent / "outcomes.pickle").write_bytes(pickle.dumps(outcomes))
 
 
 if __name__ == "__main__":

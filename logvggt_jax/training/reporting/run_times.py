@@ -60,7 +60,7 @@ class RunTimes:
 
     @contextlib.contextmanager
     def other(self, kind: str) -> Iterator[None]:
-        """Time of a `compilation`, `validation` or `save`, in which no step runs."""
+        """Time of a `compilation`, `validation`, `save` or another `kind`, in which no step runs."""
         started = time.perf_counter()
         yield
         self._others.setdefault(kind, []).append(time.perf_counter() - started)

@@ -13,6 +13,7 @@ from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.model.parameters import stack_layers
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.parallel.sharding import Layout, parameter_layout
+from logvggt_jax.training.step.finite_check import make_finite_check
 from logvggt_jax.training.step.freezing import ENCODER, frozen_leaves
 from logvggt_jax.training.step.optimizer import learning_rate_schedule, make_optimizer
 from logvggt_jax.training.step.state import TrainState, initial_state
@@ -32,6 +33,7 @@ class Program(NamedTuple):
     step: jax.stages.Wrapped  # of `make_train_step`
     abstract_state: TrainState  # shapes and places
     beside: jax.stages.Wrapped  # what the first state has beside parameters, of these
+    finite_check: jax.stages.Wrapped  # of `make_finite_check`, compiled where it is needed
 
     def initial_state(self, params: Any) -> TrainState:
         """The state before the first step, of parameters on the host, in its place: no device holds a second copy."""
@@ -46,8 +48,9 @@ def make_program(model: LogVGGT, config: TrainConfig, params: Any, mesh: Mesh) -
     layout = parameter_layout(params, mesh, shard=config.shard_parameters)
     optimizer = make_optimizer(config.optimizer, params, frozen=frozen, norm=layout.norm)
     schedule = learning_rate_schedule(config.optimizer, config.stages)
+    terms = make_loss_terms(model, config.loss, frozen=frozen)
     step = make_train_step(
-        make_loss_terms(model, config.loss, frozen=frozen),
+        terms,
         config.loss,
         optimizer,
         schedule,
@@ -62,4 +65,5 @@ def make_program(model: LogVGGT, config: TrainConfig, params: Any, mesh: Mesh) -
     beside = jax.jit(
         lambda params: made(params)._replace(params=None), out_shardings=layout.shardings(shapes)._replace(params=None)
     )
-    return Program(layout, optimizer, step, layout.abstract(shapes), beside)
+    finite_check = make_finite_check(terms, config.loss, layout, accumulate=config.accumulate)
+    return Program(layout, optimizer, step, layout.abstract(shapes), beside, finite_check)

@@ -120,7 +120,7 @@ def make_train_step(
     [B, T, 4, 4], optionally `frame_mask` bool [B, T], and for a distillation the teacher's `confidence` [B, T, H, W].
     Metrics are float32 scalars, equal on all devices. A non-finite loss or gradient leaves parameters and moments as
     they were and is counted in the state; where it comes from predictions, targets or the loss of single clips, `finite
-    clips`, bool [B] and split as the batch is, says of which clips.
+    clips`, bool [B] and split as the batch is, says of which clips. Of the gradient `make_finite_check` says it.
 
     State and optimiser lie as `layout` says. `accumulate`: see `loss_and_gradients`. `average` is the decay of the
     moving average in a step, for a state that has one.
@@ -131,8 +131,7 @@ def make_train_step(
             terms, config, state.params, batch, layout, accumulate=accumulate
         )
         norms = module_norms(gradients, layout.norm)
-        # One reduction, which the compiler does not repeat in the update of every parameter.
-        usable = jnp.isfinite(jnp.stack([total, *norms.values()])).all()
+        usable = all_finite(total, norms)
         learning_rate = jnp.asarray(schedule(state.step), jnp.float32)
         directions, opt_state = optimizer.update(gradients, state.opt_state, state.params)
         params = apply_updates(state.params, directions, learning_rate)
@@ -169,6 +168,12 @@ def make_train_step(
 
     options = quick_compilation(layout.mesh.devices.flat[0])
     return jax.jit(on_all_devices, donate_argnums=0, compiler_options=options)
+
+
+def all_finite(total: jax.Array, norms: dict[str, jax.Array]) -> jax.Array:
+    """bool scalar: whether an objective and the norms of its gradient, module by module, are finite."""
+    # One reduction, which the compiler does not repeat in the update of every parameter.
+    return jnp.isfinite(jnp.stack([total, *norms.values()])).all()
 
 
 def _finite_clips(predictions: Predictions, targets: Targets) -> jax.Array:

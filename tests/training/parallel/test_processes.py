@@ -166,26 +166,32 @@ def test_clips_of_one_process_that_make_an_update_useless_are_named_by_all(
 from dazzled_model import DazzledModel
 loop.LogVGGT = lambda config: DazzledModel(config, conftest.PixelModel(config))
 """
-    black = """
+    # The loss of every other clip, the gradient of those between them.
+    black_and_white = """
 from logvggt_jax.data.feeding.clips import ClipReader
 read = ClipReader.__call__
-def reading(reader, *given):
-    clip = read(reader, *given)
-    return {**clip, "images": 0 * clip["images"], "name": "black " + clip["name"]}
+def reading(reader, index, *given):
+    clip = read(reader, index, *given)
+    colour, value = (("black", 0), ("white", 255))[index // 2 % 2]
+    return {**clip, "images": 0 * clip["images"] + value, "name": f"{colour} {clip['name']}"}
 ClipReader.__call__ = reading
 """
     flags = ("--config.max_skipped_in_a_row=2", "--config.log_every=100000", "--validation_source=none")
-    with PixelRuns(programs, tmp_path, tmp_path, patches=(dazzled, dazzled + black), flags=flags) as runs:
+    with PixelRuns(programs, tmp_path, tmp_path, patches=(dazzled, dazzled + black_and_white), flags=flags) as runs:
         errors = [runs.errors(number) for number in range(2)]
         assert [process.returncode for process in runs.processes] == [1, 1], errors
     for said in errors:
-        named = re.findall(r"step (\d): update left out, loss was not finite in (.*)", said)
+        named = re.findall(r"step (\d): update left out, (.*) was not finite in (.*)", said)
         # Two more were under way when two were known.
-        assert [step for step, _ in named] == ["1", "2", "3", "4"], said
+        assert [found[:2] for found in named] == [
+            (str(step), "loss" if step % 2 else "loss or gradient") for step in range(1, 5)
+        ], said
         (end,) = re.findall(r"4 updates in a row had a non-finite loss .*, with (.*); the same command goes on", said)
-        assert end == "; ".join(clips for _, clips in named), said
+        assert end == "; ".join(clips for *_, clips in named), said
         # One clip each, of process 1.
-        assert all(re.fullmatch(r"black rooms, [^;]*", clips) for _, clips in named), said
+        assert all(
+            re.fullmatch(rf"{'black' if what == 'loss' else 'white'} rooms, [^;]*", clips) for _, what, clips in named
+        ), said
 
 
 def test_folders_that_are_not_shared_are_an_error_of_the_start(programs: RootPrograms, tmp_path: Path) -> None:

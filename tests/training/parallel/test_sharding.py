@@ -136,7 +136,21 @@ def test_twenty_steps_on_sixteen_devices_and_in_two_processes_are_those_of_one_d
     parts = _gentle(run_config, shard_parameters=True)
     _same_run(steps(layered, parts, layered_params, sixteen, data_mesh(16), 20), alone)
     both = dataclasses.replace(parts, accumulate=2)
-    _same_run(steps_of_processes(both, layered_params, sixteen, 20, tmp_path, layered=True), alone)
+    _same_run(*steps_of_processes([both], layered_params, sixteen, 20, tmp_path, layered=True), alone)
+
+
+def test_first_gradient_of_two_processes_is_that_of_one_device(
+    run_config: TrainConfig, layered: LayeredModel, layered_params: Any, sixteen: Clips, tmp_path: Path
+) -> None:
+    config = _gentle(run_config)
+    alone = steps(layered, config, layered_params, sixteen, data_mesh(1), 1)
+    configs = [
+        dataclasses.replace(config, shard_parameters=shard, accumulate=accumulate)
+        for shard in (False, True)
+        for accumulate in (1, 2)
+    ]
+    for found in steps_of_processes(configs, layered_params, sixteen, 1, tmp_path, layered=True):
+        _same_gradient(found, alone)
 
 
 # What a quick test of the real model leaves as it is: all runs and is gathered, while GCCR, camera head and the depth
@@ -207,9 +221,12 @@ def test_twenty_steps_of_the_real_model_are_the_same_on_all_devices_and_in_two_p
     for devices, shard, accumulate in ((1, False, 4), (4, False, 1), (4, True, 2), (16, False, 1), (16, True, 1)):
         changed = dataclasses.replace(config, shard_parameters=shard, accumulate=accumulate)
         _same_run(steps(model, changed, params, short, data_mesh(devices), 20), alone)
-    for shard, accumulate in ((False, 1), (True, 2)):
-        changed = dataclasses.replace(config, shard_parameters=shard, accumulate=accumulate)
-        _same_run(steps_of_processes(changed, params, short, 20, tmp_path, layered=False), alone)
+    both = [
+        dataclasses.replace(config, shard_parameters=shard, accumulate=accumulate)
+        for shard, accumulate in ((False, 1), (True, 2))
+    ]
+    for found in steps_of_processes(both, params, short, 20, tmp_path, layered=False):
+        _same_run(found, alone)
 
 
 def test_a_step_gathers_one_layer_at_a_time_and_scatters_its_gradient(

@@ -4,7 +4,7 @@ import json
 from types import SimpleNamespace
 
 import jax
-import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from logvggt_jax.training.parallel import agreement
@@ -14,29 +14,29 @@ OTHERS = (json.dumps([["d"], ["c", "d"]]), json.dumps([[], ["e"]]))
 
 
 @pytest.mark.parametrize(
-    ("finite", "others", "blamed", "reason"),
+    ("finite", "others", "blamed", "which"),
     [
-        ([True, False], OTHERS, ["b", "d"], "loss was not finite in"),
-        ([True, True], OTHERS, ["d"], "loss was not finite in"),
-        ([True, True], OTHERS[1:], ["a", "b", "e"], "loss or gradient was not finite, with all or some of"),
+        ([True, False], OTHERS, ["b", "d"], "in"),
+        ([True, True], OTHERS, ["d"], "in"),
+        ([True, True], OTHERS[1:], ["a", "b", "e"], "with all or some of"),
         (
             [True, True],
             (None, OTHERS[1]),
             ["a", "b", "e"],
-            "loss or gradient was not finite, with all or some of (those of the processes [1] are not known)",
+            "with all or some of (those of the processes [1] are not known)",
         ),
         (
             [False, True],
             (OTHERS[1], None),
             ["a"],
-            "loss was not finite in (those of the processes [2] are not known)",
+            "in (those of the processes [2] are not known)",
         ),
     ],
 )
 def test_a_process_blames_what_all_have_found(
-    finite: list[bool], others: tuple[str | None, ...], blamed: list[str], reason: str
+    finite: list[bool], others: tuple[str | None, ...], blamed: list[str], which: str
 ) -> None:
-    assert clips_to_blame(jnp.array(finite), ["a", "b"], lambda own: [own, *others]) == (blamed, reason)
+    assert clips_to_blame(np.array(finite), ["a", "b"], lambda own: [own, *others]) == (blamed, which)
 
 
 def test_one_silent_process_leaves_the_others_time_to_be_heard(monkeypatch: pytest.MonkeyPatch) -> None:
