@@ -10,9 +10,6 @@ Flipped bytes are restored without complaint; the digests, of the float32 parame
 import contextlib
 import dataclasses
 import importlib.metadata
-import logging
-import os
-import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal
@@ -24,7 +21,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from logvggt_jax.config import ModelConfig, from_mapping
-from logvggt_jax.errors import DiskError, InputError, MissingInput, OutputExists, disk_errors, one_line
+from logvggt_jax.errors import InputError, MissingInput, OutputExists, disk_errors, one_line
 from logvggt_jax.files import atomic_folder, check_output, check_regular_files, check_space, check_writable, user_path
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.weights.address import hub_address, resolve, similar
@@ -34,6 +31,7 @@ from logvggt_jax.weights.folder import MEND, is_model_folder, read_description, 
 from logvggt_jax.weights.half_precision import PARAMETERS_FILE, read_parameters, rounded, write_parameters
 from logvggt_jax.weights.hub import licence
 from logvggt_jax.weights.lazy import LazyTensors
+from logvggt_jax.weights.orbax_writing import writing_with_orbax
 from logvggt_jax.weights.provenance import Provenance
 from logvggt_jax.weights.shipped_models import SHIPPED, shipped_model
 from logvggt_jax.weights.vggt import (
@@ -365,30 +363,6 @@ def read_with_orbax(read: Callable[[], Any], where: str, mend: str) -> Any:
     except Exception as error:
         reason = f"{type(error).__name__}: {one_line(error):.200}"
         raise InputError(f"{where} cannot be read ({reason}); {mend}") from error
-
-
-@contextlib.contextmanager
-def writing_with_orbax(path: Path) -> Iterator[None]:
-    """Turns the operating system's errors in the block, which writes `path`, into DiskError, as `disk_errors` does;
-    those too that Orbax passes on as the text of another exception, after it has logged hundreds of lines of them."""
-    logger = logging.getLogger("absl")
-    logger.addFilter(_is_not_orbaxs)
-    try:
-        with disk_errors(path):
-            yield
-    except InputError:
-        raise
-    except Exception as error:
-        code = re.search(r"os_error_code='(\d+)'", str(error))
-        if code is None:
-            raise
-        raise DiskError(f"{path}: {os.strerror(int(code[1]))}") from error
-    finally:
-        logger.removeFilter(_is_not_orbaxs)
-
-
-def _is_not_orbaxs(record: logging.LogRecord) -> bool:
-    return f"{os.sep}orbax{os.sep}" not in record.pathname
 
 
 @contextlib.contextmanager

@@ -25,8 +25,9 @@ from logvggt_jax.files import atomic_folder, to_disk
 from logvggt_jax.model.parameters import is_stack, stack_layers, unstack_layers
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.step.state import TrainState
-from logvggt_jax.weights.checkpoints import read_arrays, write_arrays, writing_with_orbax
+from logvggt_jax.weights.checkpoints import read_arrays, write_arrays
 from logvggt_jax.weights.digests import digests, json_digest, verify_digests
+from logvggt_jax.weights.orbax_writing import writing_with_orbax
 
 LIBRARIES = ("logvggt-jax", "jax", "flax", "optax", "orbax-checkpoint", "grain")
 _ENTRIES = {"step", "stage", "layers", "config", "digests", "libraries", "digest"}
