@@ -315,6 +315,17 @@ def test_a_list_names_files_in_its_own_order(tmp_path: Path, monkeypatch: pytest
         open_source(listing)
 
 
+def test_links_to_pictures_that_are_gone_are_called_so(tmp_path: Path) -> None:
+    for number in range(3):
+        (tmp_path / f"{number}.png").symlink_to(tmp_path.parent / "moved" / f"{number}.png")
+    (tmp_path / "notes.txt").write_text("of the day")
+    expected = r"found 1 \.txt; 3 broken links \(0\.png, 1\.png, 2\.png\)"
+    with pytest.raises(MissingInput, match=expected):
+        open_source(tmp_path)
+    with pytest.raises(MissingInput, match=r"found 3 broken links"):
+        open_source(tmp_path / "*.png")
+
+
 def test_folders_without_pictures_say_what_they_hold(tmp_path: Path) -> None:
     with pytest.raises(MissingInput, match=f"no image in {tmp_path}.*found nothing"):
         open_source(tmp_path)

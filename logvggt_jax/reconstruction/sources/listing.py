@@ -244,10 +244,18 @@ def _doubts(files: list[Path]) -> list[str]:
 
 def _contents(entries: list[Path]) -> str:
     """What a folder without pictures holds."""
-    found = [_suffixes([entry for entry in entries if not entry.is_dir()])]
+    kinds: dict[str, list[Path]] = defaultdict(list)
+    for entry in entries:
+        kinds[_kind(entry)].append(entry)
+    found = [_suffixes(kinds.pop("file", []))]
+    subfolders = kinds.pop("folder", [])
+    found += [
+        f"{len(those)} {kind}{'s' if len(those) > 1 else ''} ({some(each.name for each in those)})"
+        for kind, those in kinds.items()
+    ]
     if folders := _folders_with_pictures(entries):
         found.append(f"sub-folders with images: {folders}")
-    elif any(entry.is_dir() for entry in entries):
+    elif subfolders:
         found.append("sub-folders without images")
     return "; ".join(part for part in found if part) or "nothing"
 
