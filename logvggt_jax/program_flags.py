@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Callable
 
@@ -9,6 +10,11 @@ from absl import flags, logging
 from ml_collections import config_flags
 
 from logvggt_jax.errors import one_line
+
+# Of a configuration file that the library cannot open, between words on where it looked.
+_NO_FILE = re.compile(r"Failed loading config file.*\[Errno \d+\] (?P<reason>[^:]+): '(?P<path>[^']*)'", re.DOTALL)
+# In the words of absl, once for each flag.
+_MISSING = re.compile(r"(--\w+) must have a value other than None")
 
 # A flag belongs to the program that asks for it here, whose --help lists it.
 flags.disclaim_key_flags()
@@ -49,5 +55,9 @@ def flags_parser(program: str) -> Callable[[list[str]], list[str]]:
 
 def _reason(error: Exception) -> str:
     """An error in one line; of one that holds the traceback of a configuration file, what that ended with."""
+    if missing := _MISSING.findall(str(error)):
+        return f"missing: {', '.join(missing)}; --help says what each is"
+    if found := _NO_FILE.search(str(error)):
+        return f"--config={found['path']}: {found['reason']}"
     before, traceback, after = str(error).partition("Traceback (most recent call last):")
     return one_line(error) if not traceback else f"{before.split(chr(10))[0].strip()} {after.strip().splitlines()[-1]}"

@@ -42,14 +42,15 @@ from logvggt_jax.training.step.compilation import compiled_steps
 from logvggt_jax.training.step.costs import step_flops
 from logvggt_jax.training.step.device_memory import memory_explained, validation_memory_explained
 from logvggt_jax.training.step.finite_check import non_finite_clips
-from logvggt_jax.training.step.initialization import initial_parameters
-from logvggt_jax.training.step.program import abstract_parameters, make_program
+from logvggt_jax.training.step.initialization import check_weights, initial_parameters
+from logvggt_jax.training.step.program import Program, abstract_parameters, make_program
 from logvggt_jax.training.step.state import TrainState
 from logvggt_jax.training.step.train_step import Batch
 from logvggt_jax.training.steps_in_flight import StepsInFlight
 from logvggt_jax.training.teaching.run_data import open_data
 from logvggt_jax.training.validation.earlier import VALIDATION_SET, is_best, validation_digest, validation_of
 from logvggt_jax.training.validation.validation import Validation, validation_line
+from logvggt_jax.weights.address import hub_address
 
 # Of a process, in words.
 NO_CLIPS = "can read no more clips"
@@ -94,12 +95,16 @@ def train(
     with contextlib.ExitStack() as stack:
         earlier = RunCheckpoints(workdir, config)
         earlier.check_unused()
-        if resume_step is None:
-            earlier.resumed_step()  # checkpoints of another configuration are refused before any work
+        # What can be refused without data is, before they are drawn or labelled: checkpoints, names of parameters, and
+        # weights at hand, which a run that goes on needs no more.
+        begins = earlier.resumed_step(resume_step) is None
+        program = make_program(LogVGGT(config.model), config, abstract_parameters(config.model), mesh)
+        if begins and config.initial_weights is not None and hub_address(config.initial_weights) is None:
+            check_weights(config.model, config.initial_weights)
         # Before gigabytes of weights are read, and unwatched: to label all clips, or to list a disk, takes hours.
         datasets, validated = open_data(config)
         watched = stack.enter_context(Watchdog(watchdog))
-        run = _Run(config, workdir, mesh, watched, validated)
+        run = _Run(config, workdir, program, watched, validated)
         run.profiler = stack.enter_context(Profiler(profile, workdir / "profile"))
         stack.enter_context(run.checkpoints)
         stop = stack.enter_context(StopRequest("SIGTERM", "SIGINT"))
@@ -126,23 +131,21 @@ class _Run:
     profiler: Profiler
 
     def __init__(
-        self, config: TrainConfig, workdir: Path, mesh: Mesh, watchdog: Watchdog, validated: Sequence[Dataset]
+        self, config: TrainConfig, workdir: Path, program: Program, watchdog: Watchdog, validated: Sequence[Dataset]
     ) -> None:
-        self.config, self.mesh, self.watchdog = config, mesh, watchdog
+        layout = program.layout
+        self.config, self.program, self.mesh, self.watchdog = config, program, layout.mesh, watchdog
         self.deadline = None if config.max_minutes is None else time.monotonic() + 60 * config.max_minutes
-        model = LogVGGT(config.model)
-        # Shapes alone: a run that goes on needs no initial weights.
-        self.shapes = abstract_parameters(config.model)
-        self.program = make_program(model, config, self.shapes, mesh)
         self.programs: dict[tuple[int, ...], jax.stages.Compiled] = {}
         self.operations: dict[tuple[int, ...], float] = {}
-        layout = self.program.layout
-        self.validation = None if config.validation is None else Validation(model, config.validation, layout, validated)
+        self.validation = None
+        if config.validation is not None:
+            self.validation = Validation(LogVGGT(config.model), config.validation, layout, validated)
         self.checkpoints = RunCheckpoints(workdir, config)
         self.peak = None
-        if mesh.devices.flat[0].platform != "cpu":  # whose cores share one peak
-            self.peak = mesh.size * matmul_flops_per_second(config.model.dtype)
-        self.vote = Vote(mesh, delay=steps_in_flight.MOST)
+        if layout.mesh.devices.flat[0].platform != "cpu":  # whose cores share one peak
+            self.peak = layout.mesh.size * matmul_flops_per_second(config.model.dtype)
+        self.vote = Vote(layout.mesh, delay=steps_in_flight.MOST)
 
     def start(self, resume_step: int | None) -> tuple[int, Position | None]:
         """Takes up a checkpoint, or the initial weights if there is none.

@@ -776,17 +776,11 @@ def test_a_run_that_begins_anew_keeps_no_validation_of_the_start_before(
 def test_a_run_goes_on_when_its_initial_weights_are_gone(
     run_config: TrainConfig, straight: tuple[TrainState, Path], finished: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    parameters = loop.initial_parameters
-
-    def missing(*arguments: Any, weights: str | None = None, **options: Any) -> Any:
-        if weights is not None:
-            raise FileNotFoundError(f"{weights}: nothing is there")
-        return parameters(*arguments, **options)
-
-    monkeypatch.setattr(loop, "initial_parameters", missing)
+    monkeypatch.setattr(loop, "initial_parameters", lambda *_, **__: pytest.fail("a run that goes on has its own"))
     config = dataclasses.replace(run_config, initial_weights="gone")
     _same(train(config, finished, mesh=data_mesh(2), resume_step=4), straight[0])
-    with pytest.raises(FileNotFoundError, match="gone: nothing is there"):
+    monkeypatch.setattr(loop, "open_data", lambda _: pytest.fail("before data are drawn"))
+    with pytest.raises(FileNotFoundError, match="gone: no such file or folder"):
         train(config, finished / "new", mesh=data_mesh(2))
 
 

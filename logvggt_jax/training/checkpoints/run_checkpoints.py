@@ -155,16 +155,14 @@ class RunCheckpoints:
         configuration, or DamagedCheckpoint where `step` is damaged or all are.
         """
         steps = self.steps
-        if step is not None and step == self._went_back_to() and steps:
+        candidates = self._candidates(steps, step)
+        if step is not None and candidates != [step]:
             logging.warning(
                 "--resume_step=%d was honoured before: going on from the latest; to go back once more, remove %s",
                 step,
                 self._honoured,
             )
             step = None
-        if not steps or (step is not None and step not in steps):
-            raise InputError(f"{self.folder}: no checkpoint of step {step}; there are {steps or 'none'}")
-        candidates = list(reversed(steps)) if step is None else [step]
         for chosen in candidates:
             try:
                 state, position = self._restore(chosen, like)
@@ -190,23 +188,34 @@ class RunCheckpoints:
                     write_text(self._honoured, json.dumps({"resume_step": step}))
         return state, position
 
-    def resumed_step(self) -> int | None:
+    def resumed_step(self, step: int | None = None) -> int | None:
         """The step that `restore` would go on from, as far as descriptions tell; None where a run begins anew.
 
-        Raises InputError for a checkpoint of another configuration, and DamagedCheckpoint where no description can be
-        read.
+        Raises InputError for a checkpoint that is not there, or of another configuration, and DamagedCheckpoint where
+        no description can be read.
         """
-        steps = self.steps if any(self.steps) else []
-        for step in reversed(steps):
+        steps = self.steps
+        if step is None and not any(steps):
+            return None
+        candidates = self._candidates(steps, step)
+        for chosen in candidates:
             try:
-                stored = StoredCheckpoint(self.folder / str(step))
+                stored = StoredCheckpoint(self.folder / str(chosen))
             except DamagedCheckpoint:
-                if step == steps[0]:
+                if chosen == candidates[-1]:
                     raise
                 continue  # as a run does, which goes on from the one before
             check_configuration(stored, self.config)
-            return step
+            return chosen
         return None
+
+    def _candidates(self, steps: list[int], step: int | None) -> list[int]:
+        """Those of `steps` to go on from, the first that is whole: the one asked for alone, or the latest first."""
+        if step is not None and steps and step == self._went_back_to():
+            step = None
+        if not steps or (step is not None and step not in steps):
+            raise InputError(f"{self.folder}: no checkpoint of step {step}; there are {steps or 'none'}")
+        return list(reversed(steps)) if step is None else [step]
 
     def begin_anew(self) -> None:
         """Takes away the `best` model of a start that was given up before its first save: aside where it had learned,

@@ -37,11 +37,7 @@ def open_sources(config: DataConfig, validation: Sequence[SourceConfig] = ()) ->
     Raises InputError: folders of data sets do not exist and `config.allow_missing` is off, or none exists; a source of
     `validation` has no folder; a data set would train on sequences that `config.hold_out` or one of those keeps.
     """
-    if missing := _without_folder(validation):
-        raise InputError(
-            f"data sets to validate on without their folder: {_named(missing)}; give --validation_source=NAME=FOLDER "
-            "(or none), or set validation.sources.NAME.root"
-        )
+    _check_folders(config, validation)
     rules = dict(config.hold_out)
     if unknown := sorted(rules.keys() - set(DATASETS)):
         raise InputError(
@@ -86,19 +82,31 @@ def _present(config: DataConfig) -> list[SourceConfig]:
     missing = _without_folder(config.sources)
     if not missing:
         return list(config.sources)
-    named = _named(missing)
-    if not config.allow_missing:
-        raise InputError(
-            f"data sets without their folder: {named}; set data.sources.NAME.root, remove them from the mixture, or "
-            "train on the others with data.allow_missing=True"
-        )
     present = [source for source in config.sources if source not in missing]
-    if not present:
-        raise InputError(f"none of the data sets has its folder: {named}; set data.sources.NAME.root")
     total = sum(source.weight for source in present)
     shares = ", ".join(f"{source.name} {source.weight / total:.1%}" for source in present)
-    logging.warning("data sets without their folder are left out: %s; clips come from %s", named, shares)
+    logging.warning("data sets without their folder are left out: %s; clips come from %s", _named(missing), shares)
     return present
+
+
+def _check_folders(config: DataConfig, validation: Sequence[SourceConfig]) -> None:
+    """Raises InputError naming all data sets, to train and to validate on, that have to have a folder and have none."""
+    problems = []
+    missing = _without_folder(config.sources)
+    if missing and len(missing) == len(config.sources):
+        problems.append(f"none of the data sets has its folder: {_named(missing)}; set data.sources.NAME.root")
+    elif missing and not config.allow_missing:
+        problems.append(
+            f"data sets without their folder: {_named(missing)}; set data.sources.NAME.root, remove them from the "
+            "mixture, or train on the others with data.allow_missing=True"
+        )
+    if absent := _without_folder(validation):
+        problems.append(
+            f"data sets to validate on without their folder: {_named(absent)}; give --validation_source=NAME=FOLDER "
+            "(or none), or set validation.sources.NAME.root"
+        )
+    if problems:
+        raise InputError("; ".join(problems))
 
 
 def _without_folder(sources: Sequence[SourceConfig]) -> list[SourceConfig]:

@@ -105,6 +105,10 @@ def test_a_data_set_to_validate_on_without_its_folder_is_named_with_the_flag(tmp
     absent = SourceConfig(name="tum_recording", root=str(tmp_path / "none"), split="all")
     with pytest.raises(InputError, match=r"without their folder: tum_recording \(.*none\); give --validation_source="):
         open_sources(data(), (rooms("val"), absent))
+    # With those to train on that are missing as well.
+    told = r"none of the data sets has its folder: tum_recording .*; data sets to validate on without their folder: tum"
+    with pytest.raises(InputError, match=told):
+        open_sources(data(sources=(absent,)), (absent,))
 
 
 def test_a_damaged_data_set_is_not_a_missing_one(tmp_path: Path) -> None:

@@ -331,7 +331,8 @@ def test_no_device_ever_holds_a_second_copy_when_a_run_starts_or_goes_on(
     monkeypatch.setattr(StoredCheckpoint, "read", lambda *given: (look(), read(*given), look())[1])
     monkeypatch.setattr(StoredCheckpoint, "verified", lambda *given: (look(), verified(*given), look())[1])
     for step in (0, 1):
-        run = loop._Run(config, tmp_path, mesh, Watchdog(0), ())
+        program = make_program(layered, config, jax.eval_shape(lambda: layered_params), mesh)
+        run = loop._Run(config, tmp_path, program, Watchdog(0), ())
         with run.checkpoints as checkpoints:
             run.start(None)
             state = run.state
