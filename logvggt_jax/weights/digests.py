@@ -45,8 +45,9 @@ def _digests(tree: Any, earlier: Collection[str]) -> dict[str, str]:
     return {name: digest.result() for name, digest in found.items()}
 
 
-def verify_digests(tree: Any, expected: dict[str, str], where: str) -> None:
-    """Compares a restored tree with the digests stored when it was saved; `where` is the checkpoint's path.
+def verify_digests(tree: Any, expected: dict[str, str], where: str, *, mend: str = MEND) -> None:
+    """Compares a restored tree with the digests stored when it was saved; `where` is the checkpoint's path, `mend` what
+    an error ends with.
 
     Raises InputError naming the leaf that differs, is missing or has no digest.
     """
@@ -54,10 +55,10 @@ def verify_digests(tree: Any, expected: dict[str, str], where: str) -> None:
     for name in sorted(found.keys() | expected.keys()):
         if name not in found or name not in expected:
             which = "is not in the checkpoint" if name not in found else "has no digest"
-            raise InputError(f"{where}: leaf {name} {which}; {MEND}")
+            raise InputError(f"{where}: leaf {name} {which}; {mend}")
         if found[name] != expected[name]:
             raise InputError(
-                f"{where}: leaf {name} differs from its digest ({found[name]}, expected {expected[name]}); {MEND}"
+                f"{where}: leaf {name} differs from its digest ({found[name]}, expected {expected[name]}); {mend}"
             )
 
 

@@ -119,7 +119,7 @@ class StoredCheckpoint:
         """
         for name, tree in zip(("params", "state"), _parts(state), strict=True):
             with self._damage():
-                verify_digests(tree, self._digests[name], self.where)
+                verify_digests(tree, self._digests[name], self.where, mend="it is damaged")
         return stack_layers(state)
 
     @contextlib.contextmanager

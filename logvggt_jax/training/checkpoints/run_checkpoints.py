@@ -168,9 +168,7 @@ class RunCheckpoints:
                 state, position = self._restore(chosen, like)
             except DamagedCheckpoint as error:
                 if chosen == candidates[-1]:
-                    others = [other for other in steps if other not in candidates]
-                    mend = f"resume from another with --resume_step (there are {others})" if others else _BEGIN_ANEW
-                    raise DamagedCheckpoint(f"{error}; {mend}") from error
+                    raise _without_way_on(error, steps, candidates) from error
                 logging.error("%s; going on from the checkpoint before it", one_line(error))
             else:
                 break
@@ -201,9 +199,9 @@ class RunCheckpoints:
         for chosen in candidates:
             try:
                 stored = StoredCheckpoint(self.folder / str(chosen))
-            except DamagedCheckpoint:
+            except DamagedCheckpoint as error:
                 if chosen == candidates[-1]:
-                    raise
+                    raise _without_way_on(error, steps, candidates) from error
                 continue  # as a run does, which goes on from the one before
             check_configuration(stored, self.config)
             return chosen
@@ -301,6 +299,13 @@ class RunCheckpoints:
         except (OSError, ValueError, KeyError, TypeError, RecursionError):
             return None
         return found
+
+
+def _without_way_on(error: DamagedCheckpoint, steps: list[int], tried: list[int]) -> DamagedCheckpoint:
+    """The error, and what is left to do."""
+    others = [step for step in steps if step not in tried]
+    mend = f"resume from another with --resume_step (there are {others})" if others else _BEGIN_ANEW
+    return DamagedCheckpoint(f"{error}; {mend}")
 
 
 def _is_fetched(leaf: Any) -> bool:

@@ -123,6 +123,28 @@ def test_a_changed_position_and_a_changed_setting_are_refused(
         shutil.rmtree(copy)
 
 
+def test_descriptions_tell_where_a_start_would_go_on(
+    run_config: TrainConfig, state: TrainState, tmp_path: Path
+) -> None:
+    with RunCheckpoints(tmp_path, run_config) as checkpoints:
+        assert checkpoints.resumed_step() is None
+        with pytest.raises(InputError, match="no checkpoint of step 3; there are none"):
+            checkpoints.resumed_step(3)
+        for step in (1, 2):
+            checkpoints.save(state._replace(step=np.int32(step)), POSITION)
+            checkpoints.wait()
+        assert checkpoints.resumed_step() == 2 and checkpoints.resumed_step(1) == 1
+        with pytest.raises(InputError, match=r"no checkpoint of step 3; there are \[1, 2\]"):
+            checkpoints.resumed_step(3)
+        (checkpoints.folder / "2" / "meta" / "metadata").write_text("{")
+        assert checkpoints.resumed_step() == 1
+        with pytest.raises(DamagedCheckpoint, match=r"step 2 .* cannot be read .*--resume_step \(there are \[1\]\)"):
+            checkpoints.resumed_step(2)
+        (checkpoints.folder / "1" / "meta" / "metadata").write_text("{")
+        with pytest.raises(DamagedCheckpoint, match=r"step 1 .* cannot be read .*; start a new --workdir"):
+            checkpoints.resumed_step()
+
+
 def test_a_checkpoint_from_before_the_digest_is_restored(
     run_config: TrainConfig, state: TrainState, saved: Path
 ) -> None:
