@@ -30,6 +30,7 @@ from logvggt_jax.training.parallel.agreement import (
     check_shared,
     raise_together,
 )
+from logvggt_jax.training.parallel.same_settings import check_same_parameters, check_same_settings
 from logvggt_jax.training.parallel.sharding import check_batch_size
 from logvggt_jax.training.parallel.watchdog import Watchdog
 from logvggt_jax.training.reporting.intervals import report_interval
@@ -92,6 +93,7 @@ def train(
     if jax.process_index() == 0:  # which alone writes there
         check_writable(workdir.expanduser().absolute() / "checkpoints")
     check_shared(workdir)
+    check_same_settings(config, profile=profile)
     with contextlib.ExitStack() as stack:
         earlier = RunCheckpoints(workdir, config)
         earlier.check_unused()
@@ -156,6 +158,7 @@ class _Run:
         # The checkpoint of step 0 is there to show that one can be written: nothing is lost by beginning again.
         if resume_step is None and not any(self.checkpoints.steps):
             params = initial_parameters(config.model, seed=config.seed, weights=config.initial_weights)
+            check_same_parameters(params)
             self.checkpoints.begin_anew()
             self.state = self.program.initial_state(params)
             return 0, None

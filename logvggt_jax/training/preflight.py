@@ -29,6 +29,7 @@ from logvggt_jax.training.feeding.batches import stage_batches
 from logvggt_jax.training.feeding.sources import open_source, open_sources
 from logvggt_jax.training.feeding.truth import check_depth, check_truth
 from logvggt_jax.training.parallel.agreement import any_process, check_shared
+from logvggt_jax.training.parallel.same_settings import check_same_settings
 from logvggt_jax.training.parallel.sharding import DATA_AXIS, check_batch_size, parameter_layout, split
 from logvggt_jax.training.step.costs import step_costs
 from logvggt_jax.training.step.initialization import check_weights
@@ -49,11 +50,12 @@ def preflight(config: TrainConfig, workdir: Path, mesh: Mesh, say: Callable[[str
     compilation.
 
     All processes do it together; process 0 says a line for each. Nothing is left in `workdir`. Raises InputError at
-    the end where something failed on a process, and at once where the folder is not shared.
+    the end where something failed on a process, and at once where the folder is not shared or the settings differ.
     """
     for stage in config.stages:
         check_batch_size(stage, mesh, accumulate=config.accumulate)
     check_shared(workdir)
+    check_same_settings(config)
     failed: list[str] = []
 
     def attempt(what: str, check: Callable[[], str]) -> None:

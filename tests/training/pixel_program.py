@@ -53,11 +53,16 @@ PIXEL_SETTINGS = (
 class PixelRuns:
     """Two processes of `train.py` with the model that compiles at once; ended when the block is left.
 
-    `patches` are Python statements for each process, run before training.
+    `patches` are Python statements for each process, run before training; `own` are flags of each beside the `flags`.
     """
 
     def __init__(
-        self, programs: RootPrograms, *workdirs: Path, patches: tuple[str, str] = ("", ""), flags: tuple[str, ...] = ()
+        self,
+        programs: RootPrograms,
+        *workdirs: Path,
+        patches: tuple[str, str] = ("", ""),
+        flags: tuple[str, ...] = (),
+        own: tuple[tuple[str, ...], tuple[str, ...]] = ((), ()),
     ) -> None:
         address = f"localhost:{free_port()}"
         self.processes = [
@@ -70,6 +75,7 @@ class PixelRuns:
                 "--num_processes=2",
                 f"--process_id={number}",
                 *flags,
+                *own[number],
                 first=f"{PIXEL_MODEL}\n{patch}",
             )
             for number, (workdir, patch) in enumerate(zip(workdirs, patches, strict=True))

@@ -27,6 +27,7 @@ from logvggt_jax.training.parallel.sharding import replicated, split
 SHARED_SECONDS = 60.0
 # Others may still wait for the clips of a step that this process has begun already.
 ANSWER_SECONDS = 60.0
+_SAME_FOLDERS = "let all see the same folders (their logs name what was left out)"
 
 
 class EndedElsewhere(InputError):
@@ -43,6 +44,14 @@ def from_all(values: np.ndarray) -> np.ndarray:
     if jax.process_count() == 1:
         return values[None]
     return np.asarray(multihost_utils.process_allgather(values))
+
+
+def texts_from_all(text: str) -> list[str]:
+    """The `text` of every process; all processes have to ask at the same point."""
+    own = np.frombuffer(text.encode(), np.uint8)
+    lengths = from_all(np.array(own.size))
+    padded = from_all(np.pad(own, (0, int(lengths.max()) - own.size)))
+    return [row[:length].tobytes().decode() for row, length in zip(padded, lengths, strict=True)]
 
 
 def raise_together(failure: BaseException | None, what: str) -> None:
@@ -118,8 +127,8 @@ class Vote:
         return len(self._cast) > self.notice and bool(self._cast.popleft())
 
 
-def check_agreement(what: str, value: Any) -> None:
-    """Raises InputError on every process unless `value` (JSON types) is the same on all of them.
+def check_agreement(what: str, value: Any, *, mend: str = _SAME_FOLDERS) -> None:
+    """Raises InputError on every process unless `value` (JSON types) is the same on all of them; it ends with `mend`.
 
     All processes have to ask at the same point.
     """
@@ -129,10 +138,7 @@ def check_agreement(what: str, value: Any) -> None:
     rows = multihost_utils.process_allgather(np.frombuffer(digest, np.uint8))
     odd = [process for process, row in enumerate(rows) if not np.array_equal(row, rows[0])]
     if odd:
-        raise InputError(
-            f"{what} of the processes {odd} differ from those of process 0: let all see the same folders (their logs "
-            "name what was left out)"
-        )
+        raise InputError(f"{what} of the processes {odd} differ from those of process 0: {mend}")
 
 
 def check_shared(folder: Path, setting: str = "--workdir") -> None:

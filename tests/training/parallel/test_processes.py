@@ -1,5 +1,6 @@
 """Two processes that train together give one process's numbers and leave one set of files."""
 
+import contextlib
 import platform
 import re
 import signal
@@ -19,6 +20,7 @@ from logvggt_jax.training.checkpoints.checkpoint_files import StoredCheckpoint
 from logvggt_jax.training.parallel import agreement
 from logvggt_jax.training.parallel.agreement import any_process, check_agreement
 from logvggt_jax.training.parallel.joining import check_processes, join_processes
+from logvggt_jax.training.parallel.same_settings import check_same_parameters
 from logvggt_jax.training.reporting.metrics_log import read_metrics
 from logvggt_jax.weights.checkpoints import load_model
 
@@ -192,6 +194,42 @@ ClipReader.__call__ = reading
         assert all(
             re.fullmatch(rf"{'black' if what == 'loss' else 'white'} rooms, [^;]*", clips) for _, what, clips in named
         ), said
+
+
+def test_processes_with_other_settings_are_refused(programs: RootPrograms, tmp_path: Path) -> None:
+    # How clips are read may differ.
+    own = ("--config.optimizer.learning_rate=5e-3", "--config.data.num_threads=3", "--profile=3:4")
+    with PixelRuns(programs, tmp_path, tmp_path, own=((), own)) as runs:
+        errors = [runs.errors(number) for number in range(2)]
+        assert [process.returncode for process in runs.processes] == [1, 1], errors
+    said = (
+        "process 1 was started with other settings than process 0: config.optimizer.learning_rate=0.005, there 0.001; "
+        "profile=[3, 4], there None; start all with one command"
+    )
+    assert all(said in error and "Traceback" not in error for error in errors), errors
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("other", "refused"), [(0.0, False), (1e-6, True)])
+def test_processes_with_other_initial_parameters_are_refused(
+    other: float, refused: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    params = {"a": np.arange(6, dtype=np.float32), "b": {"kernel": np.ones((2, 3), np.float32)}}
+    sent = []
+
+    def gathered(digest: np.ndarray) -> np.ndarray:
+        sent.append(digest)
+        return np.stack([digest, sent[0]])
+
+    monkeypatch.setattr(jax, "process_count", lambda: 2)
+    monkeypatch.setattr(agreement.multihost_utils, "process_allgather", gathered)
+    check_same_parameters(params)
+    params["b"]["kernel"][1, 1] += other
+    with contextlib.ExitStack() as stack:
+        if refused:
+            told = r"the initial parameters of the processes \[1\] differ .*: give all the same file"
+            stack.enter_context(pytest.raises(InputError, match=told))
+        check_same_parameters(params)
 
 
 def test_folders_that_are_not_shared_are_an_error_of_the_start(programs: RootPrograms, tmp_path: Path) -> None:
