@@ -102,7 +102,9 @@ def pose_similarity(source: np.ndarray, target: np.ndarray) -> Similarity:
     """The similarity that moves the world so that cameras `source` come to lie where cameras `target` are.
 
     Robust: a minority of wrong poses loses its weight. Rotations give the rotation and centres the rest, so that a
-    straight path, on which centres alone leave a rotation open, is enough. Noise of the others counts as the source's.
+    straight path, on which centres alone leave a rotation open, is enough. The scale is the ratio of how far centres
+    lie apart in both worlds: least squares would make it too small by as much as the paths differ in shape, or too
+    large the other way round.
 
     Args:
       source: [N, 3|4, 4] world-to-camera.
@@ -131,12 +133,11 @@ def pose_similarity(source: np.ndarray, target: np.ndarray) -> Similarity:
         weights = np.minimum(1.0, limit / np.maximum(residual, limit)) ** 2
         weights /= weights.sum()
         mean_source, mean_target = weights @ turned, weights @ centres
-        # Of `target` on `source` the scale would come out too small, by as much as the source's centres are noisy.
-        alike = float(weights @ ((turned - mean_source) * (centres - mean_target)).sum(1))
-        spread = float(weights @ ((centres - mean_target) ** 2).sum(1))
-        if not (alike > 0 and spread > 0):
-            raise NoSimilarity("no similarity: the cameras of the two worlds do not move alike")
-        scale = spread / alike
+        of_source = float(weights @ ((turned - mean_source) ** 2).sum(1))
+        of_target = float(weights @ ((centres - mean_target) ** 2).sum(1))
+        if not (of_source > 0 and of_target > 0):
+            raise NoSimilarity("no similarity: the cameras are all at one place, which leaves the scale open")
+        scale = float(np.sqrt(of_target / of_source))
         translation = mean_target - scale * mean_source
     return Similarity(scale, rotation, translation)
 

@@ -19,6 +19,8 @@ from logvggt_jax.reconstruction.points.point_filter import PointFilter
 from logvggt_jax.reconstruction.sources.record import SourceRecord
 
 CAMERAS_FILE = "cameras.json"
+# What a result's folder is called beside its name until its run has ended.
+PARTIAL = ".partial"
 CAMERAS_FORMAT = "logvggt-cameras-1"
 
 
@@ -123,11 +125,22 @@ def read_cameras(path: str | Path) -> dict[str, Any]:
     try:
         document = read_json(path, "so it is not a cameras file of this program, or damaged")
     except MissingInput:
-        raise MissingInput(f"{path} does not exist: expected the output of `logvggt reconstruct`") from None
+        raise MissingInput(
+            f"{path} does not exist: expected the output of `logvggt reconstruct`{_unfinished(path.parent)}"
+        ) from None
     try:
         return _checked(document)
     except _Fault as fault:
         raise InputError(f"{path} is not a cameras file of this program, or damaged: {fault}") from None
+
+
+def _unfinished(folder: Path) -> str:
+    """A word on a run that has not ended and was to make this folder, or whose own it is; or nothing."""
+    folder = folder.absolute()
+    partial = folder if folder.name.endswith(PARTIAL) else folder.with_name(folder.name + PARTIAL)
+    if not partial.is_dir():
+        return ""
+    return f"; {partial} is what a run has left that has not ended: the same command goes on with it"
 
 
 class _Fault(Exception):

@@ -39,6 +39,18 @@ def write_depth(path: str | Path, depth: np.ndarray, confidence: np.ndarray) -> 
     return depth.astype(np.float32), confidence.astype(np.float32)
 
 
+def check_range(depth: np.ndarray, what: str) -> None:
+    """Raises InputError, naming `what`, where more than a hundredth of a depth map is lost to the numbers of a file."""
+    valid = depth[np.isfinite(depth) & (depth > 0)]
+    limits = np.finfo(np.float16)
+    lost = np.count_nonzero((valid > float(limits.max)) | (valid < float(limits.tiny)))
+    if lost > 0.01 * valid.size:
+        raise InputError(
+            f"{what}: its depth would be {np.median(valid):.3g} (median), and files of depth hold {limits.tiny:.1g} to "
+            f"{limits.max:g}: give lengths in another unit, such as metres"
+        )
+
+
 def read_depth(path: str | Path, size: tuple[int, int] | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Depth and confidence, [H, W] float32, of a file that `write_depth` has written.
 

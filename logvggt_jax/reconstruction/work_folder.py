@@ -11,7 +11,7 @@ from types import TracebackType
 
 from logvggt_jax.errors import InputError, OutputExists, disk_errors, one_line
 from logvggt_jax.files import FolderLock, atomic_file, check_output, move_folder, to_disk, write_text
-from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE, is_complete
+from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE, PARTIAL, is_complete
 from logvggt_jax.reconstruction.saved_source import check_source
 from logvggt_jax.reconstruction.sources import Source
 from logvggt_jax.streaming.state_file import State, read_state, write_state
@@ -121,7 +121,7 @@ class WorkFolder:
 
 def work_path(output: Path) -> Path:
     """Where the work on a result lies until it is finished."""
-    return output.with_name(f"{output.name}.partial")
+    return output.with_name(output.name + PARTIAL)
 
 
 def is_unfinished(folder: Path) -> bool:

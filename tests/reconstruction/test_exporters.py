@@ -6,6 +6,7 @@ import importlib
 import importlib.util
 import json
 import shutil
+import sys
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -26,6 +27,7 @@ from logvggt_jax.reconstruction.depth_files import write_depth
 from logvggt_jax.reconstruction.exporters import frame_bytes
 from logvggt_jax.reconstruction.exporters.frame_names import file_stems
 from logvggt_jax.reconstruction.exporters.glb import _times
+from logvggt_jax.reconstruction.exporters.libraries import library
 from logvggt_jax.reconstruction.exporters.original_depth import depth_at
 from logvggt_jax.reconstruction.points.cloud_file import read_cloud, read_points
 from logvggt_jax.reconstruction.result import depth_file
@@ -449,9 +451,37 @@ def masked_result(folder: Path) -> Reconstruction:
 def test_the_results_own_files_are_never_replaced(tmp_path: Path) -> None:
     result = write_room_result(tmp_path, count=2)
     before = contents(result.folder)
-    with pytest.raises(InputError, match="is the result itself, whose files exports would replace"):
+    with pytest.raises(InputError, match="is the result itself, or lies among its own files"):
         export(result, ["ply"], result.folder, point_filter=FEW_POINTS, overwrite=True, progress=False)
+    for inside in ("depth", "images/scene"):
+        with pytest.raises(InputError, match="is the result itself, or lies among its own files"):
+            export(result, ["ply"], result.folder / inside, point_filter=FEW_POINTS, progress=False)
     assert contents(result.folder) == before
+    (made,) = export(result, ["ply"], result.folder / "exports" / "few", point_filter=FEW_POINTS, progress=False)
+    assert made.is_file()
+
+
+def test_a_library_that_does_not_load_is_told_from_one_that_is_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "trimesh").mkdir()
+    (tmp_path / "trimesh" / "__init__.py").write_text("raise ImportError('libX.so.1: cannot open shared object file')")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "trimesh", raising=False)
+    importlib.invalidate_caches()
+    with pytest.raises(
+        MissingPackage, match=r"trimesh, which is installed and does not load \(libX\.so\.1: .*\): inst"
+    ):
+        library("trimesh")
+
+
+def test_a_folder_of_a_run_that_has_not_ended_is_called_so(tmp_path: Path) -> None:
+    (tmp_path / "walk.partial").mkdir()
+    for name in ("walk", "walk.partial"):
+        with pytest.raises(InputError, match=r"walk\.partial is what a run has left .*: the same command goes on"):
+            Reconstruction.open(tmp_path / name)
+    with pytest.raises(InputError, match=r"expected the output of `logvggt reconstruct`$"):
+        Reconstruction.open(tmp_path / "other")
 
 
 def test_another_decoders_name_does_not_make_a_source_another(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from logvggt_jax.geometry import (
     rotation_angle,
 )
 from logvggt_jax.reconstruction import PointFilter, Reconstruction, export, fuse, write_trajectory
+from logvggt_jax.reconstruction.fusion.bundle_adjustment import _largest_steps
 from logvggt_jax.reconstruction.fusion.matching import match_poses
 from logvggt_jax.reconstruction.fusion.pose_files import ExternalPose, read_poses
 
@@ -153,6 +154,43 @@ def test_bundle_adjustment_brings_cameras_nearer_to_the_truth(truth: Reconstruct
     found = pose_similarity(made.extrinsics, start.extrinsics)
     assert found.scale == pytest.approx(1, abs=1e-3), "the world keeps its scale"
     assert any("bundle adjustment:" in note and "before" in note for note in notes)
+    assert any(note.startswith("between neighbours cameras turn by up to") for note in notes)
+
+
+def test_an_adjustment_that_tears_neighbours_apart_is_refused(truth: Reconstruction, tmp_path: Path) -> None:
+    pytest.importorskip("pycolmap", reason="extra `colmap` is not installed")
+    # Corners are followed with cameras that have nothing to do with the images, so that few are left, by chance.
+    start = changed(truth, tmp_path / "start", shaken(truth.extrinsics, 0.3), np.ones(COUNT))
+    with pytest.raises(InputError, match=r"bundle adjustment of .*start (did not hold|found \d+ corners).*"):
+        fuse(start, tmp_path / "adjusted", adjust=True, progress=False)
+    assert not (tmp_path / "adjusted").exists()
+
+
+def test_the_largest_change_between_neighbours_is_found(truth: Reconstruction) -> None:
+    after = truth.extrinsics.copy()
+    assert _largest_steps(truth.extrinsics, after) == pytest.approx((0.0, 0.0), abs=1e-4)
+    turn = np.eye(3)
+    turn[:2, :2] = [[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]]
+    after[4, :, :3] = turn @ after[4, :, :3]
+    centres = camera_centres(truth.extrinsics)
+    after[4, :, 3] = -after[4, :, :3] @ centres[4]
+    turned, shifted = _largest_steps(truth.extrinsics, after)
+    assert turned == pytest.approx(np.degrees(0.3), rel=1e-3) and shifted < 1e-6
+    after[7:, :, 3] -= after[7:, :, :3] @ (centres[7] - centres[6])
+    size = np.median(np.linalg.norm(centres - np.median(centres, axis=0), axis=1))
+    _, shifted = _largest_steps(truth.extrinsics, after)
+    assert shifted == pytest.approx(np.linalg.norm(centres[7] - centres[6]) / size, rel=1e-3)
+
+
+def test_paths_that_are_not_alike_give_a_scale_and_a_word_on_it(truth: Reconstruction, tmp_path: Path) -> None:
+    """Better poses are wanted most where the result's are bad: those are no reason to refuse them."""
+    bad = changed(truth, tmp_path / "bad", shaken(truth.extrinsics, 0.5), np.full(COUNT, 1.0))
+    poses = with_tum(truth, tmp_path / "poses")
+    made, notes = fuse(bad, tmp_path / "fused", poses=poses, progress=False)
+    np.testing.assert_allclose(made.extrinsics, truth.extrinsics, atol=1e-6)
+    assert any("the two paths are not alike, and the scale is a guess" in note for note in notes)
+    _, notes = fuse(truth, tmp_path / "again", poses=poses, progress=False)
+    assert not any("guess" in note for note in notes)
 
 
 def test_images_that_show_nothing_move_no_camera(truth: Reconstruction, tmp_path: Path) -> None:
@@ -172,7 +210,7 @@ def test_images_that_show_nothing_move_no_camera(truth: Reconstruction, tmp_path
     [
         ("1000 0 0 0 0 0 0 1\n1001 1 0 0 0 0 0 1\n", r"its times, 1000 to 1001, are none of the frames', 0 to 1\.125"),
         ("0 0 0 0 0 0 0 1\n", "needs? at least 2"),
-        ("0 1 1 1 0 0 0 1\n0.125 1 1 1 0 0 0 1\n", "do not move alike"),
+        ("0 1 1 1 0 0 0 1\n0.125 1 1 1 0 0 0 1\n", "all at one place"),
         ("0 1 1\n", "poses.txt:1: expected 8 numbers"),
         ("", "holds no pose"),
     ],

@@ -50,6 +50,13 @@ def test_from_the_distance_of_two_frames(truth: Reconstruction, result: Reconstr
     assert "all lengths are multiplied by 4" in notes[-1]
 
 
+@pytest.mark.parametrize("metres", [1e9, 1e-9])
+def test_a_unit_in_which_files_hold_no_depth_is_refused(result: Reconstruction, tmp_path: Path, metres: float) -> None:
+    with pytest.raises(InputError, match=r"view 0: its depth would be .* and files of depth hold 6e-05 to 65504: give"):
+        rescale(result, tmp_path / "out", frames=("0", "3"), distance=metres, progress=False)
+    assert not list(tmp_path.iterdir())
+
+
 def test_from_the_distance_of_two_pixels(truth: Reconstruction, result: Reconstruction, tmp_path: Path) -> None:
     (height, width), (rows, columns) = truth.image_size, truth.depth_size
     points = unproject(truth.depth(1), truth.depth_intrinsics[1], truth.extrinsics[1])

@@ -128,7 +128,8 @@ def export(
       What was written, in the order of the names.
 
     Raises:
-      InputError: no such format, the output is the result's own folder, or a file of the result is damaged.
+      InputError: no such format, the output is the result's own folder or one of those in it, or a file of the result
+        is damaged.
       MissingPackage: the library of a format is not installed.
       OutputExists: something is at a place where a format has to go.
       DiskError: the disk has too little room for pictures and depth, or cannot be written.
@@ -136,8 +137,12 @@ def export(
     check_formats(names)
     names = list(dict.fromkeys(names))
     folder = result.folder / EXPORT_FOLDER if output is None else user_path(output)
-    if folder.resolve() == result.folder.resolve():
-        raise InputError(f"{folder} is the result itself, whose files exports would replace: choose another output")
+    inside, own = folder.resolve(), result.folder.resolve()
+    if inside.is_relative_to(own) and not inside.is_relative_to(own / EXPORT_FOLDER):
+        raise InputError(
+            f"{folder} is the result itself, or lies among its own files: choose another output, or "
+            f"{own / EXPORT_FOLDER}"
+        )
     targets = [_checked(folder / EXPORTERS[name].file, EXPORTERS[name], overwrite) for name in names]
     drawn = any(EXPORTERS[name].picture_bytes for name in names)
     pictures = picture_size(result) if drawn else result.depth_size

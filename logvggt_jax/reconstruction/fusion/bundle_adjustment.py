@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from logvggt_jax.errors import InputError
-from logvggt_jax.geometry import pose_similarity
+from logvggt_jax.geometry import NoSimilarity, camera_centres, pose_similarity, rotation_angle
 from logvggt_jax.reconstruction.exporters.colmap import build_model
 from logvggt_jax.reconstruction.exporters.libraries import library
 from logvggt_jax.reconstruction.fusion.image_tracks import follow_corners
@@ -17,6 +17,8 @@ from logvggt_jax.reconstruction.result import Reconstruction
 # Pixels beyond which an observation's influence stops growing.
 _ROBUST = 0.5
 _FEWEST_OBSERVATIONS = 15
+# Changes between neighbours that no better camera has: the turn's in degrees, the way's as a share of the path's size.
+_BROKEN_TURN, _BROKEN_SHIFT = 10.0, 0.5
 
 
 class Adjusted(NamedTuple):
@@ -28,6 +30,9 @@ class Adjusted(NamedTuple):
       before, after: median over the corners of their mean distance from where they project to, in pixels of the depth
         maps.
       num_loose: frames that showed too little to move.
+      turned: the largest change of the rotation between neighbours, in degrees.
+      shifted: the largest change of the way between neighbours, over the median distance of the cameras from their
+        middle.
     """
 
     extrinsics: np.ndarray
@@ -35,6 +40,8 @@ class Adjusted(NamedTuple):
     before: float
     after: float
     num_loose: int
+    turned: float
+    shifted: float
 
     def notes(self) -> list[str]:
         """What to say of it, one line each."""
@@ -42,7 +49,17 @@ class Adjusted(NamedTuple):
             f"bundle adjustment: {self.num_points} corners lie {self.after:.2f} pixels from where they project to, "
             f"before {self.before:.2f}"
         ]
-        return said + ([f"{self.num_loose} frames show too little to be moved"] if self.num_loose else [])
+        if self.num_loose:
+            said.append(f"{self.num_loose} frames show too little to be moved")
+        return [*said, f"between neighbours {self.steps}"]
+
+    @property
+    def steps(self) -> str:
+        """The largest changes between neighbours, in words."""
+        return (
+            f"cameras turn by up to {self.turned:.2f} degrees more or less than before, and go up to "
+            f"{self.shifted:.1%} of the path's size further or less far"
+        )
 
 
 def bundle_adjust(
@@ -69,7 +86,7 @@ def bundle_adjust(
 
     Raises:
       MissingPackage: pycolmap is not installed.
-      InputError: the images show too little that could be found again.
+      InputError: the images show too little that could be found again, or the cameras do not stay near one another.
     """
     pycolmap = library("pycolmap")
     size, extrinsics = result.depth_size, np.asarray(extrinsics)[:, :3]
@@ -96,9 +113,32 @@ def bundle_adjust(
             config.set_constant_rig_from_world_pose(index + 1)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     pycolmap.create_default_bundle_adjuster(options, config, model).solve()
-    adjusted = np.stack([model.image(index + 1).cam_from_world().matrix() for index in range(len(frames))])
-    moved = pose_similarity(adjusted[tied], extrinsics[tied]).apply_to_extrinsics(adjusted)
-    return Adjusted(moved, len(tracks.points), before, _median_error(model), int((~tied).sum()))
+    solved = np.stack([model.image(index + 1).cam_from_world().matrix() for index in range(len(frames))])
+    try:
+        moved = pose_similarity(solved[tied], extrinsics[tied]).apply_to_extrinsics(solved)
+    except NoSimilarity as error:
+        raise InputError(
+            f"bundle adjustment of {result.folder} did not hold ({error}): leave it out, or give better cameras to "
+            "begin with"
+        ) from error
+    steps = _largest_steps(extrinsics, moved)
+    adjusted = Adjusted(moved, len(tracks.points), before, _median_error(model), int((~tied).sum()), *steps)
+    if adjusted.turned > _BROKEN_TURN or adjusted.shifted > _BROKEN_SHIFT:
+        raise InputError(
+            f"bundle adjustment of {result.folder} did not hold: {len(tracks.points)} corners lie well, but "
+            f"{adjusted.steps}; leave it out, or give better cameras to begin with"
+        )
+    return adjusted
+
+
+def _largest_steps(before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
+    """By how much the motion between two neighbours has changed at most, see `Adjusted`."""
+    old, new = (cameras[:, :3, :3] for cameras in (before, after))
+    turned = rotation_angle(old[1:] @ np.swapaxes(old[:-1], -1, -2), new[1:] @ np.swapaxes(new[:-1], -1, -2))
+    ways = [np.linalg.norm(np.diff(camera_centres(cameras), axis=0), axis=1) for cameras in (before, after)]
+    centres = camera_centres(before)
+    size = float(np.median(np.linalg.norm(centres - np.median(centres, axis=0), axis=1)))
+    return float(np.degrees(turned).max()), float(np.abs(ways[1] - ways[0]).max()) / max(size, np.finfo(float).tiny)
 
 
 def _median_error(model: object) -> float:

@@ -12,7 +12,7 @@ from logvggt_jax.data.feeding.transforms import ResizeTransform
 from logvggt_jax.errors import InputError, disk_errors
 from logvggt_jax.files import atomic_folder, check_output, check_writable
 from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE, write_cameras
-from logvggt_jax.reconstruction.depth_files import write_depth
+from logvggt_jax.reconstruction.depth_files import check_range, write_depth
 from logvggt_jax.reconstruction.exporters.ply import export_ply
 from logvggt_jax.reconstruction.exporters.tum import export_tum
 from logvggt_jax.reconstruction.frame_pool import FramePool
@@ -69,7 +69,7 @@ def write_derived(
 
     Raises:
       OutputExists: something is at `output`.
-      InputError: a file of the result is damaged.
+      InputError: a file of the result is damaged, or depth is too large or too small for a file.
     """
     target = check_derived(result, output, overwrite=overwrite)
     transform = ResizeTransform(result.image_size, result.depth_size)
@@ -80,7 +80,9 @@ def write_derived(
 
         def write(place: int) -> None:
             depth, confidence = result.depth_and_confidence(frames[place])
-            write_depth(depth_file(folder, names[place]), depth_scales[place] * depth, confidence)
+            scaled = depth_scales[place] * depth
+            check_range(scaled, names[place])
+            write_depth(depth_file(folder, names[place]), scaled, confidence)
             shutil.copyfile(image_file(result.folder, names[place]), image_file(folder, names[place]))
 
         for _ in pool.map(write, iter(range(len(frames)))):

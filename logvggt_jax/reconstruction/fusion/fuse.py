@@ -18,6 +18,8 @@ from logvggt_jax.reconstruction.fusion.matching import match_poses
 from logvggt_jax.reconstruction.fusion.pose_files import ExternalPose, read_poses
 from logvggt_jax.reconstruction.result import Reconstruction
 
+# How far the cameras of a result may lie from given ones, as a share of how far these lie from their middle.
+_UNLIKE = 0.2
 # By how much the aspect ratios of two pictures of one frame may differ.
 _ASPECT = 0.01
 
@@ -125,11 +127,19 @@ def align(result: Reconstruction, matched: dict[int, ExternalPose], path: str | 
     moved = similarity.apply_to_extrinsics(result.extrinsics[frames])
     distances = np.linalg.norm(camera_centres(moved) - camera_centres(extrinsics), axis=1)
     angles = np.degrees(rotation_angle(moved[:, :3, :3], extrinsics[:, :3, :3]))
-    return similarity, (
+    said = (
         f"similarity: scale {similarity.scale:.5g}; the result's cameras then lie {np.median(distances):.4g} from the "
         f"poses (median; root mean square {np.sqrt((distances**2).mean()):.4g}), turned by {np.median(angles):.2f} "
         "degrees"
     )
+    centres = camera_centres(extrinsics)
+    apart = float(np.median(np.linalg.norm(centres - np.median(centres, axis=0), axis=1)))
+    if np.median(distances) > _UNLIKE * apart:
+        said += (
+            f". The poses lie {apart:.4g} from their middle: the two paths are not alike, and the scale is a guess. If "
+            "they are of one recording, depth of a sensor or a known distance tells it better (logvggt scale)"
+        )
+    return similarity, said
 
 
 def match(result: Reconstruction, poses: str | Path, notes: list[str]) -> dict[int, ExternalPose]:

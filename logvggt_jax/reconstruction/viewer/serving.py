@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from logvggt_jax.errors import InputError, MissingPackage, install_line
+from logvggt_jax.errors import InputError, MissingPackage, install_line, one_line
 from logvggt_jax.reconstruction.result import Reconstruction
 from logvggt_jax.reconstruction.viewer.run_window import RunWindow
 from logvggt_jax.reconstruction.viewer.window import Window
@@ -74,7 +74,8 @@ def _viser() -> Any:
         import viser
     except ImportError as error:
         raise MissingPackage(
-            f"the viewer needs viser: {install_line('viewer')}; a page that needs nothing is written with --save"
+            f"the viewer needs viser ({one_line(error)}): {install_line('viewer')}; a page that needs nothing is "
+            "written with --save"
         ) from error
     return viser
 
