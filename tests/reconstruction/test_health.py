@@ -21,7 +21,7 @@ from logvggt_jax.reconstruction.health import report
 from logvggt_jax.reconstruction.health.measures import Measures
 from logvggt_jax.reconstruction.health.plot import svg_plot
 from logvggt_jax.reconstruction.health.recorder import HealthRecorder
-from logvggt_jax.reconstruction.health.rules import stretches
+from logvggt_jax.reconstruction.health.rules import Stretch, stretches
 from logvggt_jax.reconstruction.health.words import in_short, paragraph
 from logvggt_jax.streaming import Signals
 
@@ -69,6 +69,16 @@ def test_a_cut_is_seen_though_the_predicted_cameras_do_not_tell() -> None:
     images = np.concatenate([frames.images[:20], rooms.clean(3).images[20:]])
     (found,) = stretches(measured(frames._replace(images=images), signals))
     assert (found.cause, found.first, found.last) == ("no overlap", 20, 20)
+
+
+def test_what_depth_alone_tells_is_not_blamed_on_the_footage() -> None:
+    """Depth that is wrong looks as what moves does: a model's own result of a room in which nothing moves says so."""
+    measures, names = measured(rooms.clean(), rooms.signals(rooms.COUNT, ())), ["x"] * rooms.COUNT
+    for signs, certain in (((), False), (("disagreement",), False), (("correction", "disagreement"), True)):
+        found = (Stretch("moving", 3, 5, signs),)
+        assert ("or depth is wrong there" in paragraph(found, measures, names)) != certain
+        assert ("most likely" in paragraph(found, measures, names)) == certain
+        assert in_short(found, 40) == f"3 of 40 frames doubtful: moving{'' if certain else ', or wrong depth'} (3 to 5)"
 
 
 def test_a_moving_subject_is_told_from_the_cameras_own_movement() -> None:

@@ -248,6 +248,15 @@ def test_a_video_is_played_at_its_own_pace_and_its_end_is_no_loss(tmp_path: Path
     assert Reconstruction.open(tmp_path / "out").complete
 
 
+def test_a_video_waits_until_the_programs_are_there() -> None:
+    results, opened = list[LiveResult](), iter((Recorder(lambda _: time.sleep(0.05)), Recorder()))
+    options = {"longer_edge": LONGER_EDGE, "warm_up": 6, "capacity": 2, "on_result": results.append}
+    live = LiveSession(lambda: next(opened), **options)
+    assert follow(FakeCamera(6, step=0.02), live, realtime=True) is None
+    assert (live.report().used, live.report().dropped) == (6, 0)
+    assert [each.name for each in results] == [f"frame-{index:06d}" for index in range(6)]
+
+
 def kept(folder: Path, count: int) -> Reconstruction:
     """The result in `folder/out`, which is whole, incomplete, of so many frames, and alone there."""
     result = Reconstruction.open(folder / "out")

@@ -52,7 +52,8 @@ def in_short(found: Sequence[Stretch], count: int) -> str:
         return f"no doubtful frame among {count}"
     causes: dict[str, list[str]] = {}
     for stretch in found:
-        causes.setdefault(stretch.cause or "unexplained", []).append(_numbers(stretch))
+        cause = "moving, or wrong depth" if _wrong_depth_looks_so(stretch) else stretch.cause or "unexplained"
+        causes.setdefault(cause, []).append(_numbers(stretch))
     told = "; ".join(
         f"{cause} ({', '.join(where[:3])}{' …' if len(where) > 3 else ''})" for cause, where in causes.items()
     )
@@ -64,7 +65,14 @@ def reasons(stretch: Stretch) -> str:
     signs = " and ".join(SIGNS[name] for name in stretch.signs)
     if stretch.cause is None:
         return f"{signs}; nothing that is measured of the footage says why"
+    if _wrong_depth_looks_so(stretch):
+        return f"{CAUSES[stretch.cause]}, or depth is wrong there: {signs or 'nothing else in the result says which'}"
     return CAUSES[stretch.cause] + (f", and it shows: {signs}" if signs else ", though the result shows no sign of it")
+
+
+def _wrong_depth_looks_so(stretch: Stretch) -> bool:
+    """Whether the footage is not to blame for certain: what moves is known by depth alone."""
+    return stretch.cause == "moving" and {*stretch.signs} <= {"disagreement", "conflicts"}
 
 
 def _sentence(stretch: Stretch, measures: Measures, names: Sequence[str]) -> str:
@@ -73,7 +81,8 @@ def _sentence(stretch: Stretch, measures: Measures, names: Sequence[str]) -> str
     if stretch.cause is None:
         return f"{where}: {reasons(stretch)}."
     evidence = _evidence(stretch, measures)
-    return f"{where}: most likely {reasons(stretch)}{f' ({evidence})' if evidence else ''}."
+    likely = "" if _wrong_depth_looks_so(stretch) else "most likely "
+    return f"{where}: {likely}{reasons(stretch)}{f' ({evidence})' if evidence else ''}."
 
 
 def _evidence(stretch: Stretch, measures: Measures) -> str:

@@ -13,6 +13,8 @@ from logvggt_jax.reconstruction.sources import Source
 _PAUSE = 1.0
 # Seconds that a read in progress is given when nothing is wanted any more.
 _LEAVE = 1.0
+# How soon it is noticed that a video need not go on.
+_TICK = 0.05
 
 
 class Capture:
@@ -21,7 +23,8 @@ class Capture:
     Args:
       source: the camera, stream or video.
       session: takes the frames.
-      realtime: hands out frames no sooner than their time stamps say, as a camera would.
+      realtime: hands out frames no sooner than their time stamps say, as a camera would; what comes after the first one
+        waits until the session's programs are there, as a video can.
       reconnect: seconds for which a source that has ended is tried again, since its last frame; None for never.
 
     Attributes:
@@ -92,4 +95,11 @@ class Capture:
             if self._stop.is_set():
                 return
             self._session.push(frame.image, timestamp)
+            if self._realtime and not self._session.ready.is_set():
+                self._wait_until_ready()
+                self._began = time.monotonic() - timestamp
             asked = self._last = time.monotonic()
+
+    def _wait_until_ready(self) -> None:
+        while not (self._session.ready.wait(_TICK) or self._stop.is_set()):
+            pass

@@ -66,7 +66,7 @@ class LiveReport:
       waiting: frames in the queue.
       unreadable: frames that the source could not decode; they are in no other count.
       finished: frames whose depth is final and that were handed on.
-      fps: frames used a second, over the newest hundred; None before there are two.
+      fps: frames used a second, over the newest hundred; None before there are five.
       latencies: of the stages of `STAGES` that were measured, over the newest thousand measurements.
     """
 

@@ -23,8 +23,8 @@ from logvggt_jax.reconstruction.result import Reconstruction
 from logvggt_jax.reconstruction.watching import LiveResult
 from logvggt_jax.streaming import Cameras, FrameResult, Predictor
 
-# Used frames over which the rate is taken.
-_RATE_FRAMES = 100
+# Used frames over which the rate is taken: at most, and at least, since frames that waited are used all at once.
+_RATE_FRAMES, _FEWEST = 100, 5
 # Seconds for which the window at hand is waited for when its user has lost patience.
 _PATIENCE = 10.0
 
@@ -64,6 +64,7 @@ class LiveSession:
       recording: where frames go to the disk; None for nowhere.
 
     Attributes:
+      ready: set once the programs are there, or nothing more is used.
       unreadable: frames that whoever captures could not decode, for the report.
       complete: what a recording says of itself: False where the camera was lost.
       signal: name of the signal that ended the sequence; None where none did.
@@ -83,6 +84,7 @@ class LiveSession:
         check_longer_edge(longer_edge)
         if capacity < 1:
             raise InputError(f"capacity must be at least 1 frame, got {capacity}")
+        self.ready = threading.Event()
         self._open_stream, self._longer_edge, self._warm_up = open_stream, longer_edge, warm_up
         self._on_result, self._recording = on_result, recording
         self.unreadable, self.complete = 0, True
@@ -185,7 +187,7 @@ class LiveSession:
     def report(self) -> LiveReport:
         """How the session has kept up so far."""
         counts, used_at = self._queue.counts, list(self._used_at)
-        span = used_at[-1] - used_at[0] if used_at else 0.0
+        span = used_at[-1] - used_at[0] if len(used_at) >= _FEWEST else 0.0
         return LiveReport(
             received=counts.received,
             used=counts.taken,
@@ -209,6 +211,8 @@ class LiveSession:
         except BaseException as error:
             self._failure = error
             self._queue.close(drop=True)
+        finally:
+            self.ready.set()
 
     def _use_frames(self) -> None:
         while (frame := self._queue.take()) is not None:
@@ -243,6 +247,7 @@ class LiveSession:
                 stream.push(image)
             stream.close()
         self._stream = self._open_stream()
+        self.ready.set()
         if self._queue.counts.dropped == dropped:
             return True
         self._queue.untake()
