@@ -121,3 +121,5 @@ def test_the_wheel_is_installed_and_used(wheel: Path, tmp_path: Path) -> None:
     assert "reconstruct" in run(command, "--help", cwd=tmp_path, **path)
     assert run(command, "--version", cwd=tmp_path, **path) == f"logvggt {PROJECT['project']['version']}\n"
     assert "scannet: ScanNet" in run(command, "data", "list", cwd=tmp_path, **path)
+    # The weights are in it, whole.
+    assert "every parameter is finite and equals the digest" in run(command, "info", "rooms", cwd=tmp_path, **path)

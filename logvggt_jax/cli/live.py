@@ -41,6 +41,9 @@ def _live(options: argparse.Namespace) -> int:
         raise InputError(f"{source.name} ends where it ends, and there is nothing to wait for: leave --reconnect out")
     if options.queue is not None and options.queue < 1:
         raise InputError(f"--queue must be at least 1 frame, got {options.queue}")
+    for name in ("period", "context", "max_registers"):
+        if (count := getattr(options, name)) is not None and count < 1:
+            raise InputError(f"--{name.replace('_', '-')} must be at least 1, got {count}")
     check_watch(options)
     recording = None
     if options.output is not None:

@@ -150,7 +150,9 @@ class _Fault(Exception):
 def _checked(document: Any) -> dict[str, Any]:
     _require(isinstance(document, dict), "it holds no object")
     kind = document.get("format")
-    _require(kind == CAMERAS_FORMAT, f"it has format {shown(kind)}, expected {CAMERAS_FORMAT!r}")
+    other = isinstance(kind, str) and kind.startswith(CAMERAS_FORMAT.rstrip("1234567890"))
+    which = ": it is of another version of this program" if other and kind != CAMERAS_FORMAT else ""
+    _require(kind == CAMERAS_FORMAT, f"it has format {shown(kind)}, expected {CAMERAS_FORMAT!r}{which}")
     for key in ("image_size", "depth_size"):
         size = document.get(key)
         valid = isinstance(size, list) and len(size) == 2 and all(type(n) is int and 0 < n < 2**31 for n in size)

@@ -12,7 +12,7 @@ from PIL import Image
 from recorder import Recorder, reconstruct_recorded
 
 from logvggt_jax.geometry import unproject
-from logvggt_jax.reconstruction import PointFilter, Reconstruction
+from logvggt_jax.reconstruction import PointFilter, Reconstruction, rescale
 from logvggt_jax.reconstruction.exporters.ply import export_ply
 from logvggt_jax.reconstruction.points.cloud_file import read_points
 from logvggt_jax.streaming import Cameras
@@ -72,6 +72,9 @@ def test_the_files_say_so_and_others_stay_as_they_were(walk: Path, tmp_path: Pat
     assert "loops closed: 1 (0 with 4)" in result.summary() and "times depth_scale of cameras.json" in result.summary()
     assert "loop" not in plain.summary() and "depth_scale" not in plain.summary()
     assert result.loops == ((0, COUNT - 1),) and plain.loops is None
+    # A result that is made from it knows of them, too.
+    made, _ = rescale(result, tmp_path / "metres", frames=("0", "1"), distance=1.0, progress=False)
+    assert made.loops == result.loops
     for name in (f"depth/{index}.npz" for index in range(COUNT)):
         assert (result.folder / name).read_bytes() == (plain.folder / name).read_bytes(), "depth is written once"
 

@@ -288,7 +288,7 @@ def test_a_folder_without_poses_and_targets_in_the_way(
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match=r"expected transforms\.json, or COLMAP's images\.bin"):
         fuse(disordered, tmp_path / "out", poses=tmp_path / "empty")
-    with pytest.raises(InputError, match=r"nowhere\.txt: No such file"):
+    with pytest.raises(InputError, match=r"nowhere\.txt does not exist: expected a COLMAP"):
         fuse(disordered, tmp_path / "out", poses=tmp_path / "nowhere.txt")
     with pytest.raises(OutputExists, match="--overwrite"):
         fuse(disordered, disordered.folder, poses=tmp_path / "empty")

@@ -377,6 +377,8 @@ def test_a_video_without_realtime_is_refused_before_a_model_is_looked_for(
     arguments = ["live", str(tmp_path / "walk"), "--checkpoint", "nowhere", "--realtime"]
     assert main([*arguments, "--reconnect", "1"]) == 2
     assert "walk ends where it ends, and there is nothing to wait for" in capsys.readouterr().err
+    assert main([*arguments, "--period", "0"]) == 2
+    assert "--period must be at least 1, got 0" in capsys.readouterr().err
     assert main([*arguments, "--queue", "0"]) == 2
     assert "--queue must be at least 1 frame, got 0" in capsys.readouterr().err
 

@@ -106,6 +106,7 @@ EYE = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
         (frame_with(intrinsics=[[0, 0, 0], [0, 1, 0], [0, 0, 1]]), "not those of a pinhole camera"),
         (frame_with(depth_scale=0), "the depth_scale of frame 1, '1', must be above 0"),
         (frame_with(depth_scale="twice"), "the depth_scale of frame 1, '1', must be a number"),
+        (lambda d: d.update(format="logvggt-cameras-7"), "it is of another version of this program"),
         (lambda d: d.update(loops=[[0, 3]]), "loops must be pairs of positions among the frames"),
         (lambda d: d.update(loops={"0": 1}), "loops must be pairs of positions among the frames"),
         (frame_with(depth_intrinsics=[[10**400, 0, 0], [0, 1, 0], [0, 0, 1]]), "must be numbers"),

@@ -157,5 +157,5 @@ def test_a_folder_without_reconstruction_is_named(tmp_path: Path) -> None:
 def test_without_viser_the_line_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_result(tmp_path)
     monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(MissingPackage, match=r'needs viser: pip install "logvggt-jax\[viewer\]".*--save'):
+    with pytest.raises(MissingPackage, match=r'needs viser \(.*\): pip install "logvggt-jax\[viewer\]".*--save'):
         open_viewer(tmp_path)

@@ -12,8 +12,19 @@ from logvggt_jax.colours import depth_picture
 from logvggt_jax.reconstruction.points.cloud_file import Cloud
 from logvggt_jax.reconstruction.result import Reconstruction
 from logvggt_jax.reconstruction.viewer.colouring import colourings, level_limits, palette, point_colours, point_levels
-from logvggt_jax.reconstruction.viewer.detail import Detail
+from logvggt_jax.reconstruction.viewer.detail import Detail, levels_of_detail
 from logvggt_jax.reconstruction.viewer.opening_view import opening_view, point_spacing, scene_span, up_direction
+
+
+def test_of_twenty_million_points_two_are_shown_evenly() -> None:
+    count = 20_000_000
+    nothing = np.broadcast_to(np.zeros(3, np.float32), (count, 3))
+    detail = Detail(Cloud(nothing, np.broadcast_to(np.uint8(0), (count, 3)), None, None))
+    assert levels_of_detail(count)[0] == 2_000_000
+    chosen = detail.choose(2_000_000)
+    tenths = np.bincount(chosen // (count // 10), minlength=10)
+    assert len(chosen) == 2_000_000 and abs(tenths / 200_000 - 1).max() < 0.01
+    np.testing.assert_array_equal(detail.choose(500_000), chosen[:500_000])
 
 
 def turned(axis: int, angle: float) -> np.ndarray:

@@ -101,6 +101,7 @@ def write_derived(
             skipped=[(name, "left out of the result that this one is made from") for name in result.skipped],
             source=result.source,
             metric=metric,
+            loops=_kept_loops(result, frames),
             masked=result.masked[list(frames)].tolist() if result.masked.any() else None,
             timed=result.timed,
             point_filter=result.point_filter,
@@ -117,3 +118,12 @@ def write_derived(
         export_tum(made, folder / TRAJECTORY_FILE)
         export_ply(made, folder / POINTS_FILE, progress=progress)
     return Reconstruction.open(target)
+
+
+def _kept_loops(result: Reconstruction, frames: Sequence[int]) -> np.ndarray | None:
+    """The loops of a result by their places among some of its frames, those of which both ends are there."""
+    if result.loops is None:
+        return None
+    places = {frame: place for place, frame in enumerate(frames)}
+    kept = [(places[a], places[b]) for a, b in result.loops if a in places and b in places]
+    return np.array(kept, np.int64).reshape(-1, 2)

@@ -45,8 +45,8 @@ def match_poses(result: Reconstruction, poses: Sequence[ExternalPose], path: str
             nearest[index] = pose
     if not nearest:
         raise InputError(
-            f"{path}: its times, {given.min():g} to {given.max():g}, are none of the frames', {times.min():g} to "
-            f"{times.max():g}, to half a step of {step:g}; are they seconds of the same clock?"
+            f"{path}: its times, {given.min():.12g} to {given.max():.12g}, are none of the frames', {times.min():.12g} "
+            f"to {times.max():.12g}, to half a step of {step:g}; are they seconds of the same clock?"
         )
     return dict(sorted(nearest.items()))
 

@@ -16,6 +16,8 @@ from logvggt_jax.files import read_json, user_path
 from logvggt_jax.geometry import LARGEST_ENTRY
 from logvggt_jax.reconstruction.exporters.tum import read_trajectory
 
+_EXPECTED = "a COLMAP folder, a transforms.json or its folder, or a trajectory in TUM's format"
+
 
 class ExternalPose(NamedTuple):
     """A camera that another program has found.
@@ -45,7 +47,8 @@ def read_poses(path: str | Path) -> list[ExternalPose]:
     """
     path = user_path(path)
     with disk_errors(path):
-        path.stat()
+        if not path.exists():
+            raise MissingInput(f"{path} does not exist: expected {_EXPECTED}")
         if path.is_dir():
             if (path / TRANSFORMS_FILE).exists():
                 poses = _nerfstudio(path / TRANSFORMS_FILE)

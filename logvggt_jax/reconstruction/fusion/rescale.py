@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from logvggt_jax.data.formats.image import read_depth as read_depth_picture
-from logvggt_jax.errors import InputError, disk_errors
+from logvggt_jax.errors import InputError, MissingInput, disk_errors
 from logvggt_jax.files import open_regular, user_path
 from logvggt_jax.geometry import camera_centres, points_at
 from logvggt_jax.reconstruction.exporters.frame_names import file_stems
@@ -159,6 +159,8 @@ def _from_depth(result: Reconstruction, folder: Path, unit: float, notes: list[s
 
 
 def _depth_files(result: Reconstruction, folder: Path) -> dict[int, Path]:
+    if not folder.is_dir():
+        raise MissingInput(f"{folder} is no folder: expected one of 16-bit PNG files, a sensor's depth")
     with disk_errors(folder):
         pictures = [path for path in sorted(folder.iterdir()) if path.suffix.lower() == ".png"]
     names: dict[str, int] = {}
