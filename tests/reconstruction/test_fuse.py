@@ -106,6 +106,8 @@ def test_with_true_poses_depth_and_points_come_out_true(
     assert np.std(ratios) < 0.01, "frames agree with one another, whatever was done to their depth"
     points, _ = made.points()
     assert len(points) > 10_000
+    assert disordered.health is None and made.health is not None
+    assert np.isfinite(made.health.measures.overlap[1:]).all() and not made.health.doubtful.any()
     text = "\n".join(notes)
     assert "similarity: scale" in text and "turned by" in text and "depth: scaled by" in text
 
@@ -134,6 +136,7 @@ def test_frames_without_a_pose_and_poses_without_a_frame_are_said(
     text = "\n".join(notes)
     assert "4 of 10 frames have no pose: view 6" in text and "frames without a pose are left out" in text
     assert "1 of 7 poses belong to no frame" in text
+    assert made.health is not None and len(made.health.doubtful) == 6
     assert made.source is None and Reconstruction.open(disordered.folder).num_frames == COUNT
 
 

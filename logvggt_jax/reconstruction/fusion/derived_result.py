@@ -16,7 +16,8 @@ from logvggt_jax.reconstruction.depth_files import check_range, write_depth
 from logvggt_jax.reconstruction.exporters.ply import export_ply
 from logvggt_jax.reconstruction.exporters.tum import export_tum
 from logvggt_jax.reconstruction.frame_pool import FramePool
-from logvggt_jax.reconstruction.health.report import HEALTH_FILE, HEALTH_PAGE
+from logvggt_jax.reconstruction.health.recorder import HealthRecorder
+from logvggt_jax.reconstruction.health.report import HEALTH_FILE, HEALTH_PAGE, examine, without_harm, write_health
 from logvggt_jax.reconstruction.previews import write_previews
 from logvggt_jax.reconstruction.result import (
     DEPTH_FOLDER,
@@ -28,6 +29,7 @@ from logvggt_jax.reconstruction.result import (
     image_file,
     preview_file,
 )
+from logvggt_jax.streaming import Signals
 
 
 def check_derived(result: Reconstruction, output: str | Path, *, overwrite: bool) -> Path:
@@ -63,7 +65,8 @@ def write_derived(
       depth_scales: [n], by which the depth is multiplied.
       intrinsics: [n, 3, 3] in pixels of the original images.
       metric: whether lengths are metres.
-      keeps_health: whether its report on the result's health, of which no measure has a unit, holds as it is.
+      keeps_health: whether its report on the result's health, of which no measure has a unit, holds as it is; else one
+        is made of the new cameras and depth, and of what the earlier one knows of the stream.
       overwrite: replace an earlier result.
       progress: show a progress bar.
 
@@ -74,6 +77,7 @@ def write_derived(
     target = check_derived(result, output, overwrite=overwrite)
     transform = ResizeTransform(result.image_size, result.depth_size)
     names = [result.names[index] for index in frames]
+    recorder = HealthRecorder()
     with atomic_folder(target, replace=overwrite) as folder, disk_errors(target), FramePool() as pool:
         for name in (DEPTH_FOLDER, IMAGE_FOLDER):
             (folder / name).mkdir()
@@ -82,7 +86,10 @@ def write_derived(
             depth, confidence = result.depth_and_confidence(frames[place])
             scaled = depth_scales[place] * depth
             check_range(scaled, names[place])
-            write_depth(depth_file(folder, names[place]), scaled, confidence)
+            stored = write_depth(depth_file(folder, names[place]), scaled, confidence)
+            if not keeps_health:
+                with without_harm():
+                    recorder.see(place, *stored, result.image(frames[place]))
             shutil.copyfile(image_file(result.folder, names[place]), image_file(folder, names[place]))
 
         for _ in pool.map(write, iter(range(len(frames)))):
@@ -114,10 +121,33 @@ def write_derived(
             for name in (HEALTH_FILE, HEALTH_PAGE):
                 if (result.folder / name).is_file():
                     shutil.copyfile(result.folder / name, folder / name)
+        else:
+            _write_health(made, recorder, result, frames)
         pool.finish()
         export_tum(made, folder / TRAJECTORY_FILE)
         export_ply(made, folder / POINTS_FILE, progress=progress)
     return Reconstruction.open(target)
+
+
+def _write_health(
+    made: Reconstruction, recorder: HealthRecorder, result: Reconstruction, frames: Sequence[int]
+) -> None:
+    """Writes what is to be said of `made`, which has some frames of `result`; never raises."""
+    with without_harm():
+        signals = Signals.unknown(len(frames))
+        if (before := result.health) is not None:
+            known = before.measures.arrays()
+            signals = Signals(*(known[name][list(frames)] for name in Signals._fields))
+        focal = made.depth_intrinsics[:, 0, 0]
+        measures = recorder.measures(
+            size=made.depth_size,
+            extrinsics=made.extrinsics,
+            intrinsics=made.depth_intrinsics,
+            depth_scale=made.depth_scale,
+            field_of_view=2 * np.arctan(made.depth_size[1] / 2 / focal),
+            signals=signals,
+        )
+        write_health(made.folder, examine(measures, made.names), made.names)
 
 
 def _kept_loops(result: Reconstruction, frames: Sequence[int]) -> np.ndarray | None:
