@@ -93,7 +93,7 @@ def train(
     if jax.process_index() == 0:  # which alone writes there
         check_writable(workdir.expanduser().absolute() / "checkpoints")
     check_shared(workdir)
-    check_same_settings(config, profile=profile)
+    check_same_settings(config, profile=profile, resume_step=resume_step)
     with contextlib.ExitStack() as stack:
         earlier = RunCheckpoints(workdir, config)
         earlier.check_unused()

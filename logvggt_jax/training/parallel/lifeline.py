@@ -17,8 +17,12 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-# A machine that lost its power closes no connection: its silence ends one after this many seconds.
+# A machine that lost its power closes no connection, nor does a process that was stopped: who says nothing for so many
+# seconds is lost. JAX's own heartbeats would end the others ten seconds later.
 SILENCE_SECONDS = 20
+_BEAT_SECONDS = 5.0
+# How often it is looked who has said nothing.
+_TICK = 1.0
 CONNECT_SECONDS = 30
 _DONE = "done"
 
@@ -37,17 +41,20 @@ class Lifeline:
     def __init__(self, peers: Mapping[int, socket.socket], *, process: int, on_loss: Callable[[str], None]) -> None:
         self._peers, self._process, self._on_loss = dict(peers), process, on_loss
         self._closed = False
+        self._ended = threading.Event()
+        self._sending = threading.Lock()
         self._hosts: dict[int, str] = {}
         for connection in self._peers.values():
             connection.settimeout(None)
-            _notice_silence(connection)
         self._send({"host": platform.node()})
         self._thread = threading.Thread(target=self._watch, name="lifeline", daemon=True)
         self._thread.start()
+        threading.Thread(target=self._beat, name="lifeline beat", daemon=True).start()
 
     def fail(self, reason: str) -> None:
         """Tells the others why this process ends before its time."""
         self._closed = True
+        self._ended.set()
         self._send({"lost": self._process, "host": platform.node(), "reason": f"was lost, it ended with: {reason}"})
 
     def wait(self, seconds: float) -> None:
@@ -57,6 +64,7 @@ class Lifeline:
     def close(self) -> None:
         """Tells the others that this process is done, and stops watching."""
         self._closed = True
+        self._ended.set()
         self._send({_DONE: True})
         for connection in self._peers.values():
             # Wakes the thread, which a close alone does not.
@@ -69,25 +77,48 @@ class Lifeline:
     def _send(self, message: Mapping[str, Any]) -> None:
         line = json.dumps(message).encode() + b"\n"
         for connection in self._peers.values():
-            with contextlib.suppress(OSError):
+            with contextlib.suppress(OSError), self._sending:
                 connection.sendall(line)
+
+    def _beat(self) -> None:
+        while not self._ended.wait(_BEAT_SECONDS):
+            self._send({"alive": True})
 
     def _watch(self) -> None:
         rest = dict.fromkeys(self._peers, b"")
+        last = dict.fromkeys(self._peers, time.monotonic())
         with selectors.DefaultSelector() as selector:
             for process, connection in self._peers.items():
                 selector.register(connection, selectors.EVENT_READ, process)
             while selector.get_map() and not self._closed:
-                for key, _ in selector.select():
+                asked = time.monotonic()
+                said = selector.select(_TICK)
+                now = time.monotonic()
+                if now - asked > _TICK + _BEAT_SECONDS:
+                    last = dict.fromkeys(last, now)  # this process was stopped itself, and could hear nobody
+                for key, _ in said:
                     heard = self._heard(key.data, key.fileobj, rest)
+                    last[key.data] = now
                     if self._closed:
                         return
                     if _DONE in heard:
                         selector.unregister(key.fileobj)
+                        del last[key.data]
                     elif "lost" in heard:
-                        self._send(heard)
-                        self._on_loss(f"process {heard['lost']} on {heard['host']} {heard['reason']}")
+                        self._lost(heard)
                         return
+                for process, time_heard in last.items():
+                    if now - time_heard > SILENCE_SECONDS:
+                        silent = f"for {SILENCE_SECONDS} s it has said nothing, stopped or on a machine that is gone"
+                        self._lost(self._loss(process, f"was lost: {silent}"))
+                        return
+
+    def _lost(self, message: dict[str, Any]) -> None:
+        self._send(message)
+        self._on_loss(f"process {message['lost']} on {message['host']} {message['reason']}")
+
+    def _loss(self, process: int, reason: str) -> dict[str, Any]:
+        return {"lost": process, "host": self._hosts.get(process, "an unknown machine"), "reason": reason}
 
     def _heard(self, process: int, connection: Any, rest: dict[int, bytes]) -> dict[str, Any]:
         """What a process says that ends the watch over it; empty while nothing does."""
@@ -96,13 +127,12 @@ class Lifeline:
         except OSError:  # reset, or silent for too long
             received = b""
         if not received:
-            reason = "was lost: it was killed, or its machine is gone"
-            return {"lost": process, "host": self._hosts.get(process, "an unknown machine"), "reason": reason}
+            return self._loss(process, "was lost: it was killed, or its machine is gone")
         *lines, rest[process] = (rest[process] + received).split(b"\n")
         for message in map(json.loads, lines):
             if "lost" in message or _DONE in message:
                 return message
-            self._hosts[process] = message["host"]
+            self._hosts[process] = message.get("host", self._hosts.get(process))
         return {}
 
 
@@ -143,10 +173,3 @@ def connect(host: str, port: int, secret: str, process: int) -> dict[int, socket
     connection = socket.create_connection((host, port), timeout=CONNECT_SECONDS)
     connection.sendall(f"{process} {secret}\n".encode())
     return {0: connection}
-
-
-def _notice_silence(connection: socket.socket) -> None:
-    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    for name, value in {"TCP_KEEPIDLE": 5, "TCP_KEEPINTVL": 5, "TCP_KEEPCNT": SILENCE_SECONDS // 5 - 1}.items():
-        if hasattr(socket, name):  # not on every system
-            connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)

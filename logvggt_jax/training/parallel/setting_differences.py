@@ -15,7 +15,10 @@ _SHOWN = 5
 def what_decides_clips(data: Mapping[str, Any]) -> dict[str, Any]:
     """The data settings without those that a run may change when it goes on: its clips stay the same."""
     kept = {name: value for name, value in data.items() if name not in _FREE_DATA_SETTINGS}
-    kept["sources"] = [{name: value for name, value in source.items() if name != "root"} for source in data["sources"]]
+    kept["sources"] = [
+        {**{name: value for name, value in source.items() if name != "root"}, "options": dict(source["options"])}
+        for source in data["sources"]
+    ]
     return kept
 
 

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 
 import pytest
 
+from logvggt_jax.training.parallel import lifeline
 from logvggt_jax.training.parallel.lifeline import SILENCE_SECONDS, Lifeline, accept, connect, listen
 
 Heard = dict[int, "queue.Queue[str]"]
@@ -58,6 +59,25 @@ def test_the_loss_of_one_is_told_to_all_the_others(three) -> None:  # type: igno
     connections[1].shutdown(socket.SHUT_RDWR)
     expected = f"process 1 on {platform.node()} was lost: it was killed, or its machine is gone"
     assert heard[0].get(timeout=10) == heard[2].get(timeout=10) == expected
+
+
+def test_who_says_nothing_is_lost_and_who_only_waits_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lifeline, "SILENCE_SECONDS", 2)
+    monkeypatch.setattr(lifeline, "_BEAT_SECONDS", 0.5)
+    monkeypatch.setattr(lifeline, "_TICK", 0.1)
+    heard: queue.Queue[str] = queue.Queue()
+    with listen() as server:
+        peers = {process: connect("localhost", server.getsockname()[1], "secret", process) for process in (1, 2)}
+        accepted = accept(server, "secret", 3)
+    first = Lifeline(accepted, process=0, on_loss=heard.put)
+    alive = Lifeline(peers[1], process=1, on_loss=heard.put)
+    # One whose kernel alone still answers.
+    peers[2][0].sendall(b'{"host": "far"}\n')
+    told = "process 2 on far was lost: for 2 s it has said nothing, stopped or on a machine that is gone"
+    assert heard.get(timeout=10) == told and heard.get(timeout=10) == told, "process 0 and process 1"
+    for line in (first, alive):
+        line.close()
+    peers[2][0].close()
 
 
 def test_the_reason_of_an_end_is_told(three) -> None:  # type: ignore[no-untyped-def]
@@ -140,7 +160,8 @@ def test_a_machine_that_falls_silent_is_lost_within_the_stated_time(two_machines
         _, errors = first.communicate(timeout=10 * SILENCE_SECONDS)
         assert time.monotonic() - started < SILENCE_SECONDS + 5
         where = f"process 1 on {platform.node()}"
-        assert errors == f"train.py: {where} was lost: it was killed, or its machine is gone\n"
+        silent = f"for {SILENCE_SECONDS} s it has said nothing, stopped or on a machine that is gone"
+        assert errors == f"train.py: {where} was lost: {silent}\n"
         assert first.returncode == 1
     finally:
         for process in (first, second):

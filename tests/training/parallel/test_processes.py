@@ -20,6 +20,7 @@ from logvggt_jax.training.checkpoints.checkpoint_files import StoredCheckpoint
 from logvggt_jax.training.parallel import agreement
 from logvggt_jax.training.parallel.agreement import any_process, check_agreement
 from logvggt_jax.training.parallel.joining import check_processes, join_processes
+from logvggt_jax.training.parallel.lifeline import SILENCE_SECONDS
 from logvggt_jax.training.parallel.same_settings import check_same_parameters
 from logvggt_jax.training.reporting.metrics_log import read_metrics
 from logvggt_jax.weights.checkpoints import load_model
@@ -92,6 +93,20 @@ def test_the_loss_of_a_process_ends_the_other_with_one_line(lost: int, programs:
         line = rf"train.py: {where} was lost: it was killed, or its machine is gone\n"
         # JAX watches process 0 in the same way, and its trace may come in between.
         assert (re.fullmatch if lost else re.search)(line, errors), errors
+
+
+@pytest.mark.slow
+def test_a_stopped_process_ends_the_other_with_one_line(programs: RootPrograms, tmp_path: Path) -> None:
+    """Its machine still answers for it, and JAX would end the other with a trace that names none."""
+    with PixelRuns(programs, tmp_path, tmp_path) as runs:
+        runs.training()
+        started = time.monotonic()
+        runs.processes[1].send_signal(signal.SIGSTOP)
+        errors = runs.errors(0)
+        assert time.monotonic() - started < SILENCE_SECONDS + 5
+        assert runs.processes[0].returncode == 1, errors
+        silent = f"for {SILENCE_SECONDS} s it has said nothing, stopped or on a machine that is gone"
+        assert errors == f"train.py: process 1 on {platform.node()} was lost: {silent}\n"
 
 
 @pytest.mark.parametrize(
@@ -198,13 +213,20 @@ ClipReader.__call__ = reading
 
 def test_processes_with_other_settings_are_refused(programs: RootPrograms, tmp_path: Path) -> None:
     # How clips are read may differ.
-    own = ("--config.optimizer.learning_rate=5e-3", "--config.data.num_threads=3", "--profile=3:4")
+    own = (
+        "--config.optimizer.learning_rate=5e-3",
+        "--config.data.num_threads=3",
+        "--profile=3:4",
+        "--resume_step=0",
+        "--config.data.sources.rooms.options.num_rooms=3",
+    )
     with PixelRuns(programs, tmp_path, tmp_path, own=((), own)) as runs:
         errors = [runs.errors(number) for number in range(2)]
         assert [process.returncode for process in runs.processes] == [1, 1], errors
     said = (
-        "process 1 was started with other settings than process 0: config.optimizer.learning_rate=0.005, there 0.001; "
-        "profile=[3, 4], there None; start all with one command"
+        "process 1 was started with other settings than process 0: config.data.sources[0].options.num_rooms=3, there "
+        "2; config.optimizer.learning_rate=0.005, there 0.001; profile=[3, 4], there None; resume_step=0, there None; "
+        "start all with one command"
     )
     assert all(said in error and "Traceback" not in error for error in errors), errors
     assert not list(tmp_path.iterdir())
