@@ -6,6 +6,7 @@ python train.py --config=configs/demo.py --workdir=runs/demo/training
 from ml_collections import ConfigDict
 
 from configs import tiny
+from logvggt_jax.training.config_fields import with_all_fields
 
 
 def get_config() -> ConfigDict:
@@ -19,4 +20,4 @@ def get_config() -> ConfigDict:
     config.save_every = 300
     config.log_every = 20
     config.max_minutes = 4.0
-    return config
+    return with_all_fields(config)

@@ -13,6 +13,7 @@ clips should be as long as memory allows: raise or lower teacher.clip_length.
 from ml_collections import ConfigDict
 
 from configs import finetune
+from logvggt_jax.training.config_fields import with_all_fields
 
 
 def get_config(teacher: str = "facebook/VGGT-1B") -> ConfigDict:
@@ -37,4 +38,4 @@ def get_config(teacher: str = "facebook/VGGT-1B") -> ConfigDict:
     config.validation.stride = 2
     config.validation.every = config.save_every = 1000
     config.log_every = 50
-    return config
+    return with_all_fields(config)

@@ -11,6 +11,7 @@ time. Strides differ a little, since the teacher sees every second frame.
 from ml_collections import ConfigDict
 
 from configs import tiny
+from logvggt_jax.training.config_fields import with_all_fields
 
 
 def get_config(teacher: str = "./runs/teacher") -> ConfigDict:
@@ -22,4 +23,4 @@ def get_config(teacher: str = "./runs/teacher") -> ConfigDict:
     config.stages.stage_1.max_stride = 3
     config.stages.stage_2.max_stride = 2
     config.data.cache_dir = "runs/labels"
-    return config
+    return with_all_fields(config)

@@ -16,6 +16,7 @@ from ml_collections import ConfigDict
 from configs import h20
 from logvggt_jax.config import PATCH, ModelConfig
 from logvggt_jax.errors import MissingInput
+from logvggt_jax.training.config_fields import with_all_fields
 from logvggt_jax.weights.address import hub_address, resolve
 from logvggt_jax.weights.checkpoints import read_config, read_provenance
 
@@ -69,10 +70,11 @@ def tuning(model: str) -> ConfigDict:
         "clip_length": 12,
         "stride": 5,
         "size": images[0],
+        "best": "abs_rel",
     }
     config.log_every = 20
     config.save_every = 200
-    return config
+    return with_all_fields(config)
 
 
 def _edge(pixels: float) -> int:

@@ -20,6 +20,7 @@ from ml_collections.config_dict import placeholder
 
 from logvggt_jax.data.feeding.holdouts import PUBLISHED
 from logvggt_jax.errors import InputError
+from logvggt_jax.training.config_fields import with_all_fields
 
 STEPS_PER_EPOCH = 800
 NUM_DEVICES = 16
@@ -146,7 +147,7 @@ def get_config(data_root: str = "data") -> ConfigDict:
     config.accumulate = 1
     config.shard_parameters = False
     config.average = placeholder(float)
-    return config
+    return with_all_fields(config)
 
 
 def _stage(*, epochs: int, clip_length: int, clips_a_device: int) -> dict:

@@ -14,6 +14,7 @@ ships was trained further, as `logvggt info rooms` says. To go on from there, on
 from ml_collections import ConfigDict
 
 from configs import tiny
+from logvggt_jax.training.config_fields import with_all_fields
 
 
 def get_config(initial_weights: str = "") -> ConfigDict:
@@ -34,4 +35,4 @@ def get_config(initial_weights: str = "") -> ConfigDict:
         config.initial_weights = initial_weights
         del config.stages.stage_1
         config.optimizer.learning_rate = 5e-4
-    return config
+    return with_all_fields(config)

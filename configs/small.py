@@ -20,6 +20,7 @@ that most of the longest clips return to where they began.
 from ml_collections import ConfigDict
 
 from configs import tiny
+from logvggt_jax.training.config_fields import with_all_fields
 
 HEIGHT, WIDTH = SIZE = 168, 224
 
@@ -54,4 +55,4 @@ def get_config(initial_weights: str = "") -> ConfigDict:
         for name in ("stage_1", "stage_2"):
             del config.stages[name]
         config.optimizer.learning_rate = 3e-4
-    return config
+    return with_all_fields(config)

@@ -12,6 +12,8 @@ import math
 from ml_collections import ConfigDict
 from ml_collections.config_dict import placeholder
 
+from logvggt_jax.training.config_fields import with_all_fields
+
 HEIGHT, WIDTH = 56, 70
 # Focal lengths of `compass` rooms in units of the image width, and their middle.
 FOCAL_RANGE = (0.55, 0.75)
@@ -115,7 +117,7 @@ def get_config() -> ConfigDict:
     config.accumulate = 1
     config.shard_parameters = False
     config.average = placeholder(float)
-    return config
+    return with_all_fields(config)
 
 
 def stage(

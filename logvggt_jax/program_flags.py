@@ -13,6 +13,8 @@ from logvggt_jax.errors import one_line
 
 # Of a configuration file that the library cannot open, between words on where it looked.
 _NO_FILE = re.compile(r"Failed loading config file.*\[Errno \d+\] (?P<reason>[^:]+): '(?P<path>[^']*)'", re.DOTALL)
+# What a configuration file of ours has against its argument, behind the library's words.
+_OWN = re.compile(r"(?:logvggt_jax\.errors\.\w+|earlier failure to load): (?P<message>[^\n]+)\s*$")
 # In the words of absl, once for each flag.
 _MISSING = re.compile(r"(--\w+) must have a value other than None")
 
@@ -59,5 +61,7 @@ def _reason(error: Exception) -> str:
         return f"missing: {', '.join(missing)}; --help says what each is"
     if found := _NO_FILE.search(str(error)):
         return f"--config={found['path']}: {found['reason']}"
+    if own := _OWN.search(str(error)):
+        return f"--config: {own['message']}"
     before, traceback, after = str(error).partition("Traceback (most recent call last):")
     return one_line(error) if not traceback else f"{before.split(chr(10))[0].strip()} {after.strip().splitlines()[-1]}"

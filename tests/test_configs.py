@@ -3,6 +3,7 @@
 import dataclasses
 import importlib
 import math
+import operator
 import os
 import subprocess
 from pathlib import Path
@@ -286,6 +287,33 @@ def test_command_line_mistakes_are_one_line(
     assert finished.returncode != 0 and message in finished.stderr
     # Before data are drawn, which is told, too.
     assert finished.stderr.count("\n") == 1 and not (tmp_path / "run").exists()
+
+
+OPTIONAL = {
+    "validation.best": "rotation",
+    "loss.quantile": 0.98,
+    "model.refinement.max_registers": 64,
+    "model.aggregator.layer_scale": 0.5,
+    "data.cache_dir": "/tmp/kept",
+    "average": 0.999,
+    "max_minutes": 8.0,
+    "initial_weights": "rooms",
+}
+
+
+@pytest.mark.parametrize("name", ["tiny", "demo", "rooms", "small", "h20", "finetune", "distill", "distill_rooms"])
+def test_fields_that_a_file_leaves_out_can_be_changed_on_the_command_line(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(ROOT))
+    values = importlib.import_module(f"configs.{name}").get_config()
+    before = TrainConfig.from_dict(values.to_dict())
+    values.lock()
+    values.update_from_flattened_dict(OPTIONAL)
+    changed = TrainConfig.from_dict(values.to_dict())
+    assert changed != before
+    for field, value in OPTIONAL.items():
+        assert operator.attrgetter(field)(changed) == value, field
 
 
 def test_frozen_encoder_is_configured_by_the_model(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -232,7 +232,8 @@ class _Run:
     ) -> tuple[int, bool]:
         """Steps up to `end`, or fewer if the run is to stop; the number of steps done, and whether it is to stop."""
         config = self.config
-        with self.watchdog.other("the save"):  # of the stage before: who raises may end the others in the middle of it
+        # The save of the stage before: who raises may end the others in the middle of it.
+        with self.watchdog.other("the save", then_clips=True):
             self.checkpoints.wait()
         self.times.begin()
         raise_together(self._data_failure(batches, end - step), NO_CLIPS)
@@ -313,7 +314,7 @@ class _Run:
         new = [size for size in sizes if (stage.batch_size, stage.clip_length, *size, 3) not in self.programs]
         if not new:  # an earlier stage had the same
             return
-        with self.times.other("compilation"), self.watchdog.other("the compilation"):
+        with self.times.other("compilation"), self.watchdog.other("the compilation", then_clips=True):
             taught = self.config.teacher is not None
             for number, step in enumerate(compiled_steps(self.program, self.state, stage, new, taught=taught), 1):
                 self.programs[step.clips] = step.run

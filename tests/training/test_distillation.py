@@ -287,7 +287,13 @@ def test_a_teacher_that_does_not_fit_the_device_is_one_line(
         teacher=TeacherConfig(weights, clip_length=4),
     )
     if moment == "weights":
-        monkeypatch.setattr(jax, "device_put", full)
+        opened = loop.open_data
+
+        def opening(config: TrainConfig) -> Any:  # not before, where shapes are traced
+            monkeypatch.setattr(jax, "device_put", full)
+            return opened(config)
+
+        monkeypatch.setattr(loop, "open_data", opening)
         said = rf"teacher\.weights={weights} did not fit the memory of cpu: give a smaller teacher"
     else:
         monkeypatch.setattr("logvggt_jax.streaming.offline.predict_plain", full)

@@ -171,11 +171,12 @@ def test_an_argument_that_is_no_flag_is_one_line(run_train: Callable, tmp_path: 
     [
         (["--num_processes=2", "--process_id=0"], "--num_processes is of runs of several processes: add --distributed"),
         (["--workdir="], "--workdir is empty: name a folder"),
+        (["--preflight", "--dry_run"], "--preflight tries what --dry_run only compiles: give one of them"),
+        (["--source=seven_scene=/data"], "unknown data set 'seven_scene': choose one of "),
         (["--compilation_cache=/dev/null"], "/dev/null is no folder: give another --compilation_cache"),
         (
             ["--config=configs/h20.py:/data,stage_9"],
-            "flag --config=configs/h20.py:/data,stage_9: Error whilst parsing config file: "
-            "logvggt_jax.errors.InputError: configs/h20.py has stages stage_1, stage_2, got 'stage_9'",
+            "--config: configs/h20.py has stages stage_1, stage_2, got 'stage_9'",
         ),
     ],
 )

@@ -201,13 +201,16 @@ def _by_size(
     if len(sizes) == 1:
         return [list(sequences)]
 
+    reasons: list[str] = []
+
     def size_of(sequence: str) -> Size | None:
         try:
             return dataset.image_size(sequence)
         except Exception as error:
             if not skip_broken:
                 raise
-            logging.warning("%s, %s: size of the pictures unknown: %s", name, sequence, describe(error))
+            reasons.append(describe(error))
+            logging.warning("%s, %s: size of the pictures unknown: %s", name, sequence, reasons[-1])
             return None
 
     parts: dict[Size, list[str]] = {size: [] for size in sizes}
@@ -217,7 +220,8 @@ def _by_size(
     for sequence, size in zip(sequences, found, strict=True):
         parts[sizes[0] if size is None else nearest_size(size, sizes)].append(sequence)
     if not any(found):
-        raise InputError(f"{name}: no picture of {len(sequences)} sequences can be read; the log names them")
+        first = f", the first because {reasons[0]}" if reasons else ""
+        raise InputError(f"{name}: no picture of {len(sequences)} sequences can be read{first}; the log names all")
     return list(parts.values())
 
 

@@ -80,6 +80,10 @@ class RunCheckpoints:
             except InputError as error:
                 failure = error
         if any_process(failure is not None):
+            if isinstance(failure, DiskError):
+                raise DiskError(
+                    f"{failure}; with room again the same command goes on from the last checkpoint"
+                ) from failure
             raise failure or InputError(f"process 0 cannot use {self.folder.parent}; its output says why")
 
     def __exit__(self, *_: Any) -> None:
@@ -137,6 +141,8 @@ class RunCheckpoints:
         pending, self._pending = self._pending, []
         failure = next(filter(None, [saving.exception() for saving in pending]), None)
         if any_process(failure is not None):
+            if isinstance(failure, DiskError):
+                raise DiskError(f"{failure}; once that is mended the same command goes on") from failure
             raise failure or DiskError(f"process 0 could not save to {self.folder}; its output says why")
 
     def _begin(self, write: Callable[..., None], *given: Any) -> None:

@@ -73,21 +73,27 @@ class Watchdog:
         if not self._entered:
             return
         if self._seconds:
-            median = statistics.median(self._seconds)
-            self._allow(max(self._least, self._factor * median), f"no step has ended (the median is {median:.3g} s)")
+            self._allow_a_step("")
         else:
             self._allow(self._other, "no second step has ended")
 
     @contextlib.contextmanager
-    def other(self, what: str) -> Iterator[None]:
-        """Time for what is no step, such as a validation."""
+    def other(self, what: str, *, then_clips: bool = False) -> Iterator[None]:
+        """Time for what is no step, such as a validation; with `then_clips` those of another stage are read after it,
+        which may take as long."""
         if self._entered:
             self._allow(self._other, f"{what} has not ended")
         yield
         # The next step is not measured from the one before.
         self._last = None
-        if self._entered:
+        if self._entered and self._seconds and not then_clips:
+            self._allow_a_step(f"since {what} ")
+        elif self._entered:
             self._allow(self._other, f"no step has ended since {what}")
+
+    def _allow_a_step(self, since: str) -> None:
+        median = statistics.median(self._seconds)
+        self._allow(max(self._least, self._factor * median), f"no step has ended {since}(the median is {median:.3g} s)")
 
     def _allow(self, seconds: float, reason: str) -> None:
         with self._changed:

@@ -20,7 +20,7 @@ from logvggt_jax.training.reporting.event_file import EventFile
 from logvggt_jax.training.reporting.wandb_run import WandbRun
 
 FILE_NAME = "metrics.jsonl"
-# Beside the metrics, whose file is the same, byte by byte, however often a run was interrupted.
+# Beside the metrics, whose file is the same, byte by byte, however often a run was killed.
 TIMES_NAME = "times.jsonl"
 # By so much at least the clock of the day departs from one that nobody sets where it was set.
 _SET_SECONDS = 60.0

@@ -23,6 +23,8 @@ WAITING = "with watched.other('the validation'): time.sleep(2)"
 RUNS = {
     "step": ("time.sleep(50)", {}),
     "validation": (WAITING, {}),
+    "step after a validation": ("with watched.other('the validation'): pass\n    time.sleep(50)", {}),
+    "clips after a stage": ("with watched.other('the save', then_clips=True): pass\n    time.sleep(2)", {}),
     "long validation": (WAITING.replace("2", "50"), {"other": 1.0}),
     # sleep() of a library that is called with the interpreter's lock held.
     "library": ("import ctypes; ctypes.PyDLL(None).sleep(50)", {}),
@@ -59,6 +61,12 @@ def test_a_validation_may_take_longer_than_a_step_but_not_for_ever(finished: Fin
     assert finished["validation"].stdout == "the end\n"
     ended = finished["long validation"]
     assert ended.returncode == 1 and "the validation has not ended" in ended.stderr
+
+
+def test_the_step_after_a_validation_is_a_step(finished: Finished) -> None:
+    ended = finished["step after a validation"]
+    assert ended.returncode == 1 and "no step has ended since the validation (the median is 0.0" in ended.stderr
+    assert finished["clips after a stage"].stdout == "the end\n"
 
 
 def test_a_library_that_holds_the_interpreter_is_ended_too(finished: Finished) -> None:
