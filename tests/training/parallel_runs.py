@@ -67,10 +67,19 @@ class Outcome(NamedTuple):
 
 
 def first_gradient(
-    model: Any, config: LossConfig, params: Any, clips: Clips, mesh: Mesh, *, shard: bool = False, accumulate: int = 1
+    model: Any,
+    config: LossConfig,
+    params: Any,
+    clips: Clips,
+    mesh: Mesh,
+    *,
+    shard: bool = False,
+    accumulate: int = 1,
+    frozen: tuple[str, ...] = (),
 ) -> Any:
     """Loss, what is logged, the gradient and its norm, on the host."""
-    terms, layout = make_loss_terms(model, config), parameter_layout(params, mesh, shard=shard)
+    terms = make_loss_terms(model, config, frozen=frozen)
+    layout = parameter_layout(params, mesh, shard=shard)
     specs = layout.specs(params)
 
     def run(params: Any, batch: Any) -> Any:

@@ -153,6 +153,36 @@ def test_first_gradient_of_two_processes_is_that_of_one_device(
         _same_gradient(found, alone)
 
 
+def _real_gradient(config: TrainConfig, clips: Clips, devices: int) -> Any:
+    """That of two clips for all of LoG-VGGT but its encoder, whose parameters lie in parts; no gate is zero."""
+    two = {name: value[3:5, :2] for name, value in clips.items() if name != "frame_mask"}
+    params = _real_parameters(config.model)
+    model = LogVGGT(config.model)
+    return first_gradient(model, config.loss, params, two, data_mesh(devices), shard=True, frozen=(ENCODER,))
+
+
+@pytest.fixture(scope="module")
+def real_gradient(run_config: TrainConfig, clips: Clips) -> Any:
+    """That of one device."""
+    return _real_gradient(run_config, clips, 1)
+
+
+def test_the_gradient_reaches_all_of_the_real_model_but_the_encoder(real_gradient: Any) -> None:
+    total, _, gradients, norm = real_gradient
+    assert np.isfinite([total, norm]).all()
+    still = {
+        module: [jax.tree_util.keystr(path) for path, x in jax.tree_util.tree_leaves_with_path(tree) if not x.any()]
+        for module, tree in gradients.items()
+    }
+    assert not any(names for module, names in still.items() if module != "encoder"), still
+
+
+def test_the_gradient_of_the_real_model_in_parts_is_that_of_one_device(
+    run_config: TrainConfig, clips: Clips, real_gradient: Any
+) -> None:
+    _agree(_real_gradient(run_config, clips, 2), real_gradient, rel=1e-5)
+
+
 # What a quick test of the real model leaves as it is: all runs and is gathered, while GCCR, camera head and the depth
 # head's last convolutions are trained. Most of a compilation is the gradient through the layers, which slow tests have.
 FROZEN = ("aggregator/*", "depth_head/[!o]*")
