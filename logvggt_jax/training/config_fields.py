@@ -32,7 +32,7 @@ def _complete(config: ConfigDict, cls: Any) -> None:
         elif field.init and field.name != "name":
             default = field.default_factory() if callable(field.default_factory) else field.default
             if dataclasses.is_dataclass(default):
-                config[field.name] = ConfigDict()
+                config[field.name] = _mapping_of(default)
                 _complete(config[field.name], type(default))
             elif default is None:
                 _hold_a_place(config, field.name, kind)
@@ -52,6 +52,12 @@ def _complete_value(config: ConfigDict, name: str, kind: Any) -> None:
                 _complete(each, item)
     elif value is None:
         _hold_a_place(config, name, kind)
+
+
+def _mapping_of(default: Any) -> ConfigDict:
+    """A dataclass that is a default, whose fields may have other values than its class gives them."""
+    values = {field.name: getattr(default, field.name) for field in dataclasses.fields(default) if field.init}
+    return ConfigDict({name: _mapping_of(x) if dataclasses.is_dataclass(x) else x for name, x in values.items()})
 
 
 def _hold_a_place(config: ConfigDict, name: str, kind: Any) -> None:
