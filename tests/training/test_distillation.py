@@ -315,8 +315,8 @@ def test_errors_count_relative_to_the_teachers_confidence() -> None:
     trust = np.where(np.arange(4).reshape(1, 1, 2, 2) == 0, 3.0, 1.0) * np.array([1.0, 7.0]).reshape(2, 1, 1, 1)
     losses = jax.jit(functools.partial(distilled_depth_losses, alpha=0.2))
     found = losses(depth, trust, target, valid, trust)
-    assert float(found["depth_error"].numerator) == pytest.approx(2 * 2.0 * 3 / 1.5)
-    assert float(found["depth_confidence"].numerator) == 0.0
+    assert float(found["depth_error"].sum().numerator) == pytest.approx(2 * 2.0 * 3 / 1.5)
+    assert float(found["depth_confidence"].sum().numerator) == 0.0
     found = losses(depth, np.e * trust, target, valid, trust)
     assert float(found["depth_confidence"].value()) == pytest.approx(0.2)
     nothing = losses(depth, trust, target, np.zeros_like(valid), 0 * trust)

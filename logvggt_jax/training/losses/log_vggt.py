@@ -1,9 +1,12 @@
-"""The paper's training objective, each term a `Mean` over what is valid."""
+"""The paper's training objective, each term a `Mean` over what is valid, by clips."""
 
 import jax
 import jax.numpy as jnp
 
 from logvggt_jax.training.losses.mean import Mean
+
+# Axes of a clip's pixels: frames, rows, columns.
+PIXELS = (1, 2, 3)
 
 
 def camera_loss(
@@ -28,7 +31,7 @@ def camera_loss(
     decay = jnp.asarray([gamma ** (rounds - 1 - s) / rounds for s in range(rounds)], jnp.float32)
     distance = (jnp.abs(pose_encodings - target[..., None, :]) * weights).sum(-1)
     per_frame = (distance * decay).sum(-1)
-    return Mean(jnp.where(frame_valid, per_frame, 0.0).sum(), frame_valid.sum().astype(jnp.float32))
+    return Mean(jnp.where(frame_valid, per_frame, 0.0).sum(-1), frame_valid.sum(-1).astype(jnp.float32))
 
 
 def depth_losses(
@@ -42,23 +45,23 @@ def depth_losses(
     absolute values for the norm over one channel.
     """
     weight = jnp.where(valid, confidence, 1.0)
-    count = valid.sum().astype(jnp.float32)
+    count = valid.sum(PIXELS).astype(jnp.float32)
     error, gradient = weighted_errors(depth, target, valid, weight)
     return {
         "depth_error": Mean(error, count),
         "depth_gradient": Mean(gradient, count),
-        "depth_confidence": Mean(-alpha * jnp.log(weight).sum(), count),
+        "depth_confidence": Mean(-alpha * jnp.log(weight).sum(PIXELS), count),
     }
 
 
 def weighted_errors(
     depth: jax.Array, target: jax.Array, valid: jax.Array, weight: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Sums over valid pixels of weighted absolute errors, and of their differences between neighbours."""
+    """[B]: sums over valid pixels of weighted absolute errors, and of their differences between neighbours."""
     error = jnp.where(valid, depth - target, 0.0)
     both_x = valid[..., :, 1:] & valid[..., :, :-1]
     both_y = valid[..., 1:, :] & valid[..., :-1, :]
     along_x = weight[..., :, :-1] * jnp.abs(error[..., :, 1:] - error[..., :, :-1])
     along_y = weight[..., :-1, :] * jnp.abs(error[..., 1:, :] - error[..., :-1, :])
-    gradient = jnp.where(both_x, along_x, 0.0).sum() + jnp.where(both_y, along_y, 0.0).sum()
-    return (weight * jnp.abs(error)).sum(), gradient
+    gradient = jnp.where(both_x, along_x, 0.0).sum(PIXELS) + jnp.where(both_y, along_y, 0.0).sum(PIXELS)
+    return (weight * jnp.abs(error)).sum(PIXELS), gradient

@@ -1,4 +1,4 @@
-"""Means as sums and counts, so that devices can add theirs before dividing."""
+"""Means as sums and counts, so that clips and devices can add theirs before dividing."""
 
 from typing import NamedTuple
 
@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 
 class Mean(NamedTuple):
-    """A mean that is not divided yet: `numerator` and `denominator`, float32 scalars.
+    """A mean that is not divided yet: `numerator` and `denominator`, float32 sums of each clip [B], or of all.
 
     Means over different numbers of valid pixels cannot be averaged; their numerators and denominators can be added.
     """
@@ -15,6 +15,11 @@ class Mean(NamedTuple):
     numerator: jax.Array
     denominator: jax.Array
 
+    def sum(self) -> "Mean":
+        """The sums of all clips."""
+        return Mean(self.numerator.sum(), self.denominator.sum())
+
     def value(self) -> jax.Array:
-        """numerator / denominator, 0 (with zero gradient) where nothing was counted."""
-        return self.numerator / jnp.maximum(self.denominator, 1.0)
+        """The mean over all clips, 0 (with zero gradient) where nothing was counted."""
+        total = self.sum()
+        return total.numerator / jnp.maximum(total.denominator, 1.0)

@@ -39,8 +39,8 @@ def camera_losses(
         distance = jnp.abs(difference[..., part])
         if name == "translation":
             distance = jnp.minimum(distance, LIMIT)
-        total = (distance.mean(-1) * decay).sum()
-        losses[f"camera_{name}"] = _shard_value(total / jnp.maximum(counted.sum(), 1))
+        clips = (distance.mean(-1) * decay).sum((1, 2))
+        losses[f"camera_{name}"] = _shard_value(clips / jnp.maximum(counted.sum(), 1))
     return losses
 
 
@@ -77,8 +77,8 @@ def _bounded(values: jax.Array) -> jax.Array:
 
 
 def _shard_value(value: jax.Array) -> Mean:
-    """A scalar of one device as a term that is averaged over devices."""
-    return Mean(value, jnp.ones_like(value))
+    """A value of one device, or the clips' shares of it [B], as a term that is averaged over devices."""
+    return Mean(value, jnp.ones((), value.dtype))
 
 
 def _mean_below_quantile(values: jax.Array, valid: jax.Array, quantile: float | None) -> jax.Array:

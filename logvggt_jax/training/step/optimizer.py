@@ -98,7 +98,8 @@ def _clip(limit: float, norm: Norm) -> optax.GradientTransformation:
     def update(updates: Any, state: optax.EmptyState, params: Any = None) -> tuple[Any, optax.EmptyState]:
         del params
         length = norm(updates)
-        return jax.tree.map(lambda x: jnp.where(length < limit, x, x / length.astype(x.dtype) * limit), updates), state
+        factor = jnp.where(length < limit, 1.0, limit / length)
+        return jax.tree.map(lambda x: x * factor.astype(x.dtype), updates), state
 
     return optax.GradientTransformation(lambda _: optax.EmptyState(), update)
 

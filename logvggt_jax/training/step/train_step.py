@@ -42,8 +42,12 @@ def make_loss_terms(model: LogVGGT, config: LossConfig, *, frozen: tuple[str, ..
         seen: Any = jax.lax.stop_gradient(predictions)
         confidence = batch.get("confidence")
         means = loss_terms(predictions, targets, config, confidence)
-        finite = _finite_clips(seen, targets) & _finite_terms(seen, targets, config, confidence)
-        return means, clip_errors(seen, targets), finite
+        # A clip's own terms overflow where its finite predictions are far off.
+        finite = _finite_clips(seen, targets)
+        for mean in means.values():
+            if mean.numerator.ndim:
+                finite &= jnp.isfinite(mean.numerator)
+        return _summed(means), _summed(clip_errors(seen, targets)), finite
 
     return terms
 
@@ -183,14 +187,5 @@ def _finite_clips(predictions: Predictions, targets: Targets) -> jax.Array:
     return ((depth.all((-2, -1)) & poses) | ~targets.frame_valid).all(-1)
 
 
-def _finite_terms(
-    predictions: Predictions, targets: Targets, config: LossConfig, confidence: jax.Array | None
-) -> jax.Array:
-    """bool [b]: whether a clip's own terms are finite, which overflow where its finite predictions are far off."""
-
-    def clip_is_finite(*clip: Any) -> jax.Array:
-        predictions, targets, confidence = jax.tree.map(lambda x: x[None], clip)
-        means = loss_terms(predictions, targets, config, confidence)
-        return jnp.isfinite(jnp.stack([mean.numerator for mean in means.values()])).all()
-
-    return jax.vmap(clip_is_finite)(predictions, targets, confidence)
+def _summed(means: dict[str, Mean]) -> dict[str, Mean]:
+    return {name: mean.sum() for name, mean in means.items()}

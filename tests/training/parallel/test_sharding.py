@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +23,7 @@ from parallel_runs import (
     steps_of_processes,
 )
 
-from logvggt_jax import LogVGGT, ModelConfig
+from logvggt_jax import LogVGGT, ModelConfig, Predictions
 from logvggt_jax.model.parameters import stack_layers
 from logvggt_jax.training import loop
 from logvggt_jax.training.checkpoints.checkpoint_files import Position, StoredCheckpoint
@@ -153,34 +155,56 @@ def test_first_gradient_of_two_processes_is_that_of_one_device(
         _same_gradient(found, alone)
 
 
-def _real_gradient(config: TrainConfig, clips: Clips, devices: int) -> Any:
-    """That of two clips for all of LoG-VGGT but its encoder, whose parameters lie in parts; no gate is zero."""
+@dataclasses.dataclass(frozen=True)
+class PosesAlone:
+    """LoG-VGGT whose depth has no gradient, so that no backward pass through the depth head is compiled."""
+
+    config: ModelConfig
+
+    def apply(self, *args: Any, **options: Any) -> Predictions:
+        found: Predictions = LogVGGT(self.config).apply(*args, **options)
+        depth, confidence = jax.lax.stop_gradient((found.depth, found.depth_confidence))
+        return dataclasses.replace(found, depth=depth, depth_confidence=confidence)
+
+
+# The quick tests take the gradient of the real model in two, as most of a test's time is its compilation: the model,
+# and what has none meanwhile.
+GRADIENTS: dict[str, tuple[Any, tuple[str, ...]]] = {
+    "aggregator": (PosesAlone, ("camera_head/*", "depth_head/*", "gccr/*")),
+    "heads": (LogVGGT, ("aggregator/*",)),
+}
+
+
+def _real_gradient(config: TrainConfig, clips: Clips, devices: int, part: str) -> Any:
+    """That of two clips for one part of the model, whose parameters lie in parts; no gate is zero."""
     two = {name: value[3:5, :2] for name, value in clips.items() if name != "frame_mask"}
     params = _real_parameters(config.model)
-    model = LogVGGT(config.model)
-    return first_gradient(model, config.loss, params, two, data_mesh(devices), shard=True, frozen=(ENCODER,))
+    model, frozen = GRADIENTS[part]
+    mesh = data_mesh(devices)
+    return first_gradient(model(config.model), config.loss, params, two, mesh, shard=True, frozen=(ENCODER, *frozen))
 
 
 @pytest.fixture(scope="module")
-def real_gradient(run_config: TrainConfig, clips: Clips) -> Any:
-    """That of one device."""
-    return _real_gradient(run_config, clips, 1)
+def real_gradients(run_config: TrainConfig, clips: Clips) -> Callable[[str], Any]:
+    """Those of one device."""
+    return functools.cache(lambda part: _real_gradient(run_config, clips, 1, part))
 
 
-def test_the_gradient_reaches_all_of_the_real_model_but_the_encoder(real_gradient: Any) -> None:
-    total, _, gradients, norm = real_gradient
-    assert np.isfinite([total, norm]).all()
-    still = {
-        module: [jax.tree_util.keystr(path) for path, x in jax.tree_util.tree_leaves_with_path(tree) if not x.any()]
-        for module, tree in gradients.items()
-    }
-    assert not any(names for module, names in still.items() if module != "encoder"), still
-
-
-def test_the_gradient_of_the_real_model_in_parts_is_that_of_one_device(
-    run_config: TrainConfig, clips: Clips, real_gradient: Any
+@pytest.mark.parametrize("part", GRADIENTS)
+def test_the_gradient_reaches_every_parameter_of_the_real_model_but_the_encoders(
+    part: str, run_config: TrainConfig, real_gradients: Callable[[str], Any]
 ) -> None:
-    _agree(_real_gradient(run_config, clips, 2), real_gradient, rel=1e-5)
+    total, _, gradients, norm = real_gradients(part)
+    assert np.isfinite([total, norm]).all()
+    still = jax.tree.map(lambda x: not x.any(), gradients)
+    assert still == frozen_leaves(abstract_parameters(run_config.model), (ENCODER, *GRADIENTS[part][1]))
+
+
+@pytest.mark.parametrize("part", GRADIENTS)
+def test_the_gradient_of_the_real_model_in_parts_is_that_of_one_device(
+    part: str, run_config: TrainConfig, clips: Clips, real_gradients: Callable[[str], Any]
+) -> None:
+    _agree(_real_gradient(run_config, clips, 2, part), real_gradients(part), rel=1e-5)
 
 
 # What a quick test of the real model leaves as it is: all runs and is gathered, while GCCR, camera head and the depth
