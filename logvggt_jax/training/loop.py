@@ -177,7 +177,7 @@ class _Run:
             step_ended=self.watchdog.step_ended,
             non_finite_clips=self._non_finite_clips,
         )
-        self.times = RunTimes(self.config, productive=log.productive_seconds, peak=self.peak)
+        self.times = RunTimes(self.config, productive=log.productive_seconds, costs=log.costs, peak=self.peak)
         left: list[tuple[int, StageConfig, int, BatchIterator]] = []
         # All of them at once: data that do not fit the last stage are an error of the first minute.
         for index, stage in enumerate(self.config.stages):

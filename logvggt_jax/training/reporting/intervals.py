@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from logvggt_jax.training.config import StageConfig, TrainConfig
-from logvggt_jax.training.reporting.metrics_log import MetricsLog
+from logvggt_jax.training.reporting.metrics_log import COST, MetricsLog
 from logvggt_jax.training.reporting.progress import progress_line
 from logvggt_jax.training.reporting.run_times import RunTimes
 
@@ -39,6 +39,7 @@ def report_interval(
             "data_share": speed.data_share,
             "stage_seconds_left": stage_seconds,
             "run_seconds_left": run_seconds,
+            **{f"{COST}{kind}": seconds for kind, seconds in times.costs.items()},
             **({} if speed.utilisation is None else {"utilisation": speed.utilisation}),
             **({} if memory is None else {"device_gib": memory / 2**30}),
         },

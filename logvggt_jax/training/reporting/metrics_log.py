@@ -22,6 +22,8 @@ from logvggt_jax.training.reporting.wandb_run import WandbRun
 FILE_NAME = "metrics.jsonl"
 # Beside the metrics, whose file is the same, byte by byte, however often a run was killed.
 TIMES_NAME = "times.jsonl"
+# What one validation, save, … takes is in `times.jsonl` as `seconds_of/validation`, ….
+COST = "seconds_of/"
 # By so much at least the clock of the day departs from one that nobody sets where it was set.
 _SET_SECONDS = 60.0
 _CLOCK_SET = "clock_set_by"
@@ -32,6 +34,7 @@ class MetricsLog:
 
     Attributes:
       productive_seconds: what earlier sessions spent on the steps that are left of them.
+      costs: seconds that one validation, save, … took in the last of them.
 
     On a run that resumes at `first_step`, lines of later steps (of the run that was interrupted) are dropped, so
     that the file reads like one uninterrupted run; on one that begins `anew`, perhaps with other settings, the metrics
@@ -56,6 +59,7 @@ class MetricsLog:
         self.silent = silent
         self._wandb = wandb
         self.productive_seconds = 0.0
+        self.costs: dict[str, float] = {}
         self._started = self._opened = time.time()
         self._opened_steadily = _steady_time()
         self._was_set = False
@@ -76,6 +80,8 @@ class MetricsLog:
         if known:
             self._started = known[0]["time"]
             self.productive_seconds = known[-1]["productive_seconds"]
+            costs = {name.removeprefix(COST): value for name, value in known[-1].items() if name.startswith(COST)}
+            self.costs = {kind: value for kind, value in costs.items() if value is not None}
         else:
             self.write_times(first_step, {"productive_seconds": 0.0})
         set_by = [entry[_CLOCK_SET] for entry in earlier if _CLOCK_SET in entry]

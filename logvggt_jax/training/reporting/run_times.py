@@ -2,7 +2,7 @@
 
 import contextlib
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 from logvggt_jax.training.config import StageConfig, TrainConfig
@@ -33,10 +33,19 @@ class RunTimes:
       productive: seconds of the steps that made the present state, those of earlier sessions too.
     """
 
-    def __init__(self, config: TrainConfig, *, productive: float = 0.0, peak: float | None = None) -> None:
-        """Args: `peak` is operations a second of all devices at their best."""
+    def __init__(
+        self,
+        config: TrainConfig,
+        *,
+        productive: float = 0.0,
+        costs: Mapping[str, float] | None = None,
+        peak: float | None = None,
+    ) -> None:
+        """Args: `costs` are those that an earlier session found, `peak` operations a second of all devices at their
+        best."""
         self.productive = productive
         self._config, self._peak = config, peak
+        self._earlier = dict(costs or {})
         self._others: dict[str, list[float]] = {}
         self._seconds_a_frame: float | None = None
         self.begin()
@@ -81,6 +90,11 @@ class RunTimes:
         self.begin()
         return speed
 
+    @property
+    def costs(self) -> dict[str, float]:
+        """Seconds that one of each kind of `other` takes: the mean of this session, else that of the one before."""
+        return self._earlier | {kind: sum(seconds) / len(seconds) for kind, seconds in self._others.items()}
+
     def remaining_seconds(self, step: int, end: int | None = None, *, compilations: int = 0) -> float:
         """Seconds until step `end` (None: the last of all), if frames, validations and saves take as long as so far.
 
@@ -100,10 +114,9 @@ class RunTimes:
             every = config.validation.every
             validations = end // every - step // every + (step < end == config.total_steps and end % every > 0)
         counts = {"save": saves, "validation": validations, "compilation": compilations}
+        costs = self.costs
         return frames * (self._seconds_a_frame or 0.0) + sum(
-            count * sum(self._others[kind]) / len(self._others[kind])
-            for kind, count in counts.items()
-            if kind in self._others
+            count * costs.get(kind, 0.0) for kind, count in counts.items()
         )
 
 

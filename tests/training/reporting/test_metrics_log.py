@@ -1,6 +1,7 @@
 """The metrics file: one line a step, readable after a crash, continued without duplicates."""
 
 import io
+import math
 import os
 import struct
 import time
@@ -97,6 +98,15 @@ def test_a_run_that_begins_anew_replaces_step_0_and_keeps_when_it_began(tmp_path
     (file,) = (tmp_path / "tensorboard").iterdir()
     begun = [event.step for event in _events(file.read_bytes()) if event.HasField("session_log")]
     assert begun == [0], "where it takes over from the start before"
+
+
+def test_a_session_that_goes_on_knows_what_validations_and_saves_took(tmp_path: Path) -> None:
+    with _log(tmp_path, 0) as log:
+        assert not log.costs
+        log.write_times(1, {"productive_seconds": 9.0, "seconds_of/save": 7.0, "seconds_of/validation": math.nan})
+        log.write_times(2, {"productive_seconds": 18.0, "seconds_of/save": 8.0})
+    with _log(tmp_path, 1) as log:
+        assert log.costs == {"save": 7.0}, "of the step that it goes on from; what is not known is left out"
 
 
 @pytest.mark.parametrize("jump", [3600.0, -3600.0])

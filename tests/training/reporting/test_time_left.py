@@ -58,6 +58,16 @@ def test_the_time_left_counts_validations_saves_and_compilations(config: TrainCo
     assert times.remaining_seconds(160) == 0
 
 
+def test_a_session_that_goes_on_counts_what_the_one_before_found(config: TrainConfig, clock: Clock) -> None:
+    times = RunTimes(config, costs={"save": 7.0, "validation": 20.0})
+    assert times.remaining_seconds(90, 100) == 7.0
+    with times.other("save"):
+        clock.now += 5.0
+    assert times.costs == {"save": 5.0, "validation": 20.0}
+    # Saves at 120, 150 and 160; validations at 140 and 160.
+    assert times.remaining_seconds(100) == 3 * 5 + 2 * 20
+
+
 def test_utilisation_is_of_the_peak_in_the_time_of_steps(config: TrainConfig, clock: Clock) -> None:
     times = RunTimes(config, peak=100.0)
     for _ in range(4):
