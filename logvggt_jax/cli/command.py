@@ -76,6 +76,24 @@ def longer_edge_option(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def calibration_options(parser: argparse.ArgumentParser) -> None:
+    """`--intrinsics` and `--shared-intrinsics`: what is known of the camera."""
+    known = parser.add_argument_group("camera").add_mutually_exclusive_group()
+    known.add_argument(
+        "--intrinsics",
+        type=_pinhole,
+        default=None,
+        metavar="FX,FY,CX,CY",
+        help="focal lengths and principal point of all frames where they are known, in pixels of the original images "
+        "with centres at integers, instead of the model's",
+    )
+    known.add_argument(
+        "--shared-intrinsics",
+        action="store_true",
+        help="all frames have one camera: take the median of the model's focal lengths for all",
+    )
+
+
 def execution_options(parser: argparse.ArgumentParser) -> None:
     """Adds how a network is computed, and where its compiled programs stay."""
     parser.add_argument(
@@ -121,3 +139,11 @@ class _Formatter(argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescription
         if isinstance(action.default, tuple):
             return f"{action.help} (default: {'x'.join(map(str, action.default))})"
         return super()._get_help_string(action)
+
+
+def _pinhole(text: str) -> tuple[float, ...]:
+    try:
+        fx, fy, cx, cy = (float(number) for number in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected FX,FY,CX,CY such as 1400,1400,960,540, got {text!r}") from None
+    return fx, fy, cx, cy

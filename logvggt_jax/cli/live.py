@@ -10,6 +10,7 @@ from typing import Any
 
 from logvggt_jax.cli.command import (
     add_command,
+    calibration_options,
     execution_options,
     given_path,
     loaded_model,
@@ -24,6 +25,7 @@ from logvggt_jax.errors import InputError, one_line
 def _live(options: argparse.Namespace) -> int:
     from logvggt_jax.compile import check_devices, enable_compilation_cache
     from logvggt_jax.model.low_precision import check_precision
+    from logvggt_jax.reconstruction.calibration import Calibration
     from logvggt_jax.reconstruction.live import LiveSession, OnlineSettings, Recording, online_stream
     from logvggt_jax.reconstruction.live.follow import check_answers, follow
     from logvggt_jax.reconstruction.reconstruct import LONGER_EDGE
@@ -34,7 +36,7 @@ def _live(options: argparse.Namespace) -> int:
     from logvggt_jax.weights.checkpoints import read_provenance
 
     thinned = {name: getattr(options, name) for name in ("stride", "fps")}
-    source = open_source(options.camera, most_broken=1.0, **thinned)
+    source = open_source(options.camera, masks=options.masks, most_broken=1.0, **thinned)
     if source.address is not None and not options.realtime:
         raise InputError(f"{source.name} is no camera: add --realtime to play it as one, or use `logvggt reconstruct`")
     if source.address is not None and options.reconnect is not None:
@@ -45,10 +47,18 @@ def _live(options: argparse.Namespace) -> int:
         if (count := getattr(options, name)) is not None and count < 1:
             raise InputError(f"--{name.replace('_', '-')} must be at least 1, got {count}")
     check_watch(options)
-    recording = None
+    recording, calibration = None, Calibration(options.intrinsics, options.shared_intrinsics)
     if options.output is not None:
-        check_request(source, options.output, longer_edge=options.longer_edge, overwrite=options.overwrite)
-        recording = Recording(options.output, overwrite=options.overwrite)
+        check_request(
+            source,
+            options.output,
+            longer_edge=options.longer_edge,
+            overwrite=options.overwrite,
+            calibration=calibration,
+        )
+        recording = Recording(options.output, calibration=calibration, overwrite=options.overwrite)
+    elif calibration != Calibration():
+        raise InputError("--intrinsics and --shared-intrinsics are of a result: give --output, too")
     online = OnlineSettings(options.period, options.context, options.max_registers)
     checkpoint = resolve(options.checkpoint)
     provenance = read_provenance(checkpoint)
@@ -117,6 +127,15 @@ def add_to(commands: Any) -> None:
         metavar="N",
         help="frames that may wait (default: the windows' stride, what a window takes at once)",
     )
+    sub.add_argument(
+        "--masks",
+        default=None,
+        metavar="PATH",
+        help="one picture for all frames (a robot's arm, a car's bonnet, dirt on the lens): what is black or "
+        "transparent there has no influence, no depth and no points; for a video a folder, too, as for `logvggt "
+        "reconstruct`",
+    )
+    calibration_options(sub)
     sub.add_argument("--stride", type=int, default=1, metavar="N", help="look at every N-th frame alone")
     sub.add_argument("--fps", type=float, default=None, metavar="N", help="look at N frames a second at most")
     sub.add_argument("--realtime", action="store_true", help="play a video at its own pace, as if it were a camera")

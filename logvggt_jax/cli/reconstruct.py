@@ -10,7 +10,14 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from logvggt_jax.cli.choices import FORMATS, METHOD_NAMES
-from logvggt_jax.cli.command import add_command, execution_options, loaded_model, longer_edge_option, output_option
+from logvggt_jax.cli.command import (
+    add_command,
+    calibration_options,
+    execution_options,
+    loaded_model,
+    longer_edge_option,
+    output_option,
+)
 from logvggt_jax.cli.exit_codes import BAD_INPUT
 from logvggt_jax.cli.viewing import check_watch, stay_open, watch_options, watched
 from logvggt_jax.errors import InputError, one_line, printable
@@ -154,14 +161,6 @@ def _setting(text: str) -> tuple[str, Any]:
     return name, value
 
 
-def _pinhole(text: str) -> tuple[float, ...]:
-    try:
-        fx, fy, cx, cy = (float(number) for number in text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"expected FX,FY,CX,CY such as 1400,1400,960,540, got {text!r}") from None
-    return fx, fy, cx, cy
-
-
 def add_to(commands: Any) -> None:
     """Adds the command."""
     sub = add_command(
@@ -251,20 +250,7 @@ def add_to(commands: Any) -> None:
         "60 frames or more. Both places are predicted together, and a loop is refused where that does not fit. Up to "
         "512 frames are kept in memory",
     )
-    known = sub.add_argument_group("camera").add_mutually_exclusive_group()
-    known.add_argument(
-        "--intrinsics",
-        type=_pinhole,
-        default=None,
-        metavar="FX,FY,CX,CY",
-        help="focal lengths and principal point of all frames where they are known, in pixels of the original images "
-        "with centres at integers, instead of the model's",
-    )
-    known.add_argument(
-        "--shared-intrinsics",
-        action="store_true",
-        help="all frames have one camera: take the median of the model's focal lengths for all",
-    )
+    calibration_options(sub)
     points = sub.add_argument_group("point cloud")
     points.add_argument(
         "--confidence-percentile",

@@ -12,13 +12,13 @@ import jax
 import numpy as np
 
 from logvggt_jax.compile import out_of_device_memory
-from logvggt_jax.data.feeding.transforms import ResizeTransform, resize
+from logvggt_jax.data.feeding.transforms import ResizeTransform
 from logvggt_jax.errors import InputError, one_line, too_little_memory
 from logvggt_jax.interruption import Interrupted, StopRequest
 from logvggt_jax.reconstruction.calibration import Calibration
 from logvggt_jax.reconstruction.frame_pool import FramePool
 from logvggt_jax.reconstruction.frame_writer import FrameWriter, Picture
-from logvggt_jax.reconstruction.masking import mask_at, without_masked
+from logvggt_jax.reconstruction.masking import resized
 from logvggt_jax.reconstruction.points.selection import PointSelection
 from logvggt_jax.reconstruction.result import Reconstruction
 from logvggt_jax.reconstruction.saved_source import check_source, source_facts
@@ -160,9 +160,7 @@ class Run:
         frame = load()
         if frame is None:
             return None
-        image = frame.image if frame.mask is None else without_masked(frame.image, frame.mask)
-        image, transform = resize(image, longer_edge=self._longer_edge)
-        mask = None if frame.mask is None else mask_at(frame.mask, transform.size)
+        image, mask, transform = resized(frame.image, frame.mask, longer_edge=self._longer_edge)
         return Picture(frame.name, frame.timestamp, image, transform, frame.focal_length, mask)
 
     def _hand_on(self, results: list[FrameResult]) -> None:

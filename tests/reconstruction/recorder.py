@@ -26,11 +26,13 @@ class Recorder:
     def __init__(self, on_push: Callable[[int], object] = lambda _: None) -> None:
         self.on_push, self.num_pushed = on_push, 0
         self.frames: list[np.ndarray] = []
+        self.masks: list[np.ndarray | None] = []
         self.threads: set[int] = set()
         self.num_frames = 0
 
-    def push(self, frame: np.ndarray) -> list[FrameResult]:
+    def push(self, frame: np.ndarray, mask: np.ndarray | None = None) -> list[FrameResult]:
         self.num_pushed += 1
+        self.masks.append(mask)
         self.on_push(self.num_pushed)
         self.threads.add(threading.get_ident())
         self.frames.append(frame)

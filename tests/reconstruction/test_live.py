@@ -24,6 +24,7 @@ from logvggt_jax.cli import main
 from logvggt_jax.errors import DiskError, InputError
 from logvggt_jax.interruption import Interrupted
 from logvggt_jax.reconstruction import Reconstruction, Source, SourceFrame, SourceOptions, frame_writer
+from logvggt_jax.reconstruction.calibration import Calibration
 from logvggt_jax.reconstruction.live import (
     LiveResult,
     LiveSession,
@@ -35,6 +36,7 @@ from logvggt_jax.reconstruction.live import (
 )
 from logvggt_jax.reconstruction.live.follow import follow
 from logvggt_jax.reconstruction.live.newest import FrameCounts, NewestFrames
+from logvggt_jax.reconstruction.sources import masks
 
 PICTURES = np.random.default_rng(0).integers(0, 256, (12, 28, 42, 3), np.uint8)
 
@@ -173,6 +175,51 @@ def test_the_numbers_are_those_of_a_stream_of_the_frames_that_were_used(
     cameras = live.cameras()
     assert cameras is not None
     np.testing.assert_array_equal(cameras.extrinsics, plain.cameras().extrinsics)
+
+
+def test_what_a_mask_drops_has_no_influence_and_no_depth(small_config: ModelConfig, small_variables: dict) -> None:
+    model, mask = LogVGGT(small_config), np.ones((28, 42), bool)
+    mask[14:, :14] = False
+    found: list[list[LiveResult]] = []
+    for number in range(2):
+        shown, results = PICTURES.copy(), list[LiveResult]()
+        shown[:, ~mask] = 200 * number
+        options = {"longer_edge": LONGER_EDGE, "capacity": 12, "on_result": results.append}
+        with LiveSession(lambda: online_stream(model, small_variables), **options) as live:
+            for picture in shown[:6]:
+                live.push(picture, mask=mask)
+        found.append(results)
+    for first, second in zip(*found, strict=True):
+        np.testing.assert_array_equal(first.result.depth, second.result.depth)
+        np.testing.assert_array_equal(first.result.depth > 0, mask)
+        np.testing.assert_array_equal(first.result.pose_encoding, second.result.pose_encoding)
+
+
+def test_a_recording_has_the_intrinsics_that_are_known_and_a_camera_the_mask_of_all_its_frames(tmp_path: Path) -> None:
+    black = np.zeros((28, 42), np.uint8)
+    black[:14] = 255
+    Image.fromarray(black).save(tmp_path / "arm.png")
+
+    class Masked(FakeCamera):
+        def loaders(self, first: int = 0) -> Iterator[Callable[[], SourceFrame | None]]:
+            assert self.masks is not None
+            for load in super().loaders(first):
+                frame = load()
+                assert frame is not None
+                mask = self.masks.read(masks.Masked(frame.name, "", (28, 42)))
+                yield lambda frame=frame, mask=mask: frame._replace(mask=mask)
+
+    camera, predictor = Masked(5), Recorder()
+    camera.masks = masks.Masks(tmp_path / "arm.png")
+    calibration = Calibration((50.0, 51.0, 20.0, 14.0))
+    follow(camera, live := session(predictor, recording=Recording(tmp_path / "out", calibration=calibration)))
+    assert all(mask is not None and (mask == (black > 0)).all() for mask in predictor.masks)
+    assert live.reconstruction is not None
+    np.testing.assert_allclose(live.reconstruction.intrinsics, [[[50.0, 0, 20], [0, 51, 14], [0, 0, 1]]] * 5)
+    outside = Calibration((50.0, 51.0, 420.0, 14.0))
+    with pytest.raises(InputError, match=r"principal point 420,14 lies outside of images of 42 x 28 pixels"):
+        follow(FakeCamera(5), session(recording=Recording(tmp_path / "none", calibration=outside)))
+    assert not (tmp_path / "none").exists()
 
 
 def test_an_unplugged_camera_leaves_what_is_final_and_one_line(tmp_path: Path) -> None:
@@ -360,6 +407,10 @@ def test_frames_of_another_kind_are_refused() -> None:
             live.push(PICTURES[0][:, :28])
         with pytest.raises(InputError, match=r"uint8 \[H, W, 3\], got float32"):
             live.push(PICTURES[0].astype(np.float32))
+        with pytest.raises(InputError, match=r"a mask must be bool \[28, 42\], got bool \[28, 28\]"):
+            live.push(PICTURES[0], mask=np.ones((28, 28), bool))
+        with pytest.raises(InputError, match="masks for all frames or for none"):
+            live.push(PICTURES[0], mask=np.ones((28, 42), bool))
     for options, complaint in (({"capacity": 0}, "capacity"), ({"longer_edge": 43}, "14")):
         with pytest.raises(InputError, match=complaint):
             session(**options)
@@ -381,6 +432,10 @@ def test_a_video_without_realtime_is_refused_before_a_model_is_looked_for(
     assert "--period must be at least 1, got 0" in capsys.readouterr().err
     assert main([*arguments, "--queue", "0"]) == 2
     assert "--queue must be at least 1 frame, got 0" in capsys.readouterr().err
+    assert main([*arguments, "--shared-intrinsics"]) == 2
+    assert "--intrinsics and --shared-intrinsics are of a result: give --output, too" in capsys.readouterr().err
+    assert main(["live", "0", "--checkpoint", "nowhere", "--masks", str(tmp_path / "walk")]) == 2
+    assert "walk is a folder: a camera or a stream takes one mask" in capsys.readouterr().err
 
 
 def test_an_address_where_nobody_answers_is_told_before_the_weights_are_read(

@@ -94,7 +94,7 @@ class Capture:
                 self._stop.wait(max(0.0, self._began + timestamp - now))
             if self._stop.is_set():
                 return
-            self._session.push(frame.image, timestamp)
+            self._session.push(frame.image, timestamp, frame.mask)
             if self._realtime and not self._session.ready.is_set():
                 self._wait_until_ready()
                 self._began = time.monotonic() - timestamp

@@ -77,6 +77,10 @@ class Recording:
         """Lets go of the folder; without `finish` or `rescue` nothing of it is left."""
         self._stack.__exit__(kind, error, trace)
 
+    def check(self, size: tuple[int, int]) -> None:
+        """InputError where the calibration is none of frames of `size` (H, W), which those to come have."""
+        self._calibration.check(size)
+
     def add(self, picture: Picture) -> None:
         """The next frame, which goes to the method now."""
         self._frames.add(picture)

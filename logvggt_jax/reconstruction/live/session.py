@@ -13,12 +13,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from logvggt_jax.data.feeding.transforms import LONGER_EDGE, check_longer_edge, resize
+from logvggt_jax.data.feeding.transforms import LONGER_EDGE, check_longer_edge
 from logvggt_jax.errors import InputError, one_line
 from logvggt_jax.reconstruction.frame_writer import Picture
 from logvggt_jax.reconstruction.live.newest import NewestFrames
 from logvggt_jax.reconstruction.live.recording import Recording
 from logvggt_jax.reconstruction.live.report import LiveReport, StageTimes
+from logvggt_jax.reconstruction.masking import resized
 from logvggt_jax.reconstruction.result import Reconstruction
 from logvggt_jax.reconstruction.watching import LiveResult
 from logvggt_jax.streaming import Cameras, FrameResult, Predictor
@@ -33,6 +34,7 @@ class _Waiting(NamedTuple):
     number: int
     timestamp: float
     image: np.ndarray
+    mask: np.ndarray | None
     pushed: float  # by the monotonic clock
 
 
@@ -94,6 +96,7 @@ class LiveSession:
         self._capacity = capacity
         self._queue: NewestFrames[_Waiting] = NewestFrames(capacity)
         self._size: tuple[int, ...] | None = None
+        self._masked = False
         self._began = time.monotonic()
         self._used_at: deque[float] = deque(maxlen=_RATE_FRAMES)
         # Frames in the stream that are not handed on yet, by position among those used.
@@ -158,15 +161,17 @@ class LiveSession:
         """What becomes of frames that come too fast, in one line."""
         return f"up to {self._capacity} frames wait; a newer one drops the one that has waited longest"
 
-    def push(self, image: np.ndarray, timestamp: float | None = None) -> None:
+    def push(self, image: np.ndarray, timestamp: float | None = None, mask: np.ndarray | None = None) -> None:
         """Hands over the newest frame; returns at once.
 
         Args:
           image: [H, W, 3] uint8 RGB, of one size in all calls; it must not be changed afterwards.
           timestamp: seconds, increasing; None for those since the session was made.
+          mask: [H, W] bool, True for pixels that count; what else the frame shows has no influence, depth or points.
+            All frames have one, or none has; it must not be changed afterwards either.
 
         Raises:
-          InputError: another shape, size or type.
+          InputError: another shape, size or type; a mask for some frames alone.
           ValueError: the session was left.
           Exception: whatever went wrong in the session's thread.
         """
@@ -180,9 +185,13 @@ class LiveSession:
         if self._size is not None and self._size != image.shape:
             before, size = (f"{width} x {height}" for height, width, _ in (self._size, image.shape))
             raise InputError(f"the frames were {before} pixels large and now are {size}: all need one size")
-        self._size = image.shape
+        if mask is not None and (mask.dtype != np.bool_ or mask.shape != image.shape[:2]):
+            raise InputError(f"a mask must be bool {list(image.shape[:2])}, got {mask.dtype} {list(mask.shape)}")
+        if self._size is not None and self._masked != (mask is not None):
+            raise InputError("a sequence has masks for all frames or for none")
+        self._size, self._masked = image.shape, mask is not None
         number = self._queue.counts.received
-        self._queue.put(_Waiting(number, now - self._began if timestamp is None else timestamp, image, now))
+        self._queue.put(_Waiting(number, now - self._began if timestamp is None else timestamp, image, mask, now))
 
     def report(self) -> LiveReport:
         """How the session has kept up so far."""
@@ -220,19 +229,19 @@ class LiveSession:
                 continue
             taken = time.monotonic()
             self.times.add("wait", taken - frame.pushed)
-            image, transform = resize(frame.image, longer_edge=self._longer_edge)
-            resized = time.monotonic()
-            self.times.add("resize", resized - taken)
-            picture = Picture(f"frame-{frame.number:06d}", frame.timestamp, image, transform)
+            image, mask, transform = resized(frame.image, frame.mask, longer_edge=self._longer_edge)
+            at_size = time.monotonic()
+            self.times.add("resize", at_size - taken)
+            picture = Picture(f"frame-{frame.number:06d}", frame.timestamp, image, transform, mask=mask)
             self._pictures[self._used] = picture, frame.pushed
             self._used += 1
             self._used_at.append(taken)
             if self._recording is not None:
                 self._recording.add(picture)
             assert self._stream is not None
-            results = self._stream.push(image)
+            results = self._stream.push(image, mask)
             if results:  # or else no window was run
-                self.times.add("device", time.monotonic() - resized)
+                self.times.add("device", time.monotonic() - at_size)
                 self._hand_on(results)
         if self._stream is not None:
             self._hand_on(self._stream.close())
@@ -240,11 +249,14 @@ class LiveSession:
     def _prepared(self, first: _Waiting) -> bool:
         """Opens the stream, warm; whether the first frame is used, or counts as dropped as those after it were."""
         dropped = self._queue.counts.dropped
+        if self._recording is not None:
+            height, width, _ = first.image.shape
+            self._recording.check((height, width))
         if self._warm_up:
-            image, _ = resize(first.image, longer_edge=self._longer_edge)
+            image, mask, _ = resized(first.image, first.mask, longer_edge=self._longer_edge)
             stream = self._open_stream()
             for _ in range(self._warm_up):
-                stream.push(image)
+                stream.push(image, mask)
             stream.close()
         self._stream = self._open_stream()
         self.ready.set()
