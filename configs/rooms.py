@@ -24,15 +24,16 @@ def get_config(initial_weights: str = "") -> ConfigDict:
     """
     config = tiny.get_config()
     config.model.encoder.embed_dim = 96
-    config.stages.stage_1.steps = 3000
-    config.stages.stage_2.update(steps=2300, max_stride=6)
+    config.optimizer.update(algorithm="muon", learning_rate=3e-3)
+    config.stages.stage_1.steps = 1500
+    config.stages.stage_2.update(steps=3300, max_stride=6)
     # Camera paths close after 96 frames at the mean speed.
     config.data.sources.rooms.options.num_frames = 96
-    config.stages.stage_3 = {**config.stages.stage_2, "steps": 250, "clip_length": 32, "batch_size": 2, "max_stride": 3}
+    config.stages.stage_3 = {**config.stages.stage_2, "steps": 150, "clip_length": 32, "batch_size": 2, "max_stride": 3}
     config.average = 0.999
     config.validation.every = 1000
     if initial_weights:
         config.initial_weights = initial_weights
         del config.stages.stage_1
-        config.optimizer.learning_rate = 5e-4
+        config.optimizer.learning_rate = 1e-3
     return with_all_fields(config)

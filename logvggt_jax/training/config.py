@@ -26,6 +26,7 @@ from logvggt_jax.errors import InputError
 
 LOSSES = ("log_vggt", "vggt", "distillation")
 SCHEDULES = ("cosine", "linear_tail")
+ALGORITHMS = ("adamw", "muon")
 # What validation measures of a model, and whether more of it is better.
 VALIDATION_METRICS = {
     "abs_rel": False,
@@ -64,8 +65,10 @@ class LossConfig:
 
 @dataclasses.dataclass(frozen=True)
 class OptimizerConfig:
-    """AdamW with clipping by module.
+    """AdamW or Muon, with clipping by module.
 
+    `algorithm` "muon" moves the matrices of linear layers by their orthogonalised momentum, and all else as "adamw"
+    does; a learning rate means about the same for both.
     The rate climbs linearly over `warmup_fraction` of the schedule and then follows a `cosine`, or stays and
     falls linearly over the last quarter (`linear_tail`), to `final_learning_rate`. With `restart_each_stage` every
     stage of the curriculum runs the schedule anew. `decay_all` applies weight decay to vectors (biases, norms,
@@ -84,10 +87,12 @@ class OptimizerConfig:
     decay_all: bool
     clip_norm: float
     frozen: tuple[str, ...] = ()
+    algorithm: str = "adamw"
 
     def __post_init__(self) -> None:
         freeze_lists(self)
         require_one_of(self, SCHEDULES, "schedule")
+        require_one_of(self, ALGORITHMS, "algorithm")
         require_within(self, "(0, inf)", "learning_rate", "clip_norm")
         require_within(self, "[0, inf)", "final_learning_rate", "weight_decay")
         require_within(self, "[0, 1)", "b1", "b2")
@@ -285,6 +290,11 @@ class TrainConfig:
                     f"stages {', '.join(other)}: sizes differ from those of {self.stages[0].name}; a teacher labels "
                     "every clip at one size: give all stages the same sizes"
                 )
+        if self.shard_parameters and self.optimizer.algorithm == "muon":
+            raise InputError(
+                "optimizer.algorithm='muon' turns whole matrices, of which shard_parameters=True leaves each device a "
+                "part: take optimizer.algorithm='adamw', or shard_parameters=False"
+            )
         require_counts(self, "log_every", "save_every", "keep_checkpoints", "max_skipped_in_a_row", "accumulate")
         require_counts(self, "seed", least=0)
         require_within(self, "[0, 1)", "average")

@@ -67,6 +67,14 @@ def test_stages_run_in_the_order_written(run_config: TrainConfig) -> None:
     assert order(ConfigDict({"b": fields, "a": fields}, sort_keys=False).to_dict()) == ["b", "a"]
 
 
+def test_muon_needs_whole_matrices(run_config: TrainConfig) -> None:
+    values = _mapping(run_config)
+    values["optimizer"] |= {"algorithm": "muon"}
+    assert TrainConfig.from_dict(values).optimizer.algorithm == "muon"
+    with pytest.raises(InputError, match=r"'muon' turns whole matrices.* take optimizer\.algorithm='adamw', or shard"):
+        TrainConfig.from_dict({**values, "shard_parameters": True})
+
+
 @pytest.mark.parametrize(
     ("path", "message"),
     [

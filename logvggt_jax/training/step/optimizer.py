@@ -1,4 +1,4 @@
-"""AdamW with gradients clipped in each module by itself, and the schedule of its learning rate."""
+"""AdamW and Muon with gradients clipped in each module by itself, and the schedule of the learning rate."""
 
 from collections.abc import Callable
 from typing import Any
@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import optax
+from optax.contrib import MuonDimensionNumbers, scale_by_muon
 
 from logvggt_jax.training.config import OptimizerConfig, StageConfig
 from logvggt_jax.training.step.freezing import frozen_leaves
@@ -13,6 +14,9 @@ from logvggt_jax.training.step.freezing import frozen_leaves
 Norm = Callable[[Any], jax.Array]
 # Group of the parameters that are frozen in a module of which others are trained.
 _FROZEN = "frozen"
+# Root mean square of Muon's updates, about that of Adam's, so that one learning rate serves both.
+_MUON_RMS = 0.2
+_MUON_MOMENTUM = 0.95
 
 
 def learning_rate_schedule(config: OptimizerConfig, stages: tuple[StageConfig, ...]) -> optax.Schedule:
@@ -27,7 +31,7 @@ def learning_rate_schedule(config: OptimizerConfig, stages: tuple[StageConfig, .
 def make_optimizer(
     config: OptimizerConfig, params: Any, *, frozen: tuple[str, ...], norm: Norm = optax.tree.norm
 ) -> optax.GradientTransformation:
-    """AdamW without the learning rate: the training step multiplies what it returns with the rate of that step.
+    """AdamW or Muon without the learning rate: the training step multiplies what it returns with that step's rate.
 
     `params` is a dict of modules (encoder, aggregator, heads). The gradient of each module is clipped to
     `config.clip_norm` by itself, so that one head with an exploding gradient does not slow down the others. Parameters
@@ -37,7 +41,8 @@ def make_optimizer(
     Weight decay applies to the kernels of linear layers and convolutions: not to biases, norms, gains of residual
     branches, special tokens and the position embedding, unless `config.decay_all`.
 
-    Source: clipping by module as in VGGT's released trainer.
+    Sources: clipping by module as in VGGT's released trainer; Muon by Jordan et al. 2024 ("Muon: an optimizer for
+    hidden layers"), with the scale of its updates by Liu et al. 2025 ("Muon is scalable for LLM training").
     """
     still = frozen_leaves(params, frozen)
     groups: dict[str, optax.GradientTransformation] = {}
@@ -105,13 +110,36 @@ def _clip(limit: float, norm: Norm) -> optax.GradientTransformation:
 
 
 def _module_optimizer(config: OptimizerConfig, norm: Norm) -> optax.GradientTransformation:
-    """Clipping, Adam and weight decay, which the leaves named `kernel` have, of one module."""
+    """Clipping, Adam or Muon, and weight decay, which the leaves named `kernel` have, of one module."""
 
     def decayed(tree: Any) -> Any:
         return jax.tree_util.tree_map_with_path(lambda path, _: config.decay_all or path[-1].key == "kernel", tree)
 
+    adam = optax.scale_by_adam(config.b1, config.b2)
     return optax.chain(
         _clip(config.clip_norm, norm),
-        optax.scale_by_adam(config.b1, config.b2),
+        adam if config.algorithm == "adamw" else optax.partition({"adam": adam, "muon": _muon()}, _by_muon),
         optax.add_decayed_weights(config.weight_decay, decayed),
     )
+
+
+def _by_muon(tree: Any) -> Any:
+    """ "muon" for the matrices of linear layers, alone [in, out] or stacked [layers, in, out], "adam" for the rest."""
+
+    def label(path: Any, leaf: Any) -> str:
+        return "muon" if path[-1].key == "kernel" and leaf.ndim in (2, 3) else "adam"
+
+    return jax.tree_util.tree_map_with_path(label, tree)
+
+
+def _muon() -> optax.GradientTransformation:
+    """The orthogonalised momentum of every matrix."""
+
+    def matrices(tree: Any) -> Any:
+        return jax.tree.map(lambda x: MuonDimensionNumbers(x.ndim - 2, x.ndim - 1), tree)
+
+    def scaled(updates: Any, _: Any) -> Any:
+        # The values of an orthogonal matrix [in, out] have a root mean square of max(in, out)^-1/2.
+        return jax.tree.map(lambda x: _MUON_RMS * max(x.shape[-2:]) ** 0.5 * x, updates)
+
+    return optax.chain(scale_by_muon(beta=_MUON_MOMENTUM, weight_dimension_numbers=matrices), optax.stateless(scaled))

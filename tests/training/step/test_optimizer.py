@@ -49,6 +49,39 @@ def test_an_exploding_module_is_clipped_alone(optimizer_config: OptimizerConfig)
     np.testing.assert_allclose(found[1]["depth_head"]["kernel"], expected["depth_head"]["kernel"], rtol=1e-5)
 
 
+def test_muon_turns_the_matrices_of_linear_layers_and_leaves_the_rest_to_adam(
+    optimizer_config: OptimizerConfig,
+) -> None:
+    generator = np.random.default_rng(0)
+    shapes = {"linear": (12, 8), "stack": (3, 8, 12), "conv": (3, 3, 4, 4)}
+    params: Any = {"head": {name: {"kernel": jnp.ones(shape), "bias": jnp.ones(4)} for name, shape in shapes.items()}}
+    gradients = jax.tree.map(lambda x: jnp.asarray(generator.standard_normal(x.shape), jnp.float32), params)
+    plain = dataclasses.replace(optimizer_config, weight_decay=0.0)
+
+    def second_direction(config: OptimizerConfig) -> Any:
+        optimizer = make_optimizer(config, params, frozen=())
+        state = optimizer.update(gradients, optimizer.init(params), params)[1]
+        return optimizer.update(gradients, state, params)[0]["head"]
+
+    found = second_direction(dataclasses.replace(plain, algorithm="muon"))
+    by_adam = second_direction(plain)
+    for name in ("linear", "stack"):
+        moved, given = (
+            np.asarray(tree[name]["kernel"]).reshape(-1, *shapes[name][-2:]) for tree in (found, gradients["head"])
+        )
+        for matrix, gradient in zip(moved, given, strict=True):
+            # All singular values alike, about 0.2 for each value of the matrix, in the directions of the gradient's.
+            u, _, v = np.linalg.svd(gradient, full_matrices=False)
+            along = np.diag(u.T @ matrix @ v.T)
+            assert np.linalg.norm(matrix - u * along @ v) < 1e-3 * np.linalg.norm(matrix)
+            assert along.min() > 0.4 * along.max()
+            assert np.sqrt((matrix**2).mean()) == pytest.approx(0.2, rel=0.25)
+    assert not np.allclose(found["linear"]["kernel"], by_adam["linear"]["kernel"], atol=0.05)
+    np.testing.assert_array_equal(found["conv"]["kernel"], by_adam["conv"]["kernel"])
+    for name in shapes:
+        np.testing.assert_array_equal(found[name]["bias"], by_adam[name]["bias"])
+
+
 @pytest.mark.parametrize("decay_all", [False, True])
 def test_weight_decay_falls_on_kernels_alone(
     optimizer_config: OptimizerConfig, small_variables: dict[str, Any], decay_all: bool
