@@ -3,6 +3,7 @@
 import json
 import os
 import platform
+import re
 import secrets
 import shutil
 import stat
@@ -18,6 +19,8 @@ from logvggt_jax.errors import DiskError, InputError, OutputExists, disk_errors,
 
 EMPTY_PATH = "the path is empty (a variable without a value?)"
 _LONGEST_NAME, _LONGEST_SUFFIX = 255, 32  # bytes
+# A name beside the one that a file is to have: see `_temporary_name`.
+_TEMPORARY = re.compile(r"\..*\.\d+-[0-9a-f]{8}(\.[^.]*)?", re.DOTALL)
 
 
 @contextmanager
@@ -139,6 +142,20 @@ def check_output(output: str | Path, *, overwrite: bool, marker: str, in_place: 
     return output
 
 
+def check_apart(output: Path, read: Iterable[str | Path]) -> None:
+    """Raises InputError where something that is `read` lies in `output`, an absolute path, and would go with it when a
+    new folder takes its place; through links, too."""
+    if not output.is_dir():
+        return
+    folders: dict[Path, Path] = {}
+    for path in map(Path, read):
+        # Of many files in one folder each would be looked at from the top down.
+        folder = folders.setdefault(path.parent, path.parent.resolve())
+        found = path.resolve() if path.is_symlink() else folder / path.name
+        if found == output or output in found.parents:
+            raise InputError(f"output {output} contains {path}, which is read: choose another output")
+
+
 def check_writable(output: Path) -> None:
     """Raises DiskError unless something can be made at `output`, an absolute path, as far as permissions tell."""
     parent = existing_parent(output)
@@ -220,6 +237,13 @@ def user_cache_folder(kind: str) -> Path:
     except RuntimeError as error:
         raise InputError(f"there is no home for what is kept between runs ({error}): set XDG_CACHE_HOME") from error
     return caches / "logvggt" / kind
+
+
+def remove_temporary(folder: Path) -> None:
+    """Removes what writers that were killed have left half-written in a folder that nobody else writes to."""
+    for path in folder.rglob(".*"):
+        if _TEMPORARY.fullmatch(path.name) and path.is_file():
+            path.unlink()
 
 
 def _temporary_name(path: Path) -> str:

@@ -24,6 +24,7 @@ from logvggt_jax.errors import InputError, one_line
 
 def _live(options: argparse.Namespace) -> int:
     from logvggt_jax.compile import check_devices, enable_compilation_cache
+    from logvggt_jax.files import check_apart
     from logvggt_jax.model.low_precision import check_precision
     from logvggt_jax.reconstruction.calibration import Calibration
     from logvggt_jax.reconstruction.live import LiveSession, OnlineSettings, Recording, online_stream
@@ -49,13 +50,14 @@ def _live(options: argparse.Namespace) -> int:
     check_watch(options)
     recording, calibration = None, Calibration(options.intrinsics, options.shared_intrinsics)
     if options.output is not None:
-        check_request(
+        target = check_request(
             source,
             options.output,
             longer_edge=options.longer_edge,
             overwrite=options.overwrite,
             calibration=calibration,
         )
+        check_apart(target, [resolve(options.checkpoint)])
         recording = Recording(options.output, calibration=calibration, overwrite=options.overwrite)
     elif calibration != Calibration():
         raise InputError("--intrinsics and --shared-intrinsics are of a result: give --output, too")

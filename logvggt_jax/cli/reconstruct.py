@@ -31,6 +31,7 @@ SOURCE_OPTIONS = ("stride", "max_frames", "fps", "start", "end", "pattern", "siz
 
 def _reconstruct(options: argparse.Namespace) -> int:
     from logvggt_jax.compile import check_devices, enable_compilation_cache
+    from logvggt_jax.files import check_apart
     from logvggt_jax.model.low_precision import check_precision
     from logvggt_jax.reconstruction.calibration import Calibration
     from logvggt_jax.reconstruction.exporters import check_formats
@@ -64,6 +65,7 @@ def _reconstruct(options: argparse.Namespace) -> int:
         num_previews=options.previews,
     )
     checkpoint = resolve(options.checkpoint)
+    check_apart(target, [checkpoint])
     provenance = read_provenance(checkpoint)
     longer_edge = options.longer_edge or provenance.longer_edge or LONGER_EDGE
     config = read_config(checkpoint, dtype=options.dtype)

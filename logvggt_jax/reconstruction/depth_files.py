@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import threading
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,10 +20,22 @@ from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE
 
 # Numpy parses an array's header with `ast`, which in Python 3.11 fails now and then where several threads do so.
 _ONE_AT_A_TIME = threading.Lock()
+DEPTH_FOLDER, IMAGE_FOLDER = "depth", "images"
+_END_OF_JPEG = b"\xff\xd9"
 _JPEG = (
     *(cv2.IMWRITE_JPEG_QUALITY, 95),
     *(cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444),
 )
+
+
+def depth_file(folder: Path, name: str) -> Path:
+    """Where a result folder keeps the depth of the frame of this name."""
+    return folder / DEPTH_FOLDER / f"{name}.npz"
+
+
+def image_file(folder: Path, name: str) -> Path:
+    """Where a result folder keeps the image of the frame of this name."""
+    return folder / IMAGE_FOLDER / f"{name}.jpg"
 
 
 def write_depth(path: str | Path, depth: np.ndarray, confidence: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -79,6 +93,20 @@ def read_depth(path: str | Path, size: tuple[int, int] | None = None) -> tuple[n
             found = f"{list(values.shape)} of {values.dtype}"
             raise InputError(f"{path}: {name} must be floats {expected}, got {found}; reconstruct again")
     return maps[0].astype(np.float32), maps[1].astype(np.float32)
+
+
+def is_whole(path: Path) -> bool:
+    """Whether a file that `write_depth` or `write_picture` (as JPEG) has written is there, and to its end; of depth the
+    checksums that it holds are compared."""
+    try:
+        with open_regular(path) as stream:
+            if path.suffix == ".npz":
+                with zipfile.ZipFile(stream) as archive:
+                    return archive.testzip() is None
+            stream.seek(-len(_END_OF_JPEG), os.SEEK_END)
+            return stream.read() == _END_OF_JPEG
+    except Exception:  # zipfile meets damaged files with a dozen kinds
+        return False
 
 
 def write_picture(path: str | Path, image: np.ndarray) -> None:

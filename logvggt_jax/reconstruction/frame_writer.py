@@ -13,12 +13,19 @@ from logvggt_jax.data.feeding.transforms import ResizeTransform
 from logvggt_jax.geometry import decode_poses
 from logvggt_jax.reconstruction.calibration import Calibration
 from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE, write_cameras
-from logvggt_jax.reconstruction.depth_files import write_depth, write_picture
+from logvggt_jax.reconstruction.depth_files import (
+    DEPTH_FOLDER,
+    IMAGE_FOLDER,
+    depth_file,
+    image_file,
+    write_depth,
+    write_picture,
+)
 from logvggt_jax.reconstruction.frame_pool import FramePool
 from logvggt_jax.reconstruction.health.recorder import HealthRecorder
 from logvggt_jax.reconstruction.health.report import HEALTH_FILE, HEALTH_PAGE, examine, without_harm, write_health
 from logvggt_jax.reconstruction.points.selection import PointSelection
-from logvggt_jax.reconstruction.result import DEPTH_FOLDER, IMAGE_FOLDER, Reconstruction, depth_file, image_file
+from logvggt_jax.reconstruction.result import Reconstruction
 from logvggt_jax.reconstruction.sources.record import SourceRecord
 from logvggt_jax.reconstruction.watching import LiveResult
 from logvggt_jax.streaming import Cameras, FrameResult, Predictor

@@ -14,7 +14,7 @@ import jax
 from logvggt_jax.config import ModelConfig
 from logvggt_jax.data.feeding.transforms import check_longer_edge, resized_size
 from logvggt_jax.errors import InputError
-from logvggt_jax.files import check_output, check_space, check_writable, user_path
+from logvggt_jax.files import check_apart, check_output, check_space, check_writable, user_path
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.operations import matmul_flops_per_second
 from logvggt_jax.reconstruction.calibration import Calibration
@@ -63,6 +63,7 @@ def check_request(
         raise InputError(f"output {output} contains the source {source.path}: choose another output")
     if overwrite or not is_unfinished(target):
         check_output(target, overwrite=overwrite, marker=CAMERAS_FILE)
+    check_apart(target, source.files())
     check_writable(target)
     return target
 

@@ -10,7 +10,14 @@ import numpy as np
 from logvggt_jax.errors import InputError, disk_errors, printable
 from logvggt_jax.files import user_path
 from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE, read_cameras
-from logvggt_jax.reconstruction.depth_files import read_depth, read_picture
+from logvggt_jax.reconstruction.depth_files import (
+    DEPTH_FOLDER,
+    IMAGE_FOLDER,
+    depth_file,
+    image_file,
+    read_depth,
+    read_picture,
+)
 from logvggt_jax.reconstruction.health.report import HEALTH_FILE, HEALTH_PAGE, Health, read_health
 from logvggt_jax.reconstruction.points.cloud_file import Cloud, count_points, read_cloud, read_points
 from logvggt_jax.reconstruction.points.point_filter import PointFilter
@@ -19,8 +26,6 @@ from logvggt_jax.reconstruction.work_folder import is_unfinished
 
 TRAJECTORY_FILE = "trajectory.txt"
 POINTS_FILE = "points.ply"
-DEPTH_FOLDER = "depth"
-IMAGE_FOLDER = "images"
 PREVIEW_FOLDER = "previews"
 EXPORT_FOLDER = "exports"
 
@@ -226,16 +231,6 @@ class Reconstruction:
         return "\n".join(
             [f"{self.num_frames} frames{took}", *notes, *(f"  {folder}/{name}: {what}" for name, what in lines)]
         )
-
-
-def depth_file(folder: Path, name: str) -> Path:
-    """Where a result folder keeps the depth of the frame of this name."""
-    return folder / DEPTH_FOLDER / f"{name}.npz"
-
-
-def image_file(folder: Path, name: str) -> Path:
-    """Where a result folder keeps the image of the frame of this name."""
-    return folder / IMAGE_FOLDER / f"{name}.jpg"
 
 
 def preview_file(folder: Path, name: str) -> Path:

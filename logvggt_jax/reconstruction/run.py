@@ -21,7 +21,7 @@ from logvggt_jax.reconstruction.frame_writer import FrameWriter, Picture
 from logvggt_jax.reconstruction.masking import resized
 from logvggt_jax.reconstruction.points.selection import PointSelection
 from logvggt_jax.reconstruction.result import Reconstruction
-from logvggt_jax.reconstruction.saved_source import check_source, source_facts
+from logvggt_jax.reconstruction.saved_source import check_frames, check_source, source_facts
 from logvggt_jax.reconstruction.sources import SkippedFrame, Source, SourceFrame
 from logvggt_jax.reconstruction.sources.record import record_source
 from logvggt_jax.reconstruction.watching import Watcher
@@ -221,6 +221,7 @@ class Run:
         facts = saved.facts
         self.num_taken = facts["num_taken"]
         check_source(self._source, facts, self._work.found_at)
+        check_frames(saved, self._work.path)
         self._frames.masked = facts.get("masked", [])  # of earlier versions
         self._frames.focal_lengths = facts.get("focal_lengths", [])
         self._frames.names, self._frames.timestamps = facts["names"], facts["timestamps"]

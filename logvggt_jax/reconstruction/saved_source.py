@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from logvggt_jax.errors import InputError, OutputExists
+from logvggt_jax.reconstruction.depth_files import depth_file, image_file, is_whole
 from logvggt_jax.reconstruction.sources import Source, SourceOptions
+from logvggt_jax.streaming.state_file import State
 
 _ANEW = "pass --overwrite to start anew"
 
@@ -41,6 +43,16 @@ def check_source(source: Source, facts: Mapping[str, Any], folder: Path) -> None
     masks = source.masks
     if (None if masks is None else masks.fingerprint(facts["names"])) != facts.get("masks"):
         raise InputError(f"the masks of frames that were read have changed since {folder} was left unfinished; {_ANEW}")
+
+
+def check_frames(state: State, folder: Path) -> None:
+    """Raises InputError where a frame that the run had written whose `state` lies in `folder` is gone or damaged."""
+    for index, name in enumerate(state.facts["names"]):
+        if f"images/{index}" in state.arrays:  # its depth is not final
+            continue
+        for file in (depth_file(folder, name), image_file(folder, name)):
+            if not is_whole(file):
+                raise InputError(f"{file}, of a frame that an earlier run has done, is missing or damaged; {_ANEW}")
 
 
 def _described(source: Source) -> str:

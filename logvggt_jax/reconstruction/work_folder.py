@@ -10,9 +10,17 @@ from pathlib import Path
 from types import TracebackType
 
 from logvggt_jax.errors import InputError, OutputExists, disk_errors, one_line
-from logvggt_jax.files import FolderLock, atomic_file, check_output, move_folder, to_disk, write_text
+from logvggt_jax.files import (
+    FolderLock,
+    atomic_file,
+    check_output,
+    move_folder,
+    remove_temporary,
+    to_disk,
+    write_text,
+)
 from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE, PARTIAL, is_complete
-from logvggt_jax.reconstruction.saved_source import check_source
+from logvggt_jax.reconstruction.saved_source import check_frames, check_source
 from logvggt_jax.reconstruction.sources import Source
 from logvggt_jax.streaming.state_file import State, read_state, write_state
 
@@ -82,6 +90,8 @@ class WorkFolder:
                 if entry != self._progress:
                     shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
             (self._progress / _STATE).unlink(missing_ok=True)
+        else:
+            remove_temporary(self.path)
         write_text(stored, json.dumps(self._request, indent=1))
 
     @property
@@ -143,6 +153,7 @@ def check_leftovers(output: Path, request: Mapping[str, str], source: Source, *,
             _check_request(unfinished, request, unknown=("weights", "precision"))
             if (saved := _saved(unfinished)) is not None:
                 check_source(source, saved.facts, unfinished)
+                check_frames(saved, unfinished)
 
 
 def _saved(folder: Path) -> State | None:

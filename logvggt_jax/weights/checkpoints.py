@@ -22,7 +22,15 @@ from rich.progress import Progress
 
 from logvggt_jax.config import ModelConfig, from_mapping
 from logvggt_jax.errors import InputError, MissingInput, OutputExists, disk_errors, one_line
-from logvggt_jax.files import atomic_folder, check_output, check_regular_files, check_space, check_writable, user_path
+from logvggt_jax.files import (
+    atomic_folder,
+    check_apart,
+    check_output,
+    check_regular_files,
+    check_space,
+    check_writable,
+    user_path,
+)
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.weights.address import hub_address, resolve, similar
 from logvggt_jax.weights.digests import check_finite, digests, named_leaves, verify_digests
@@ -262,6 +270,7 @@ def convert(
     check_destination(destination)
     check_writable(destination)
     path, progress_console = resolve(source), Console(stderr=True)
+    check_apart(destination, [path])
     if path.is_dir() and is_model_folder(path):
         raise InputError(f"{path}: is a model folder already, there is nothing to convert")
     with open_state_dict(path) as state_dict, _naming(path):

@@ -23,14 +23,13 @@ from logvggt_jax.data import open_dataset
 from logvggt_jax.errors import DiskError, InputError, MissingPackage, OutputExists
 from logvggt_jax.geometry import camera_centres, invert, project, unproject_pixels
 from logvggt_jax.reconstruction import EXPORTERS, PointFilter, Reconstruction, export
-from logvggt_jax.reconstruction.depth_files import write_depth
+from logvggt_jax.reconstruction.depth_files import depth_file, write_depth
 from logvggt_jax.reconstruction.exporters import frame_bytes
 from logvggt_jax.reconstruction.exporters.frame_names import file_stems
 from logvggt_jax.reconstruction.exporters.glb import _times
 from logvggt_jax.reconstruction.exporters.libraries import library
 from logvggt_jax.reconstruction.exporters.original_depth import depth_at
 from logvggt_jax.reconstruction.points.cloud_file import read_cloud, read_points
-from logvggt_jax.reconstruction.result import depth_file
 
 COUNT = 6
 FEW_POINTS = PointFilter(max_points=600)
@@ -116,9 +115,8 @@ def test_the_cloud_of_colmap_has_the_pictures_colours(result: Reconstruction, ex
 
 def test_points_are_observed_only_where_nothing_is_before_them(tmp_path: Path) -> None:
     pytest.importorskip("pycolmap", reason="extra `colmap` is not installed")
-    from logvggt_jax.reconstruction.depth_files import write_depth
+    from logvggt_jax.reconstruction.depth_files import depth_file, write_depth
     from logvggt_jax.reconstruction.exporters.tracks import find_tracks
-    from logvggt_jax.reconstruction.result import depth_file
 
     result = write_room_result(tmp_path, count=3, source=False)
     # Something large stands close before the last camera.
@@ -331,8 +329,7 @@ def test_enlarged_depth_is_exact_on_planes_and_mixes_no_two_surfaces() -> None:
 
 
 def test_depth_without_a_unit_keeps_its_precision_whatever_lies_far_away(tmp_path: Path) -> None:
-    from logvggt_jax.reconstruction.depth_files import write_depth
-    from logvggt_jax.reconstruction.result import depth_file
+    from logvggt_jax.reconstruction.depth_files import depth_file, write_depth
 
     result = write_room_result(tmp_path, count=1, image_size=(42, 56), metric=False)
     depth = result.depth(0)

@@ -586,3 +586,8 @@ def test_archives_and_an_end_before_the_beginning_are_named(tmp_path: Path) -> N
         open_source(tmp_path / "walk.zip")
     with pytest.raises(InputError, match=r"end must be above 0 s, got -5"):
         SourceOptions(end=-5.0)
+    with pytest.raises(InputError, match="end must be finite: leave it out"):
+        SourceOptions(end=float("inf"))
+    for start in (-1.0, float("nan"), float("inf")):
+        with pytest.raises(InputError, match=rf"start must be at least 0 s and finite, got {start} s"):
+            SourceOptions(start=start)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import threading
 import weakref
 from pathlib import Path
@@ -15,7 +16,7 @@ from recorder import Recorder, reconstruct_recorded
 
 from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.data.feeding.transforms import preprocess, resize
-from logvggt_jax.errors import DiskError
+from logvggt_jax.errors import DiskError, InputError
 from logvggt_jax.geometry import decode_poses, unproject
 from logvggt_jax.reconstruction import frame_writer
 from logvggt_jax.reconstruction import run as run_module
@@ -357,6 +358,20 @@ def test_bad_arguments_are_named(
         run(output=result.folder)
     with pytest.raises(ValueError, match="contains the source"):
         run(output=room.parent, overwrite=True)
+    kept = result.folder / "mine"
+    kept.mkdir()
+    mine = [Path(shutil.copy(picture, kept)) for picture in sorted(room.glob("*.color.png"))[:3]]
+    (tmp_path / "walk.txt").write_text("".join(f"{picture}\n" for picture in mine))
+    (tmp_path / "links").mkdir()
+    for picture in mine:
+        (tmp_path / "links" / picture.name).symlink_to(picture)
+    mask = Path(shutil.copy(mine[0], kept / "mask.png"))
+    for source in (tmp_path / "walk.txt", tmp_path / "links", open_source(room, masks=mask)):
+        with pytest.raises(InputError, match=rf"output {result.folder} contains \S*, which is read: choose another"):
+            run(source, result.folder, overwrite=True)  # type: ignore[arg-type]
+    shutil.rmtree(kept)
+    shutil.rmtree(tmp_path / "links")
+    (tmp_path / "walk.txt").unlink()
     with pytest.raises(ValueError, match="previews must not be negative"):
         run(num_previews=-1)
     with pytest.raises(ValueError, match="workers must be at least 1"):

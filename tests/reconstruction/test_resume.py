@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import pkgutil
 import resource
@@ -20,6 +21,7 @@ from recorder import LONGER_EDGE, Recorder, reconstruct_recorded
 
 from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.errors import DiskError, InputError, OutputExists
+from logvggt_jax.files import atomic_file
 from logvggt_jax.interruption import Interrupted
 from logvggt_jax.reconstruction import PointFilter, Reconstruction, open_source, reconstruct
 from logvggt_jax.reconstruction.saved_source import source_facts
@@ -104,6 +106,47 @@ def test_a_run_that_died_twice_gives_the_bytes_of_one_that_did_not(
     assert last.num_pushed == COUNT - 5 - 3
     assert contents(output) == straight
     assert not (tmp_path / "out.partial").exists()
+
+
+def test_what_a_killed_run_left_half_written_is_in_no_result(
+    walk: Path, tmp_path: Path, straight: dict[str, bytes]
+) -> None:
+    output, work = tmp_path / "out", tmp_path / "out.partial"
+    with pytest.raises(KeyboardInterrupt):
+        run(Recorder(die_at(8)), walk, output)
+    for file in (work / "depth" / "005.npz", work / "images" / "005.jpg", work / "cameras.json"):
+        with pytest.raises(SystemExit), atomic_file(file) as temporary:
+            raise SystemExit
+        temporary.write_bytes(b"half")
+    run(Recorder(), walk, output)
+    assert contents(output) == straight
+
+
+@pytest.mark.parametrize(
+    ("file", "damage"),
+    [
+        ("depth/001.npz", Path.unlink),
+        ("depth/001.npz", lambda file: file.write_bytes(b"")),
+        ("depth/001.npz", lambda file: file.write_bytes(file.read_bytes()[:200] + b"x" + file.read_bytes()[201:])),
+        ("images/001.jpg", lambda file: file.write_bytes(file.read_bytes()[:-300])),
+    ],
+)
+def test_a_damaged_frame_of_a_run_that_ended_early_is_told_before_the_weights(
+    walk: Path, tmp_path: Path, file: str, damage: Callable[[Path], object]
+) -> None:
+    output, work = tmp_path / "out", tmp_path / "out.partial"
+    with pytest.raises(KeyboardInterrupt):
+        run(Recorder(die_at(8)), walk, output)
+    request = json.loads((work / ".progress" / "request.json").read_text())
+    check_leftovers(output, request, open_source(walk), overwrite=False)
+    damage(work / file)
+    before = contents(work)
+    said = rf"{file}, of a frame that an earlier run has done, is missing or damaged; pass --overwrite to start anew"
+    with pytest.raises(InputError, match=said):
+        check_leftovers(output, request, open_source(walk), overwrite=False)
+    with pytest.raises(InputError, match=said):
+        run(Recorder(), walk, output)
+    assert contents(work) == before
 
 
 @pytest.mark.filterwarnings("ignore:.*no field of view")
@@ -252,7 +295,7 @@ def test_a_source_that_breaks_off_keeps_its_frames(walk: Path, tmp_path: Path) -
     ("failing", "words"),
     [
         ("sources.image_folder.read_picture", r"walk/007\.png: too little memory for a picture of 42 x 28 pixels"),
-        ("run.resize", r"walk: too little memory for a picture of 42 x 28 pixels"),
+        ("masking.resize", r"walk: too little memory for a picture of 42 x 28 pixels"),
     ],
 )
 def test_too_little_memory_is_a_line_and_keeps_the_frames(
@@ -294,7 +337,7 @@ def test_where_memory_does_not_suffice_to_save_what_was_saved_before_is_kept(wal
 
     def on_push(count: int) -> None:
         if count == 5:
-            patch.setattr("logvggt_jax.reconstruction.run.resize", refuse)
+            patch.setattr("logvggt_jax.reconstruction.masking.resize", refuse)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Recorder, "snapshot", snapshot)

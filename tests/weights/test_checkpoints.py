@@ -328,6 +328,9 @@ def test_conversion_replaces_a_model_folder_only_when_asked(folder, vggt_file, v
     with pytest.raises(InputError, match="no such file"):
         convert(folder.parent / "absent.pt", folder, overwrite=True)
     _assert_same(load_model(folder)[1], small_variables)
+    within = shutil.copy(vggt_file, folder)
+    with pytest.raises(InputError, match=rf"output {folder} contains {within}, which is read: choose another output"):
+        convert(within, folder, overwrite=True)
     convert(vggt_file, folder, overwrite=True)
     assert load_model(folder)[0].config == dataclasses.replace(vggt_config, point_head=None)
     assert [entry.name for entry in folder.parent.iterdir()] == ["model"]

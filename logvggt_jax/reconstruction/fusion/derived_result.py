@@ -10,9 +10,16 @@ import numpy as np
 
 from logvggt_jax.data.feeding.transforms import ResizeTransform
 from logvggt_jax.errors import InputError, disk_errors
-from logvggt_jax.files import atomic_folder, check_output, check_writable
+from logvggt_jax.files import atomic_folder, check_apart, check_output, check_writable
 from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE, write_cameras
-from logvggt_jax.reconstruction.depth_files import check_range, write_depth
+from logvggt_jax.reconstruction.depth_files import (
+    DEPTH_FOLDER,
+    IMAGE_FOLDER,
+    check_range,
+    depth_file,
+    image_file,
+    write_depth,
+)
 from logvggt_jax.reconstruction.exporters.ply import export_ply
 from logvggt_jax.reconstruction.exporters.tum import export_tum
 from logvggt_jax.reconstruction.frame_pool import FramePool
@@ -20,24 +27,24 @@ from logvggt_jax.reconstruction.health.recorder import HealthRecorder
 from logvggt_jax.reconstruction.health.report import HEALTH_FILE, HEALTH_PAGE, examine, without_harm, write_health
 from logvggt_jax.reconstruction.previews import write_previews
 from logvggt_jax.reconstruction.result import (
-    DEPTH_FOLDER,
-    IMAGE_FOLDER,
     POINTS_FILE,
     TRAJECTORY_FILE,
     Reconstruction,
-    depth_file,
-    image_file,
     preview_file,
 )
 from logvggt_jax.streaming import Signals
 
 
-def check_derived(result: Reconstruction, output: str | Path, *, overwrite: bool) -> Path:
-    """The absolute path for a result that is made from another; OutputExists or InputError if it cannot go there."""
+def check_derived(
+    result: Reconstruction, output: str | Path, *, overwrite: bool, read: Sequence[str | Path] = ()
+) -> Path:
+    """The absolute path for a result that is made from another, and from what else is `read`; OutputExists or
+    InputError if it cannot go there."""
     target = check_output(output, overwrite=overwrite, marker=CAMERAS_FILE)
     source = result.folder.resolve()
     if target == source or source in target.parents or target in source.parents:
         raise InputError(f"{target} is the result itself, or one lies in the other: choose another output")
+    check_apart(target, read)
     check_writable(target)
     return target
 

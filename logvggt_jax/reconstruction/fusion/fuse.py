@@ -71,7 +71,7 @@ def fuse(
         raise InputError("nothing to fuse: give poses, bundle adjustment, or both")
     if metric and poses is None:
         raise InputError("metric says what the lengths of poses are: give poses")
-    check_derived(result, output, overwrite=overwrite)
+    check_derived(result, output, overwrite=overwrite, read=() if poses is None else (poses,))
     if adjust:
         check_library("pycolmap")
     notes: list[str] = []

@@ -57,7 +57,8 @@ def rescale(
         raise InputError("a scale comes from poses, depth, two frames or two pixels: give one of them")
     if distance is not None and frames is None and pixels is None:
         raise InputError("a distance is one between two frames or two pixels: poses and depth have metres already")
-    check_derived(result, output, overwrite=overwrite)
+    read = [path for path in (poses, depth) if path is not None]
+    check_derived(result, output, overwrite=overwrite, read=read)
     notes: list[str] = []
     if poses is not None:
         similarity, said = align(result, match(result, poses, notes), poses)

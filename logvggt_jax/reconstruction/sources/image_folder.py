@@ -108,6 +108,10 @@ class FolderSource(Source):
         """(H, W) of the upright images, after cropping."""
         return self._size
 
+    def files(self) -> Iterator[Path]:
+        yield from super().files()
+        yield from (picture.file for picture in self._pictures)
+
     def fingerprint(self, count: int) -> str:
         """See `Source.fingerprint`. What files further on may change, as sizes and time stamps, is part of it."""
         pictures = self._pictures[:count]

@@ -6,7 +6,7 @@ import functools
 import hashlib
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -113,6 +113,11 @@ class Masks:
         """InputError for a folder: nobody knows the frames of a camera or a network stream before they come."""
         if not self._for_all:
             raise InputError(f"{self.path} is a folder: a camera or a stream takes one mask, a picture, for all frames")
+
+    def files(self) -> Iterator[Path]:
+        """The picture, or the folder and what is in it."""
+        yield self.path
+        yield from self._files.values()
 
     def file(self, name: str) -> Path:
         """The mask of the frame of this name. MissingInput where a video's frame has none."""

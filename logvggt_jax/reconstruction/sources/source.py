@@ -79,8 +79,12 @@ class SourceOptions:
             raise InputError(f"fps must be above 0, got {self.fps}")
         if self.end is not None and not self.end > 0:
             raise InputError(f"end must be above 0 s, got {self.end} s")
-        if not 0 <= (self.start or 0.0) < (float("inf") if self.end is None else self.end):
-            raise InputError(f"start must lie between 0 and the end ({self.end} s), got {self.start} s")
+        if self.end == float("inf"):
+            raise InputError("end must be finite: leave it out to take all frames")
+        if not 0 <= (self.start or 0.0) < float("inf"):
+            raise InputError(f"start must be at least 0 s and finite, got {self.start} s")
+        if self.end is not None and (self.start or 0.0) >= self.end:
+            raise InputError(f"start must lie before the end ({self.end} s), got {self.start} s")
         if self.size_mismatch not in SIZE_MISMATCH:
             raise InputError(f"size_mismatch must be one of {', '.join(SIZE_MISMATCH)}, got {self.size_mismatch!r}")
 
@@ -126,6 +130,13 @@ class Source(abc.ABC):
     @abc.abstractmethod
     def image_size(self) -> tuple[int, int] | None:
         """(H, W) of the frames as they will be handed out; None where it is known with the first frame only."""
+
+    def files(self) -> Iterator[Path]:
+        """What is read of the disk: pictures or a video, and masks."""
+        if self.address is not None:
+            yield self.path
+        if self.masks is not None:
+            yield from self.masks.files()
 
     @abc.abstractmethod
     def fingerprint(self, count: int) -> str:

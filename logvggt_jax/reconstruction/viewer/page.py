@@ -17,10 +17,10 @@ from logvggt_jax.errors import InputError, OutputExists, disk_errors, printable
 from logvggt_jax.files import check_writable, user_path, write_text
 from logvggt_jax.frames import evenly_spaced
 from logvggt_jax.geometry import camera_centres
-from logvggt_jax.reconstruction.depth_files import encode_picture
+from logvggt_jax.reconstruction.depth_files import IMAGE_FOLDER, encode_picture
 from logvggt_jax.reconstruction.points.cloud_file import Cloud
 from logvggt_jax.reconstruction.previews import depth_range
-from logvggt_jax.reconstruction.result import IMAGE_FOLDER, Reconstruction
+from logvggt_jax.reconstruction.result import Reconstruction
 from logvggt_jax.reconstruction.viewer.colouring import IMAGE, colourings, level_limits, palette, point_levels
 from logvggt_jax.reconstruction.viewer.detail import Detail
 from logvggt_jax.reconstruction.viewer.drawing import MOST_FRUSTA, camera_size

@@ -13,8 +13,9 @@ from PIL import Image
 from logvggt_jax.colours import depth_picture
 from logvggt_jax.frames import evenly_spaced
 from logvggt_jax.geometry import camera_centres
+from logvggt_jax.reconstruction.depth_files import IMAGE_FOLDER
 from logvggt_jax.reconstruction.previews import depth_range
-from logvggt_jax.reconstruction.result import IMAGE_FOLDER, Reconstruction
+from logvggt_jax.reconstruction.result import Reconstruction
 from logvggt_jax.reconstruction.viewer.colouring import IMAGE, colourings, level_limits, point_colours
 from logvggt_jax.reconstruction.viewer.detail import USUALLY_SHOWN, Detail, levels_of_detail
 from logvggt_jax.reconstruction.viewer.drawing import (
