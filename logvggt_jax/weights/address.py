@@ -13,6 +13,8 @@ from logvggt_jax.weights.shipped_models import SHIPPED, shipped_model
 
 _NAME = r"[\w-][\w.-]*"
 _HUB = re.compile(rf"(?P<repository>{_NAME}/{_NAME})(?:/(?P<file>.+))?")
+_URL = re.compile(r"[a-z][a-z0-9+.-]*://(?P<host>[^/]*)/(?P<path>.*)", re.IGNORECASE)
+_HUB_HOST = "huggingface.co"
 
 
 def resolve(path_or_repo: str | Path) -> Path:
@@ -32,9 +34,16 @@ def resolve(path_or_repo: str | Path) -> Path:
         )
     if shipped := shipped_model(path_or_repo):
         return shipped
+    if isinstance(path_or_repo, str) and (url := _URL.fullmatch(path_or_repo)):
+        known = _HUB.fullmatch(url["path"]) if url["host"] == _HUB_HOST else None
+        written = f"{PREFIX}{known['repository']}" if known else f"{PREFIX}owner/name"
+        raise MissingInput(
+            f"{path_or_repo}: a checkpoint is a file or folder here, or a repository on the hub, written {written}; "
+            "download what lies elsewhere"
+        )
     path = user_path(path_or_repo)
     with disk_errors(path):
-        there = path.exists()
+        there = path.exists() or path.is_symlink()
     if not there:
         raise MissingInput(
             f"{path}: no such file or folder{similar(path)}; give a checkpoint file, its folder, a hub repository as "

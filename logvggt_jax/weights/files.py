@@ -53,6 +53,8 @@ def find_weights(path: Path) -> Path:
         return path / choose_weights(names, str(path), f"{path}/")
     if not path.is_file():
         what = "neither a file nor a folder" if path.exists() else "no such file or folder"
+        if path.is_symlink() and not path.exists():
+            what = "a link that leads to nothing, or to itself"
         raise MissingInput(f"{path}: {what}; give a checkpoint file or the folder that holds it")
     if is_shard(path.name):
         raise InputError(f"{path}: one of several shards of a checkpoint; give their folder or their index")

@@ -263,6 +263,8 @@ def params_from_vggt(
             continue
         tensor = np.asarray(state_dict[rule.name])
         _check_header(rule, Header(tensor.shape, tensor.dtype.name), state_dict, config)
+        if wide := _too_large(tensor):
+            raise InputError(f"{rule.name} has {wide}")
         tensor = tensor.astype(np.float32, copy=False)
         if wrong := non_finite(tensor):
             raise InputError(f"{rule.name} has {wrong}; the checkpoint is of a training that failed, or damaged")
@@ -443,3 +445,13 @@ def _smallest_images(config: ModelConfig) -> jax.Array:
 
 def _path(path: Any) -> ParamPath:
     return tuple(key.key for key in path)
+
+
+def _too_large(array: np.ndarray) -> str | None:
+    """What to say of finite numbers that float32 has no place for; None where there are none."""
+    if array.dtype.itemsize <= np.dtype(np.float32).itemsize or not array.size:
+        return None
+    sizes = np.abs(array, where=np.isfinite(array), out=np.zeros_like(array))
+    if sizes.max() <= np.finfo(np.float32).max:
+        return None
+    return f"numbers up to {sizes.max():.3g}, too large for float32: no network has such weights, is the file damaged?"

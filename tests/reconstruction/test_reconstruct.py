@@ -18,8 +18,7 @@ from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.data.feeding.transforms import preprocess, resize
 from logvggt_jax.errors import DiskError, InputError
 from logvggt_jax.geometry import decode_poses, unproject
-from logvggt_jax.reconstruction import frame_writer
-from logvggt_jax.reconstruction import run as run_module
+from logvggt_jax.reconstruction import frame_writer, masking
 from logvggt_jax.reconstruction.cameras_file import read_cameras
 from logvggt_jax.reconstruction.depth_files import read_depth
 from logvggt_jax.reconstruction.exporters.tum import read_trajectory
@@ -310,7 +309,7 @@ def test_each_frame_is_resized_once_and_few_are_alive(
         alive.append(sum(reference() is not None for reference in made))
         return image, transform
 
-    monkeypatch.setattr(run_module, "resize", watched)
+    monkeypatch.setattr(masking, "resize", watched)
     reconstruct_recorded(Recorder(), walk, tmp_path / "out", progress=False, workers=2)
     assert len(made) == 40
     # Six ahead, two in the predictor, one in either worker.

@@ -12,6 +12,7 @@ from safetensors.numpy import save
 from logvggt_jax.errors import InputError
 from logvggt_jax.weights import open_state_dict, read_provenance
 from logvggt_jax.weights.address import resolve
+from logvggt_jax.weights.files import find_weights
 from logvggt_jax.weights.hub import download
 
 constants = pytest.importorskip("huggingface_hub.constants", reason="extra `hub` is not installed")
@@ -195,6 +196,15 @@ def test_a_path_that_exists_is_never_a_repository(hub, tmp_path, monkeypatch):
             resolve(text)
     with pytest.raises(FileNotFoundError, match=r"hf:vggt: no address on the hub; expected hf:owner/name"):
         resolve("hf:vggt")
+    for url, written in (
+        ("https://huggingface.co/facebook/VGGT-1B/resolve/main/model.pt", "hf:facebook/VGGT-1B"),
+        ("ftp://example.org/model.pt", "hf:owner/name"),
+    ):
+        with pytest.raises(FileNotFoundError, match=rf"^{url}: a checkpoint is a file .* the hub, written {written};"):
+            resolve(url)
+    Path("loop").symlink_to("loop")
+    with pytest.raises(FileNotFoundError, match="loop: a link that leads to nothing, or to itself"):
+        find_weights(resolve("loop"))
     with pytest.raises(FileNotFoundError, match=r"stranger/vggt: no such file or folder"):
         resolve(Path("stranger/vggt"))  # whoever has a path says so
     with pytest.raises(FileNotFoundError, match=r"did you mean owner/vggt\?"):

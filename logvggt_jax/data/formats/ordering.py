@@ -7,6 +7,7 @@ import re
 from collections import defaultdict
 from collections.abc import Sequence
 from datetime import UTC, datetime
+from decimal import Decimal
 from itertools import pairwise
 from typing import Any
 
@@ -14,7 +15,8 @@ _DIGITS = re.compile(r"(\d+)")
 _DECIMALS = re.compile(r"(\d+(?:\.\d+)?)")
 # Before a fraction, or a time of day.
 _NO_COUNTER = re.compile(r"\d\.$|(?:19|20)\d\d[-_.:]?[01]\d[-_.:]?[0-3]\d\D")
-_SECONDS = re.compile(r"\d+\.\d+|\d{10}")
+_SECONDS = re.compile(r"-?\d+\.\d+|\d{10}")
+_NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
 # A date and a time of day, as cameras and recorders write it, perhaps with a fraction of the second.
 _DATE = re.compile(
     r"(.*?)(?<!\d)((?:19|20)\d\d)[-_.:]?([01]\d)[-_.:]?([0-3]\d)[-_.T ]?([0-2]\d)[-_.:h]?([0-5]\d)[-_.:m]?([0-5]\d)"
@@ -29,8 +31,11 @@ def natural_order(stems: Sequence[str]) -> list[int]:
     """Positions of the names in natural order: `img2` before `img10`, `0.88868` before `0.9022` before `470.0`.
 
     A point between digits is a decimal point, unless the digits behind it are a counter: some end with a zero that
-    no number in decimals has (`1.9` before `1.10`), and their lengths differ.
+    no number in decimals has (`1.9` before `1.10`), and their lengths differ. A dash is a minus where all names are
+    numbers: `-1.5` before `-0.5` before `0.5`.
     """
+    if any(stem.startswith("-") for stem in stems) and all(_NUMBER.fullmatch(stem) for stem in stems):
+        return sorted(range(len(stems)), key=lambda position: (Decimal(stems[position]), stems[position], position))
     fractions = {text.partition(".")[2] for stem in stems for text in _DECIMALS.findall(stem)} - {""}
     counters = len({len(f) for f in fractions}) > 1 and any(f.endswith("0") and f != "0" for f in fractions)
     pattern = _DIGITS if counters else _DECIMALS

@@ -18,6 +18,8 @@ from logvggt_jax.data.formats.ordering import missing_numbers, natural_order, ti
         ["a", "a1", "a1b", "a2", "b"],
         ["1403636579.763555584", "1403636579.763555585"],
         ["A1", "a2", "A3"],
+        ["-10.5", "-2", "-0.50", "0.5", "1.5"],
+        ["-1", "a-1"],
     ],
 )
 def test_order_is_natural_and_knows_decimals(names: list[str]) -> None:
@@ -43,6 +45,7 @@ def test_order_is_natural_and_knows_decimals(names: list[str]) -> None:
         (["IMG_20240131_120000", "VID_20240131_120001"], None),  # of two clocks, perhaps
         (["IMG_20240231_120000", "IMG_20240231_120001"], None),  # no date
         (["IMG_20240131_120000", "IMG_20240131_120000_1"], None),  # a burst within a second
+        (["-0.5", "0.25"], [-0.5, 0.25]),
         (["img0.5", "img1.0"], None),
         (["0.5", "0.5"], None),
         (["0.5", "0.25"], None),
