@@ -328,9 +328,17 @@ class _Run:
 
     def _log(self, step: int, end: int, stage: StageConfig, broken_clips: int, log: MetricsLog) -> None:
         """One line about the steps since the last one, all of which have finished."""
-        values = {**self.in_flight.means.read(), "broken_clips": float(broken_clips)}
-        memory = most_device_bytes(self.mesh.local_devices)
-        report_interval(log, step, values, self.times, config=self.config, stage=stage, end=end, memory=memory)
+        report_interval(
+            log,
+            step,
+            self.in_flight.means.read(),
+            self.times,
+            config=self.config,
+            stage=stage,
+            end=end,
+            broken_clips=broken_clips,
+            memory=most_device_bytes(self.mesh.local_devices),
+        )
 
     def _validation_is_due(self, step: int) -> bool:
         every = None if self.config.validation is None else self.config.validation.every

@@ -32,13 +32,15 @@ def progress_line(
     values: Mapping[str, float],
     speed: Speed,
     *,
+    waited: int | None = None,
     memory: int | None,
     stage_seconds: float,
     run_seconds: float,
 ) -> str:
     """One line about an interval's steps: loss with its terms, errors, learning rate, speed and remaining time.
 
-    `values` are its means as they are logged, `memory` the most bytes that a device held.
+    `values` are its means as they are logged, `memory` the most bytes that a device held; `waited` is the process that
+    has waited longest for clips, where there are several.
     """
     terms = {name: value for name, value in values.items() if name.startswith("loss/") and name != "loss/total"}
     parts = [
@@ -53,7 +55,8 @@ def progress_line(
     ]
     if speed.utilisation is not None:
         parts.append(f"utilisation {speed.utilisation:.2f}")
-    parts.append(f"waiting for data {speed.data_share:.0%}")
+    who = "" if waited is None else f" (process {waited})"
+    parts.append(f"waiting for data {speed.data_share:.0%}{who}")
     if memory is not None:
         parts.append(f"memory {memory / 2**30:.1f} GiB")
     left = f"{duration(stage_seconds)} left of the stage, {duration(run_seconds)} of the run"

@@ -155,6 +155,7 @@ loop.MetricsLog.write = stop
         # As docs/clusters.md promises: three later at most.
         assert int(found[1]) == 10 + 3
         assert (tmp_path / "checkpoints" / found[1]).is_dir()
+        assert re.search(r"step 10/.*waiting for data \d+% \(process [01]\)", output), output
 
 
 @pytest.mark.parametrize("batches", [12, 1])

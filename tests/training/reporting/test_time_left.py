@@ -1,13 +1,18 @@
 """The time that is left counts what is no step; means are of the steps between two lines."""
 
 import dataclasses
+import io
 import math
 import time
+from pathlib import Path
 
+import numpy as np
 import pytest
+from rich.console import Console
 
 from logvggt_jax.training.config import SourceConfig, TrainConfig, ValidationConfig
-from logvggt_jax.training.reporting import progress
+from logvggt_jax.training.reporting import intervals, progress
+from logvggt_jax.training.reporting.metrics_log import FILE_NAME, TIMES_NAME, MetricsLog, read_metrics
 from logvggt_jax.training.reporting.progress import IntervalMeans, progress_line
 from logvggt_jax.training.reporting.run_times import RunTimes, Speed
 
@@ -85,6 +90,28 @@ def test_means_are_of_finite_values_and_counters_are_the_last() -> None:
     assert means.read() == {"loss/total": 2.0, "learning_rate": 2.0, "skipped": 2.0, "longest_skip": 1.0}
     means.add({"loss/total": math.nan})
     assert math.isnan(means.read()["loss/total"])
+
+
+def test_a_line_tells_of_all_processes(
+    config: TrainConfig, clock: Clock, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    others = [[0.5, 2.0, 3.0 * 2**30], [0.0, 0.0, math.nan]]
+    monkeypatch.setattr(intervals, "from_all", lambda own: np.stack([own, *np.array(others, own.dtype)]))
+    times = RunTimes(config)
+    times.count()
+    with times.waiting():
+        clock.now += 1.0
+    clock.now += 3.0
+    shown = io.StringIO()
+    values = {"loss/total": 1.0, "train/abs_rel": 0.1, "train/rotation_over_identity": 0.9, "learning_rate": 3e-4}
+    values |= {"train/translation_direction": 50.0}
+    options = {"config": config, "stage": config.stages[0], "end": 100, "broken_clips": 1, "memory": 2**30}
+    with MetricsLog(tmp_path, first_step=0, console=Console(file=shown, width=1000)) as log:
+        intervals.report_interval(log, 1, values, times, **options)
+    assert "waiting for data 50% (process 1), memory 3.0 GiB" in shown.getvalue()
+    assert read_metrics(tmp_path / FILE_NAME)[-1]["broken_clips"] == 3.0
+    assert read_metrics(tmp_path / TIMES_NAME)[-1]["data_share"] == 0.5
+    assert times.productive == 3.0, "its own"
 
 
 def test_goodput_is_not_known_where_the_clock_was_set() -> None:
