@@ -8,7 +8,7 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -112,6 +112,19 @@ def damage(path: Path, numbers: Sequence[int]) -> Path:
         position, size, _ = packets(path)[number]
         content[position : position + size] = b"\xff" * size
     path.write_bytes(content)
+    return path
+
+
+def rewritten(path: Path, source: Path, change: Callable[[int, bytes], bytes | None]) -> Path:
+    """A copy with what `change` makes of the packets, by their number in the file; without those that it makes None."""
+    with av.open(str(source)) as container, av.open(str(path), "w") as output:
+        stream = output.add_stream_from_template(container.streams.video[0])
+        for number, packet in enumerate(packet for packet in container.demux(video=0) if packet.size):
+            if (content := change(number, bytes(packet))) is not None:
+                copy = av.Packet(content)
+                copy.pts, copy.dts, copy.duration = packet.pts, packet.dts, packet.duration
+                copy.time_base, copy.is_keyframe, copy.stream = packet.time_base, packet.is_keyframe, stream
+                output.mux(copy)
     return path
 
 
@@ -674,6 +687,25 @@ def test_a_packet_that_gives_neither_picture_nor_error_is_named(tmp_path: Path, 
     left_out = [int(frame.name.removeprefix("frame-")) for frame in source.skipped]
     assert number in left_out and shown[-1] == 7 and sorted([*shown, *left_out]) == list(range(8))
     assert {frame.reason for frame in source.skipped} == {"gives no picture"}
+
+
+@pytest.mark.parametrize("number", [0, 3])
+def test_a_jpeg_that_ends_too_soon_is_no_picture(tmp_path: Path, number: int) -> None:
+    whole = write(tmp_path / "whole.avi", [busy(i) for i in range(6)], codec="mjpeg", pixels="yuvj420p")
+    path = rewritten(
+        tmp_path / "walk.avi", whole, lambda at, packet: packet[: len(packet) * 2 // 3] if at == number else packet
+    )
+    source = open_source(path)
+    assert names(list(source)) == [i for i in range(6) if i != number]
+    assert [frame.name for frame in source.skipped] == [f"frame-{number:06d}"]
+
+
+def test_a_jpeg_without_its_end_mark_is_a_picture(tmp_path: Path, library: str) -> None:
+    """As some cameras write them."""
+    whole = write(tmp_path / "whole.avi", [busy(i) for i in range(6)], codec="mjpeg", pixels="yuvj420p")
+    path = rewritten(tmp_path / "walk.avi", whole, lambda _, packet: packet[: packet.rindex(b"\xff\xd9")])
+    source = open_source(path)
+    assert names(list(source)) == list(range(6)) and not source.skipped and not source.notes
 
 
 def test_the_first_damaged_frame_is_an_error_when_strict(tmp_path: Path, library: str) -> None:

@@ -45,6 +45,8 @@ _LARGE = 1920 * 1088
 # stand for no change. A decoder may drop a damaged packet of theirs without an error.
 _FRAME_A_PACKET = ("mpeg4", "h264", "hevc", "mjpeg")
 _EMPTY_PACKET = 8
+# Codecs of which a packet that ends too soon gives a picture that is half grey, unless any error is to be one.
+_EASILY_PLEASED = ("mjpeg",)
 # Packets within which a stream that shows its frames in another order than it holds them does so.
 _MOST_UNTIL_REORDERED = 48
 
@@ -172,6 +174,8 @@ class PyAVDecoder:
                 f"{self._name}: its codec {codec} cannot be decoded by the FFmpeg that PyAV brings; re-encode it, for "
                 "example to H.264 mp4"
             )
+        if stream.codec_context.name in _EASILY_PLEASED:
+            stream.codec_context.options = {"err_detect": "explode"}
         # Threads within a frame lose nothing when a packet is damaged. With threads over frames, which large pictures
         # need, the library drops what follows a damaged packet among the last few of the file.
         if stream.width * stream.height > _LARGE:
