@@ -689,6 +689,39 @@ def test_a_packet_that_gives_neither_picture_nor_error_is_named(tmp_path: Path, 
     assert {frame.reason for frame in source.skipped} == {"gives no picture"}
 
 
+@pytest.mark.parametrize("codec", ["mpeg1video", "mpeg2video"])
+@pytest.mark.parametrize("number", [5, 8, 11])
+def test_a_picture_of_mpeg_that_vanishes_is_named(tmp_path: Path, library: str, codec: str, number: int) -> None:
+    """Its decoder passes over a packet in which it finds no picture, be it of a key frame or the last one."""
+    whole = write(tmp_path / "whole.mkv", [busy(i) for i in range(12)], codec=codec, rate=25, options={"g": "8"})
+    noise = np.random.default_rng(0)
+    path = rewritten(
+        tmp_path / "walk.mkv", whole, lambda at, packet: noise.bytes(len(packet)) if at == number else packet
+    )
+    source = open_source(path)
+    frames, truth = list(source), list(open_source(whole))
+    assert names(frames) == [i for i in range(12) if i != number]
+    assert [frame.name for frame in source.skipped] == [f"frame-{number:06d}"]
+    np.testing.assert_array_equal(frames[0].image, truth[0].image)
+
+
+@pytest.mark.parametrize(
+    ("name", "codec", "options"),
+    [
+        *((f"whole.{suffix}", "mpeg2video", {"bf": "2", "g": "8"}) for suffix in ("mkv", "mp4", "ts", "mpg", "avi")),
+        *((f"whole.{suffix}", "mpeg1video", {"bf": "2", "g": "8"}) for suffix in ("mkv", "mp4", "ts", "mpg", "avi")),
+        ("open.ts", "mpeg2video", {"bf": "2", "g": "6", "flags": "-cgop"}),
+        ("delay.mpg", "mpeg2video", {"g": "6", "flags": "+low_delay"}),
+    ],
+)
+def test_whole_videos_of_mpeg_miss_nothing(
+    tmp_path: Path, library: str, name: str, codec: str, options: dict[str, str]
+) -> None:
+    path = write(tmp_path / name, [busy(i) for i in range(24)], codec=codec, rate=25, options=options)
+    source = open_source(path)
+    assert names(list(source)) == list(range(24)) and not source.skipped and not source.notes
+
+
 @pytest.mark.parametrize("number", [0, 3])
 def test_a_jpeg_that_ends_too_soon_is_no_picture(tmp_path: Path, number: int) -> None:
     whole = write(tmp_path / "whole.avi", [busy(i) for i in range(6)], codec="mjpeg", pixels="yuvj420p")

@@ -38,7 +38,7 @@ class MissingFrames:
         """A frame could not be read or decoded; which, will be seen."""
         self._failures.append(reason)
 
-    def before(self, shown: int, since: int | None) -> Iterator[Damage]:
+    def before(self, shown: float, since: int | None) -> Iterator[Damage]:
         """The frames before the one that is shown at this time that failed, or every one from `since` on that has not
         come out."""
         while self._waiting and self._waiting[0] <= shown:

@@ -40,7 +40,10 @@ _PICTURES = (b"mjpg", b"mpng")
 # Codecs that FFmpeg recognises in the container IVF only.
 _IN_IVF = (b"vp90", b"av01")
 # Codecs of which every packet shows a frame of its own, but for empty ones, which stand for no change.
-_FRAME_A_PACKET = (b"h264", b"avc1", b"hevc", b"hvc1", b"hev1", b"mjpg", b"fmp4", b"mp4v", b"xvid", b"divx", b"dx50")
+_FRAME_A_PACKET = (
+    *(b"h264", b"avc1", b"hevc", b"hvc1", b"hev1", b"mjpg", b"fmp4", b"mp4v", b"xvid", b"divx", b"dx50"),
+    *(b"mpg1", b"mpg2"),
+)
 _EMPTY_PACKET = 8
 # Errors in a row after which nothing more is to be read.
 _MOST_ERRORS = 64

@@ -43,7 +43,7 @@ _LONGEST_LEAD = 300
 _LARGE = 1920 * 1088
 # Codecs of which every packet shows a frame of its own, but for those of interlaced material and for empty ones, which
 # stand for no change. A decoder may drop a damaged packet of theirs without an error.
-_FRAME_A_PACKET = ("mpeg4", "h264", "hevc", "mjpeg")
+_FRAME_A_PACKET = ("mpeg4", "h264", "hevc", "mjpeg", "mpeg1video", "mpeg2video")
 _EMPTY_PACKET = 8
 # Codecs of which a packet that ends too soon gives a picture that is half grey, unless any error is to be one.
 _EASILY_PLEASED = ("mjpeg",)
@@ -190,6 +190,7 @@ class PyAVDecoder:
         self._lead = 0
         started, key = False, None  # the time stamp of the first key frame; what is shown before refers to lost frames
         joined, last = False, -math.inf  # whether time goes back, as where recordings are joined
+        each = False  # whether every packet is known to show a frame of its own
         for packet in self._packets(container, stream):
             if isinstance(packet, str):
                 missing.fail(packet)
@@ -221,11 +222,13 @@ class PyAVDecoder:
                     frame.pts = missing.take_next()
                 elif frame.pts is not None:
                     each = stream.codec_context.name in _FRAME_A_PACKET and not is_interlaced(frame, stream)
-                    since = None if joined or not each else key
+                    since = key if each and not joined else None
                     yield from ((damage, None) for damage in missing.before(frame.pts, since))
                 yield None, frame
         if stream.width * stream.height > _LARGE:
             missing.fail_all("cannot be decoded")
+        elif each and not joined:
+            yield from ((damage, None) for damage in missing.before(math.inf, key))
         yield from ((damage, None) for damage in missing.failures())
 
     def _begins_late(self) -> Iterator[str]:
