@@ -115,9 +115,14 @@ def damage(path: Path, numbers: Sequence[int]) -> Path:
     return path
 
 
-def rewritten(path: Path, source: Path, change: Callable[[int, bytes], bytes | None]) -> Path:
+def rewritten(
+    path: Path,
+    source: Path,
+    change: Callable[[int, bytes], bytes | None] = lambda _, packet: packet,
+    options: dict[str, str] | None = None,
+) -> Path:
     """A copy with what `change` makes of the packets, by their number in the file; without those that it makes None."""
-    with av.open(str(source)) as container, av.open(str(path), "w") as output:
+    with av.open(str(source)) as container, av.open(str(path), "w", options=options or {}) as output:
         stream = output.add_stream_from_template(container.streams.video[0])
         for number, packet in enumerate(packet for packet in container.demux(video=0) if packet.size):
             if (content := change(number, bytes(packet))) is not None:
@@ -934,6 +939,50 @@ def test_a_recording_that_begins_in_the_middle(tmp_path: Path, library: str) -> 
     assert len(frames) == 12
     for frame, expected in zip(frames, list(open_source(path))[12:], strict=True):
         np.testing.assert_array_equal(frame.image, expected.image)
+
+
+def trimmed(path: Path, source: Path, first: int, count: int) -> Path:
+    """A copy of so many packets from one on, which need not be a key frame; its index stands at the front."""
+    return rewritten(
+        path,
+        source,
+        lambda number, packet: packet if first <= number < first + count else None,
+        options={"movflags": "faststart"} if path.suffix == ".mp4" else None,
+    )
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "mkv"])
+def test_a_beginning_that_is_left_out_is_no_early_end(tmp_path: Path, library: str, suffix: str) -> None:
+    """As where a part was copied from between key frames, here after a pause that was recorded as one frame."""
+    stamps = [*range(20), *range(60, 100)]
+    whole = write(
+        tmp_path / "whole.mp4",
+        [busy(i) for i in range(60)],
+        options={"g": "24", "bf": "0", "sc_threshold": "0"},
+        stamps=stamps,
+    )
+    source = open_source(trimmed(tmp_path / f"part.{suffix}", whole, 14, 30))
+    frames = list(source)
+    assert len(frames) == 20 and not source.skipped
+    assert [
+        note for note in source.notes if "10 frames before its first key frame are left out" in note
+    ] == source.notes
+    if (library, suffix) != ("opencv", "mkv"):  # of which OpenCV knows no duration
+        with pytest.raises(InputError, match="lasts 2 s, but start is 3 s"):
+            open_source(source.path, start=3)
+
+
+@pytest.mark.parametrize(("suffix", "told"), [("mp4", r"1\d frames"), ("mkv", r"1\.\d+ s")])
+def test_an_early_end_is_told_of_a_part_as_well(tmp_path: Path, library: str, suffix: str, told: str) -> None:
+    whole = write(
+        tmp_path / "whole.mp4", [busy(i) for i in range(60)], options={"g": "24", "bf": "0", "sc_threshold": "0"}
+    )
+    path = trimmed(tmp_path / f"part.{suffix}", whole, 14, 40)
+    path.write_bytes(path.read_bytes()[: packets(path)[24][0]])
+    with pytest.warns(
+        UserWarning, match=rf"{told} decoded after the 10 frames that are left out, its header announces 4"
+    ):
+        list(open_source(path, most_broken=1.0))
 
 
 def test_the_library_prints_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -20,6 +20,8 @@ class VideoHeader:
       announced: number of frames that the file itself states; None where it does not.
       seconds: duration of the video stream that the file states; None where it does not.
       notes: what the user should know, one line each.
+      lead: of those frames, the ones before the first key frame, which are left out.
+      lead_seconds: of that duration, how long these are shown.
     """
 
     size: tuple[int, int]
@@ -28,6 +30,8 @@ class VideoHeader:
     announced: int | None
     seconds: float | None
     notes: tuple[str, ...] = ()
+    lead: int = 0
+    lead_seconds: float = 0.0
 
 
 class Picture(NamedTuple):

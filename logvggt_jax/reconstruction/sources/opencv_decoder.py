@@ -84,8 +84,11 @@ class OpenCVDecoder:
         rate = frequency if math.isfinite(frequency) and frequency > 0 else None
         if self._media is not None and self._media.interlaced:
             self._refuse_interlaced()
-        notes = tuple(self._notes(capture, image.shape[:2], rate))
+        follower = self._follower(0.0)
+        notes = tuple(self._notes(capture, image.shape[:2], rate, follower))
         capture.release()
+        if follower is not None:
+            follower.close()
         seconds = self._view.seconds or (self._media.seconds if self._media else None)
         return VideoHeader(
             size=shown_size(image.shape[:2], self._matrix),
@@ -94,6 +97,8 @@ class OpenCVDecoder:
             announced=stated if self._states_frames() else None,
             seconds=seconds,
             notes=notes,
+            lead=follower.lead if follower else 0,
+            lead_seconds=follower.lead_seconds if follower else 0.0,
         )
 
     def pictures(self) -> Iterator[Picture | Damage]:
@@ -167,7 +172,9 @@ class OpenCVDecoder:
         rgb = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
         return rgb if self._matrix is None else turn(rgb, self._matrix)
 
-    def _notes(self, capture: cv2.VideoCapture, size: tuple[int, int], rate: float | None) -> Iterator[str]:
+    def _notes(
+        self, capture: cv2.VideoCapture, size: tuple[int, int], rate: float | None, follower: PacketFollower | None
+    ) -> Iterator[str]:
         if self._file is None:
             return
         media = self._media
@@ -191,13 +198,10 @@ class OpenCVDecoder:
         width, height = (round(capture.get(each)) for each in (cv2.CAP_PROP_SAR_NUM, cv2.CAP_PROP_SAR_DEN))
         if width and height and width != height:
             yield oblong_pixels(self._name, width, height)
-        follower = self._follower(0.0)
-        if follower is not None:
-            if follower.lead:
-                yield begins_late(self._name, follower.lead)
-            if not follower.states_size:
-                yield f"{self._name}: OpenCV does not notice where pictures of its codec change their size; {_PYAV}"
-            follower.close()
+        if follower is not None and follower.lead:
+            yield begins_late(self._name, follower.lead)
+        if follower is not None and not follower.states_size:
+            yield f"{self._name}: OpenCV does not notice where pictures of its codec change their size; {_PYAV}"
 
     def _look_at_file(self) -> None:
         """Learns what OpenCV does not tell: how pictures are turned, what their header says, and which times hold."""

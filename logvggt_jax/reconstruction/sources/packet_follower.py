@@ -51,6 +51,7 @@ class PacketFollower:
     Attributes:
       size: (H, W) before rotation, as stated for the picture at hand; None where nothing states it.
       lead: frames before the first key frame, which refer to some that are not there.
+      lead_seconds: how long these would be shown.
       states_size: whether a packet so far states a size.
 
     Args:
@@ -73,7 +74,8 @@ class PacketFollower:
         self._is_first_part = True
         self._joint: Packet | None = None
         self.size: tuple[int, int] | None = None
-        self.lead = 0
+        self.lead, self.lead_seconds = 0, 0.0
+        self._lead_begins = math.inf
         self.states_size = False
         self._begin()
         self._fill(_AHEAD)
@@ -194,8 +196,11 @@ class PacketFollower:
         # What a later part begins with is decoded by what is known from the one before.
         if self._key is None and (packet.key or not self._is_first_part or self.lead == _LONGEST_LEAD):
             self._key = packet.stamp
+            if self._is_first_part:
+                self.lead_seconds = max(0.0, packet.stamp - self._lead_begins) * float(_MICROSECOND)
         if self._key is None:
             self.lead += 1
+            self._lead_begins = min(self._lead_begins, packet.stamp)
             return
         self.states_size = self.states_size or packet.size is not None
         if not self._sizes or self._sizes[-1][1] != packet.size:

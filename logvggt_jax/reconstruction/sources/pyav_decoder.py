@@ -62,8 +62,9 @@ class PyAVDecoder:
 
     def __init__(self, url: str, name: str, timeout: float | None = None) -> None:
         self._url, self._name, self._timeout = url, name, timeout
-        # Packets before the first key frame.
+        # Packets before the first key frame, and the earliest of their time stamps.
         self._lead = 0
+        self._lead_begins: int | None = None
         # Some writers number packets as they are stored, though their frames are shown in another order.
         self._numbered_as_stored = False
 
@@ -76,7 +77,8 @@ class PyAVDecoder:
             if frame is None:
                 codec = stream.codec_context.codec.long_name
                 raise InputError(f"{self._name} holds no frame that can be decoded ({codec}); re-encode the video")
-            rate, seconds, stated = average_rate(container, stream), duration(container, stream), stream.frames or None
+            rate, stated = average_rate(container, stream), stream.frames or None
+            seconds = duration(container, stream, self._lead_begins)
             if stated is not None and stated > container.size:
                 # A recorder that was cut off, or wrote to a pipe, never came to fill in its header.
                 seconds = stated = None
@@ -89,6 +91,8 @@ class PyAVDecoder:
                 announced=stated if stated is None or frames is None or frames <= stated else None,
                 seconds=seconds if container.format.name.startswith(_STATE_DURATION) else None,
                 notes=(*notes_on(self._name, container, stream, frame), *self._begins_late()),
+                lead=self._lead,
+                lead_seconds=self._lead_seconds(frame, stream),
             )
 
     def pictures(self) -> Iterator[Picture | Damage]:
@@ -187,7 +191,7 @@ class PyAVDecoder:
     ) -> Iterator[tuple[Damage | None, av.VideoFrame | None]]:
         """Frames in the order in which they are shown, with what is missing between them."""
         missing = MissingFrames(stream.time_base)
-        self._lead = 0
+        self._lead, self._lead_begins = 0, None
         started, key = False, None  # the time stamp of the first key frame; what is shown before refers to lost frames
         joined, last = False, -math.inf  # whether time goes back, as where recordings are joined
         each = False  # whether every packet is known to show a frame of its own
@@ -199,6 +203,8 @@ class PyAVDecoder:
             started = started or packet.is_keyframe or self._lead == _LONGEST_LEAD or not packet.size
             if not started:
                 self._lead += 1
+                stamps = [stamp for stamp in (self._lead_begins, packet.pts) if stamp is not None]
+                self._lead_begins = min(stamps, default=None)
                 continue
             if packet.dts is not None:
                 joined, last = joined or packet.dts < last, packet.dts
@@ -230,6 +236,11 @@ class PyAVDecoder:
         elif each and not joined:
             yield from ((damage, None) for damage in missing.before(math.inf, key))
         yield from ((damage, None) for damage in missing.failures())
+
+    def _lead_seconds(self, first: av.VideoFrame, stream: av.video.stream.VideoStream) -> float:
+        if self._lead_begins is None or first.pts is None:
+            return 0.0
+        return float(max(0, first.pts - self._lead_begins) * stream.time_base)
 
     def _begins_late(self) -> Iterator[str]:
         if self._lead:

@@ -78,11 +78,15 @@ def average_rate(container: av.container.InputContainer, stream: av.video.stream
     return min((rate for rate in (stream.average_rate, stream.guessed_rate) if rate), default=None)
 
 
-def duration(container: av.container.InputContainer, stream: av.video.stream.VideoStream) -> float | None:
-    """Seconds from the first frame to the end of the last."""
-    if stream.duration:
+def duration(
+    container: av.container.InputContainer, stream: av.video.stream.VideoStream, begins: int | None
+) -> float | None:
+    """Seconds from the first frame to the end of the last; `begins` is the time stamp of the first frame where that is
+    known, as the library may know none of a stream that does not begin with a key frame."""
+    is_matroska = "matroska" in container.format.name
+    if stream.duration and not is_matroska:  # which states that of the file, and the library takes it for the stream's
         return float(stream.duration * stream.time_base)
-    start = float((stream.start_time or 0) * stream.time_base)
+    start = float((stream.start_time or begins or 0) * stream.time_base)
     if tag := re.fullmatch(r"(\d+):(\d+):(\d+\.?\d*)", stream.metadata.get("DURATION", "")):
         # Matroska's, counted from the beginning of the file.
         hours, minutes, seconds = map(float, tag.groups())
@@ -90,7 +94,7 @@ def duration(container: av.container.InputContainer, stream: av.video.stream.Vid
     if not container.duration or len(container.streams) > 1:
         return None
     total = container.duration / av.time_base
-    return total - start if "matroska" in container.format.name else total
+    return total - start if is_matroska else total
 
 
 def unknown_codec(container: av.container.InputContainer, index: int) -> str:

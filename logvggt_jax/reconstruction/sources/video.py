@@ -95,7 +95,8 @@ class VideoSource(Source):
         header = self._header
         if header is None:
             return self.options.max_frames
-        return expected_frames(self.options, header.frames, header.rate)
+        frames = None if header.frames is None else max(0, header.frames - header.lead)
+        return expected_frames(self.options, frames, header.rate)
 
     @property
     def image_size(self) -> tuple[int, int] | None:
@@ -193,8 +194,9 @@ class VideoSource(Source):
 
     def _check_range(self, header: VideoHeader) -> None:
         start = self.options.start or 0.0
-        if header.seconds is not None and start >= header.seconds:
-            raise InputError(f"{self.name} lasts {header.seconds:.3g} s, but start is {start:g} s: choose less")
+        seconds = None if header.seconds is None else header.seconds - header.lead_seconds
+        if seconds is not None and start >= seconds:
+            raise InputError(f"{self.name} lasts {seconds:.3g} s, but start is {start:g} s: choose less")
 
     def _check_end(self, frames: int, seconds: float, lasts: float | None) -> None:
         """Warns of a file that ends before its header says, and notes where a few frames of it are not shown.
@@ -207,14 +209,16 @@ class VideoSource(Source):
         step = 1.0 / header.rate if header.rate else 0.0
         # An edited file announces frames that it does not show; its duration does not count them.
         end = seconds + max(step, lasts or 0.0)
-        lacks_time = header.seconds is not None and end < 0.99 * header.seconds - 2 * step
+        lacks_time = header.seconds is not None and header.lead_seconds + end < 0.99 * header.seconds - 2 * step
+        there = frames + header.lead
+        after = f" after the {header.lead} frames that are left out" if header.lead else ""
         if header.announced is None:
             short = lacks_time
-            told = f"{end:.4g} s decoded, its header announces {header.seconds or 0:.4g} s"
+            told = f"{end:.4g} s decoded{after}, its header announces {header.seconds or 0:.4g} s"
         else:
-            short = frames < 0.99 * header.announced - 2 and (lacks_time or header.seconds is None)
-            told = f"{frames} frames decoded, its header announces {header.announced}"
-            if frames < header.announced and not short:
+            short = there < 0.99 * header.announced - 2 and (lacks_time or header.seconds is None)
+            told = f"{frames} frames decoded{after}, its header announces {header.announced}"
+            if there < header.announced and not short:
                 self._add_note(
                     f"{self.name} shows {frames} of the {header.announced} frames in it: it was cut without encoding "
                     "it anew, holds empty ones where nothing changes, or its index is damaged"
