@@ -855,6 +855,14 @@ def test_a_matroska_video_cut_short_says_so(tmp_path: Path, library: str) -> Non
         assert len(list(open_source(path, most_broken=1.0))) >= 10
 
 
+def test_an_mxf_video_cut_short_says_so(tmp_path: Path) -> None:
+    path = write(tmp_path / "cut.mxf", [busy(i) for i in range(24)], codec="mpeg2video", rate=25)
+    assert len(list(open_source(path))) == 24
+    path.write_bytes(path.read_bytes()[: packets(path)[12][0]])
+    with pytest.warns(UserWarning, match=r"ends early: 0\.4\d* s decoded, its header announces 0\.96 s"):
+        assert len(list(open_source(path, most_broken=1.0))) >= 10
+
+
 def test_a_header_that_was_never_filled_in_announces_nothing(tmp_path: Path, library: str) -> None:
     """As recorders leave it that are cut off, or write to a pipe."""
     path = write(tmp_path / "killed.avi", [busy(i) for i in range(8)], codec="mjpeg", pixels="yuvj420p")

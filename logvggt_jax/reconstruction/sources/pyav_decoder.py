@@ -34,7 +34,7 @@ _TAGS = {"metadata_errors": "replace"} if av.__version__.startswith("18.") else 
 # Text and single images, which FFmpeg would show as videos of one frame.
 _NO_VIDEOS = ("image2", "tty", "bin", "xbin", "adf", "idf")
 # Formats that state their duration; FFmpeg guesses that of others.
-_STATE_DURATION = ("mov", "matroska", "avi", "flv", "asf")
+_STATE_DURATION = ("mov", "matroska", "avi", "flv", "asf", "mxf")
 # Errors in a row after which a file that cannot be read on counts as ended.
 _MOST_READ_ERRORS = 16
 # Some formats mark no key frames: after so many packets the first that decodes begins the video.
