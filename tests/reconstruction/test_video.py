@@ -18,6 +18,7 @@ import av.subtitles.stream  # which PyAV would import when the package is hidden
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from logvggt_jax.errors import InputError
 from logvggt_jax.reconstruction.sources import (
@@ -861,6 +862,29 @@ def test_an_mxf_video_cut_short_says_so(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[: packets(path)[12][0]])
     with pytest.warns(UserWarning, match=r"ends early: 0\.4\d* s decoded, its header announces 0\.96 s"):
         assert len(list(open_source(path, most_broken=1.0))) >= 10
+
+
+@pytest.mark.parametrize("place", [0.02, 0.5, 0.8, 1.0])
+def test_a_gif_cut_short_says_so(tmp_path: Path, library: str, place: float) -> None:
+    whole = write(tmp_path / "whole.gif", [busy(i) for i in range(8)], codec="gif", pixels="rgb8")
+    content = whole.read_bytes()
+    assert not [note for note in open_source(whole).notes if "its end" in note]
+    path = tmp_path / "cut.gif"
+    # Where the pictures begin, the end of the last one, and between.
+    first = content.index(b",")
+    path.write_bytes(content[: first + 400 + int((len(content) - 1 - first - 400) * place)])
+    assert "cut.gif lacks its end" in open_source(path).notes[0]
+
+
+def test_what_follows_the_end_of_a_gif_is_no_part_of_it(tmp_path: Path, library: str) -> None:
+    pictures = [Image.fromarray(busy(i)) for i in range(4)]
+    path = tmp_path / "walk.gif"
+    # With colours of each picture, a comment, and what a server appended.
+    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=100, comment=b";,!" * 200)
+    path.write_bytes(path.read_bytes() + b"\0" * 9 + b"\r\n")
+    source = open_source(path)
+    assert len(list(source)) == 4
+    assert not [note for note in source.notes if "its end" in note]
 
 
 def test_a_header_that_was_never_filled_in_announces_nothing(tmp_path: Path, library: str) -> None:

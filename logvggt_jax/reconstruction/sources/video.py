@@ -15,6 +15,7 @@ import numpy as np
 
 from logvggt_jax.errors import InputError, disk_errors
 from logvggt_jax.reconstruction.sources.decoding import Damage, Picture, VideoDecoder, VideoHeader
+from logvggt_jax.reconstruction.sources.gif_blocks import breaks_off
 from logvggt_jax.reconstruction.sources.masks import Masked, Masks
 from logvggt_jax.reconstruction.sources.media_boxes import boxes
 from logvggt_jax.reconstruction.sources.opencv_decoder import OpenCVDecoder
@@ -72,7 +73,7 @@ class VideoSource(Source):
         self.name = re.sub(r"(?<=://)[^/@]*:[^/@]*@", "", _address(path))
         self._header: VideoHeader | None = None
         if not self._live:
-            _check_file(self.path)
+            self.notes += _check_file(self.path)
             self._decoder = _decoder(self.path, self.name)
             self._header = self._decoder.header()
             self._check_range(self._header)
@@ -251,8 +252,8 @@ def _decoder(source: str | Path, name: str, timeout: float | None = None) -> Vid
     return PyAVDecoder(url, name, timeout)
 
 
-def _check_file(path: Path) -> None:
-    """Refuses what no library could read as a video, or would wait for without end."""
+def _check_file(path: Path) -> Iterator[str]:
+    """Refuses what no library could read as a video, or would wait for without end; tells what none would notice."""
     with disk_errors(path):
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):
@@ -263,6 +264,12 @@ def _check_file(path: Path) -> None:
             if file.read(30)[8:].startswith(b"WEBPVP8X") and file.read(4) == b"ANIM":
                 raise InputError(f"{path} is an animated WebP, which cannot be decoded: convert it to mp4 or GIF")
             _check_index(path, file, status.st_size)
+            file.seek(0)
+            if file.read(4) == b"GIF8" and breaks_off(file):
+                yield (
+                    f"{path} lacks its end: the last frame may be half a picture, and those after it are missing; copy "
+                    "it anew"
+                )
 
 
 def _check_index(path: Path, file: BinaryIO, size: int) -> None:
