@@ -516,6 +516,34 @@ def test_a_change_of_size_is_noticed_in_every_usual_codec(
         list(frames)
 
 
+CODECS: dict[str, dict[str, Any]] = {
+    "h264": {},
+    "hevc": {"codec": "libx265", "options": {"x265-params": "log-level=none:frame-threads=1:bframes=0"}},
+    "mpeg2video": {"codec": "mpeg2video"},
+}
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [("h264", "mpeg2video"), ("h264", "hevc"), ("mpeg2video", "h264"), ("hevc", "h264"), ("hevc", "mpeg2video")],
+)
+def test_a_change_of_codec_is_named(tmp_path: Path, before: str, after: str) -> None:
+    path = tmp_path / "both.ts"
+    parts = [
+        write(tmp_path / f"{name}.ts", [busy(i) for i in range(24)], rate=25, **CODECS[name])
+        for name in (before, after)
+    ]
+    path.write_bytes(b"".join(part.read_bytes() for part in parts))
+    source = open_source(path)
+    frames = []
+    with pytest.raises(
+        InputError, match=rf"both\.ts changes its codec about frame 2[234], from {before} to {after}: .*; cut it there"
+    ):
+        frames += source
+    assert len(frames) >= 22 and not source.skipped
+    assert len(list(open_source(path, end=0.5))) == 13
+
+
 def test_a_change_of_pixel_format_is_converted(tmp_path: Path, library: str) -> None:
     one = write(tmp_path / "one.ts", [quarters()] * 4)
     two = write(tmp_path / "two.ts", [quarters()] * 4, pixels="yuv444p", stamps=range(4, 8))

@@ -61,6 +61,14 @@ class Damage(NamedTuple):
     reason: str
 
 
+class CodecChange(NamedTuple):
+    """What follows is coded otherwise than what came before, and is not decoded; `seconds` as in `Picture`."""
+
+    seconds: float | None
+    before: str
+    after: str
+
+
 class VideoDecoder(Protocol):
     """A video file, camera or stream that can be decoded from its beginning, again and again."""
 
@@ -71,5 +79,6 @@ class VideoDecoder(Protocol):
           InputError: it cannot be opened, holds no video, or nothing of it can be decoded.
         """
 
-    def pictures(self) -> Iterator[Picture | Damage]:
-        """The frames in the order in which they are shown. Raises InputError as `header` does."""
+    def pictures(self) -> Iterator[Picture | Damage | CodecChange]:
+        """The frames in the order in which they are shown; nothing follows a change of the codec. Raises InputError as
+        `header` does."""

@@ -14,7 +14,7 @@ import av.logging
 import numpy as np
 
 from logvggt_jax.errors import InputError
-from logvggt_jax.reconstruction.sources.decoding import Damage, Picture, VideoHeader
+from logvggt_jax.reconstruction.sources.decoding import CodecChange, Damage, Picture, VideoHeader
 from logvggt_jax.reconstruction.sources.deinterlacing import Deinterlacer, is_interlaced
 from logvggt_jax.reconstruction.sources.missing_frames import MissingFrames
 from logvggt_jax.reconstruction.sources.orientation import shown_size, turn
@@ -24,7 +24,7 @@ from logvggt_jax.reconstruction.sources.pyav_header import (
     duration,
     moving_streams,
     notes_on,
-    unknown_codec,
+    stated_codec,
 )
 from logvggt_jax.reconstruction.sources.sampling import likely_frames
 from logvggt_jax.reconstruction.sources.video_notes import begins_late
@@ -95,12 +95,12 @@ class PyAVDecoder:
                 lead_seconds=self._lead_seconds(frame, stream),
             )
 
-    def pictures(self) -> Iterator[Picture | Damage]:
+    def pictures(self) -> Iterator[Picture | Damage | CodecChange]:
         """See `VideoDecoder.pictures`."""
         with self._open() as container:
             stream = self._stream(container)
             deinterlacer = Deinterlacer(stream, self._name)
-            for damage, frame in self._decode(container, stream):
+            for instead, frame in self._decode(container, stream):
                 if frame is not None:
                     ready = deinterlacer.push(frame)
                 else:
@@ -108,8 +108,8 @@ class PyAVDecoder:
                     ready = deinterlacer.drain()
                 for decoded, whole in ready:
                     yield self._picture(decoded, whole, stream)
-                if damage is not None:
-                    yield damage
+                if instead is not None:
+                    yield instead
             for decoded, whole in deinterlacer.drain():
                 yield self._picture(decoded, whole, stream)
 
@@ -173,7 +173,7 @@ class PyAVDecoder:
         best = container.streams.best("video")
         stream = best if best in streams else streams[0]
         if stream.codec_context is None:
-            codec = unknown_codec(container, stream.index)
+            codec = stated_codec(container, stream.index)
             raise InputError(
                 f"{self._name}: its codec {codec} cannot be decoded by the FFmpeg that PyAV brings; re-encode it, for "
                 "example to H.264 mp4"
@@ -188,7 +188,7 @@ class PyAVDecoder:
 
     def _decode(
         self, container: av.container.InputContainer, stream: av.video.stream.VideoStream
-    ) -> Iterator[tuple[Damage | None, av.VideoFrame | None]]:
+    ) -> Iterator[tuple[Damage | CodecChange | None, av.VideoFrame | None]]:
         """Frames in the order in which they are shown, with what is missing between them."""
         missing = MissingFrames(stream.time_base)
         self._lead, self._lead_begins = 0, None
@@ -196,6 +196,9 @@ class PyAVDecoder:
         joined, last = False, -math.inf  # whether time goes back, as where recordings are joined
         each = False  # whether every packet is known to show a frame of its own
         for packet in self._packets(container, stream):
+            if isinstance(packet, CodecChange):
+                yield packet, None
+                return
             if isinstance(packet, str):
                 missing.fail(packet)
                 continue
@@ -254,7 +257,7 @@ class PyAVDecoder:
                 return False
             stored = shown = -math.inf
             for packet in itertools.islice(self._packets(container, stream), _MOST_UNTIL_REORDERED):
-                if isinstance(packet, str) or (packet.pts is not None and packet.pts < stored):
+                if not isinstance(packet, av.Packet) or (packet.pts is not None and packet.pts < stored):
                     return False
                 stored = stored if packet.pts is None else packet.pts
                 try:
@@ -269,12 +272,18 @@ class PyAVDecoder:
 
     def _packets(
         self, container: av.container.InputContainer, stream: av.video.stream.VideoStream
-    ) -> Iterator[av.Packet | str]:
-        """Packets, an empty one at the end; a reason where reading fails."""
-        errors = 0
+    ) -> Iterator[av.Packet | str | CodecChange]:
+        """Packets, an empty one at the end, even where that is a change of the codec; a reason where reading fails."""
+        errors, codec = 0, self._codec(container, stream)
+        empty = av.Packet()
+        empty.stream = stream
         while errors < _MOST_READ_ERRORS:
             try:
                 for packet in container.demux(stream):
+                    if packet.is_keyframe and (now := self._codec(container, stream)) != codec:
+                        yield empty
+                        yield CodecChange(None, codec, now)
+                        return
                     yield packet
                     errors = 0
                 return
@@ -285,6 +294,12 @@ class PyAVDecoder:
                 if self._timeout is not None:
                     break
         # The decoder still holds frames.
-        empty = av.Packet()
-        empty.stream = stream
         yield empty
+
+    def _codec(self, container: av.container.InputContainer, stream: av.video.stream.VideoStream) -> str:
+        """Its name, which only the streams of television are known to change on their way."""
+        if container.format.name != "mpegts":
+            return stream.codec_context.name
+        name = stated_codec(container, stream.index).partition(" ")[0]
+        # The one decoder takes either, and the format has one name for both.
+        return "mpeg2video" if name == "mpeg1video" else name

@@ -97,8 +97,9 @@ def duration(
     return total - start if is_matroska else total
 
 
-def unknown_codec(container: av.container.InputContainer, index: int) -> str:
-    """The codec of a stream for which there is no decoder, as FFmpeg names it."""
+def stated_codec(container: av.container.InputContainer, index: int) -> str:
+    """The codec of a stream as FFmpeg names and describes it, by what has been read so far; there may be no decoder for
+    it."""
     level = av.logging.get_level()
     # The library tells it in its log only.
     av.logging.set_level(av.logging.INFO)

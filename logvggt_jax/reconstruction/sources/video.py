@@ -14,7 +14,7 @@ from typing import BinaryIO
 import numpy as np
 
 from logvggt_jax.errors import InputError, disk_errors
-from logvggt_jax.reconstruction.sources.decoding import Damage, Picture, VideoDecoder, VideoHeader
+from logvggt_jax.reconstruction.sources.decoding import CodecChange, Damage, Picture, VideoDecoder, VideoHeader
 from logvggt_jax.reconstruction.sources.gif_blocks import breaks_off
 from logvggt_jax.reconstruction.sources.masks import Masked, Masks
 from logvggt_jax.reconstruction.sources.media_boxes import boxes
@@ -131,6 +131,11 @@ class VideoSource(Source):
             if selection.is_over(seconds):
                 break
             wanted = selection.wants(position, seconds)
+            if isinstance(picture, CodecChange):
+                raise InputError(
+                    f"{self.name} changes its codec about frame {position}, from {picture.before} to {picture.after}: "
+                    "all frames need one; cut it there"
+                )
             if isinstance(picture, Damage):
                 lost = True
                 if wanted:
