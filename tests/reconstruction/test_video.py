@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.server
 import os
+import re
 import socket
 import sys
 import threading
@@ -849,6 +850,30 @@ def test_a_beginning_that_an_edit_list_leaves_out_is_not_missing(tmp_path: Path,
     shown = list(source)
     assert len(shown) == 24 - frames and not source.skipped
     assert abs(shown[0].image.mean() - 40 - 8 * frames) < 6
+
+
+def test_mp4_files_that_were_appended_are_told(tmp_path: Path, library: str) -> None:
+    one = write(tmp_path / "one.mp4", [grey(i) for i in range(4)])
+    path = tmp_path / "both.mp4"
+    path.write_bytes(one.read_bytes() * 2)
+    source = open_source(path)
+    assert len(list(source)) == 4
+    assert "both.mp4 holds 2 videos one after the other, of which the first alone is read" in source.notes[0]
+
+
+def test_an_index_that_is_repeated_before_a_fragment_is_no_second_video(tmp_path: Path, library: str) -> None:
+    """As recorders of streams do that begin each part anew: the library goes on from one to the next."""
+    whole = write(tmp_path / "whole.mp4", [grey(i) for i in range(16)], options={"g": "4", "bf": "0"})
+    path = rewritten(
+        tmp_path / "parts.mp4", whole, options={"movflags": "frag_keyframe+empty_moov+default_base_moof+skip_trailer"}
+    )
+    content = path.read_bytes()
+    fragments = [found.start() - 4 for found in re.finditer(b"moof", content)]
+    head, middle = content[: fragments[0]], fragments[2]
+    path.write_bytes(content[:middle] + head + content[middle:])
+    source = open_source(path)
+    assert len(list(source)) == 16
+    assert not [note for note in source.notes if "one after the other" in note]
 
 
 def test_recordings_that_were_joined_may_each_begin_in_the_middle(tmp_path: Path, library: str) -> None:

@@ -268,7 +268,7 @@ def _check_file(path: Path) -> Iterator[str]:
         with path.open("rb") as file:
             if file.read(30)[8:].startswith(b"WEBPVP8X") and file.read(4) == b"ANIM":
                 raise InputError(f"{path} is an animated WebP, which cannot be decoded: convert it to mp4 or GIF")
-            _check_index(path, file, status.st_size)
+            yield from _check_index(path, file, status.st_size)
             file.seek(0)
             if file.read(4) == b"GIF8" and breaks_off(file):
                 yield (
@@ -277,18 +277,24 @@ def _check_file(path: Path) -> Iterator[str]:
                 )
 
 
-def _check_index(path: Path, file: BinaryIO, size: int) -> None:
-    """Refuses an mp4 or mov file that lacks the box `moov`, without which none of it can be decoded."""
+def _check_index(path: Path, file: BinaryIO, size: int) -> Iterator[str]:
+    """Refuses an mp4 or mov file that lacks the box `moov`, without which none of it can be decoded; tells of a second
+    one, which is not read, though fragments after it are."""
     file.seek(0)
     head = file.read(12)
     if head[4:8] != b"ftyp" or head[8:] in _PICTURES:
         return
-    if any(box.kind == b"moov" and box.end <= size for box in boxes(file, size)):
-        return
-    raise InputError(
-        f"{path} lacks its index (moov), or part of it: the recording or the copy was broken off; copy it anew, or "
-        "restore it with untrunc and a whole video of the same camera"
-    )
+    kinds = [box.kind for box in boxes(file, size) if box.end <= size]
+    if b"moov" not in kinds:
+        raise InputError(
+            f"{path} lacks its index (moov), or part of it: the recording or the copy was broken off; copy it anew, or "
+            "restore it with untrunc and a whole video of the same camera"
+        )
+    if kinds.count(b"moov") > 1 and b"moof" not in kinds:
+        yield (
+            f"{path} holds {kinds.count(b'moov')} videos one after the other, of which the first alone is read; join "
+            "the original files with ffmpeg -f concat -i LIST.txt -c copy OUTPUT.mp4"
+        )
 
 
 def _address(path: str | Path) -> str:
