@@ -1128,6 +1128,19 @@ def test_what_is_no_video_is_refused_in_one_line(tmp_path: Path, library: str, n
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("option", [{"pattern": "*.jpg"}, {"size_mismatch": "crop"}])
+def test_options_of_images_are_refused(tmp_path: Path, option: dict[str, str]) -> None:
+    write(tmp_path / "walk.mp4", [grey(0)] * 2)
+    (name,) = option
+    for path, called in (
+        (tmp_path / "walk.mp4", "walk.mp4"),
+        ("0", "camera 0"),
+        ("rtsp://me:secret@a.b/c", "rtsp://a.b/c"),
+    ):
+        with pytest.raises(InputError, match=f"^{name} is for files of images, which .*{called} is not: leave it out$"):
+            open_source(path, **option)
+
+
 @pytest.mark.parametrize("path", ["nul\0.mp4", "~no_such_user_here/clip.mp4"])
 def test_what_is_no_path_is_refused(path: str) -> None:
     with pytest.raises(InputError, match="is no path"):

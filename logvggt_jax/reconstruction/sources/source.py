@@ -55,7 +55,7 @@ class SourceOptions:
       start, end: seconds of the video; None for its beginning and end.
       pattern: glob that names of image files have to match; None for all.
       size_mismatch: what happens to images of several sizes: `error`, `crop` (all are cut from their centre to the
-        smallest height and the smallest width) or `skip` (the most frequent size stays).
+        smallest height and the smallest width) or `skip` (the most frequent size stays). As `pattern` not for videos.
       strict: a frame that cannot be read is an error. Otherwise it is left out and listed.
       most_broken: the share of the frames that may be left out so; two always may.
     """

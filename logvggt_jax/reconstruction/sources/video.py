@@ -37,6 +37,8 @@ _TIMEOUT = 10.0
 _STREAM_RATE = 30.0
 # Brands of files that are built like an mp4 but hold pictures.
 _PICTURES = (b"heic", b"heix", b"hevc", b"mif1", b"msf1", b"avif", b"avis")
+# Options that say nothing of a video.
+_OF_IMAGES = ("pattern", "size_mismatch")
 
 
 def is_live(path: str | Path) -> bool:
@@ -63,8 +65,9 @@ class VideoSource(Source):
 
     Raises:
       MissingInput: a frame without a mask, where there are masks.
-      InputError: the file cannot be opened as a video, or nothing of it can be decoded; while iterating, the size of
-        the pictures changes, too many frames cannot be decoded, or no frame lies where the options ask for it.
+      InputError: the file cannot be opened as a video, or nothing of it can be decoded; an option is for images; while
+        iterating, the size of the pictures or the codec changes, too many frames cannot be decoded, or no frame lies
+        where the options ask for it.
     """
 
     def __init__(self, path: str | Path, options: SourceOptions, masks: Masks | None = None) -> None:
@@ -72,6 +75,11 @@ class VideoSource(Source):
         self._live = is_live(path)
         self.name = re.sub(r"(?<=://)[^/@]*:[^/@]*@", "", _address(path))
         self._header: VideoHeader | None = None
+        if self._live and str(path).isdecimal():
+            self.name = f"camera {path}"
+        for option in _OF_IMAGES:
+            if getattr(options, option) != getattr(SourceOptions, option):
+                raise InputError(f"{option} is for files of images, which {self.name} is not: leave it out")
         if not self._live:
             self.notes += _check_file(self.path)
             self._decoder = _decoder(self.path, self.name)
@@ -85,7 +93,6 @@ class VideoSource(Source):
         if masks is not None:
             masks.check_live()
         if str(path).isdecimal():
-            self.name = f"camera {path}"
             self._decoder = OpenCVDecoder(int(str(path)), self.name)
         else:
             self._decoder = _decoder(_address(path), self.name, _TIMEOUT)
