@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from logvggt_jax.errors import InputError
+from logvggt_jax.errors import InputError, MissingInput
 from logvggt_jax.reconstruction.sources import (
     SourceFrame,
     SourceOptions,
@@ -1145,6 +1145,31 @@ def test_options_of_images_are_refused(tmp_path: Path, option: dict[str, str]) -
 def test_what_is_no_path_is_refused(path: str) -> None:
     with pytest.raises(InputError, match="is no path"):
         open_source(path)
+
+
+@pytest.mark.parametrize(
+    ("given", "shown"),
+    [
+        ("ftp://me:secret@127.0.0.1/x.mp4", "ftp://127.0.0.1/x.mp4"),
+        (Path("s3://walks/a.jpg"), "s3://walks/a.jpg"),
+        ("file://server/x.mp4", "file://server/x.mp4"),
+    ],
+)
+def test_addresses_of_which_nothing_is_read_are_refused(given: str | Path, shown: str) -> None:
+    with pytest.raises(InputError, match=f"^{shown} is neither a file nor an address .* begins with rtsp, .* or mms:"):
+        open_source(given)
+
+
+def test_the_address_of_a_file_that_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(MissingInput, match=rf"^{tmp_path}/x\.mp4 does not exist"):
+        open_source(f"file://{tmp_path}/x.mp4")
+
+
+def test_a_folder_that_looks_like_an_address_is_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "ftp:").mkdir()
+    write(tmp_path / "ftp:" / "walk.mp4", [grey(i) for i in range(3)])
+    assert len(list(open_source("ftp:/walk.mp4"))) == 3
 
 
 @pytest.mark.parametrize("name", ["a:b.mp4", "100%d.mp4", "übung 漢字.mp4", "-i.mp4", "file:x.mp4", "q?x=1#y.mp4"])

@@ -14,7 +14,7 @@ from logvggt_jax.reconstruction.sources.listing import names_pictures
 from logvggt_jax.reconstruction.sources.masks import Masks
 from logvggt_jax.reconstruction.sources.pictures import IMAGE_SUFFIXES
 from logvggt_jax.reconstruction.sources.source import SkippedFrame, Source, SourceFrame, SourceOptions
-from logvggt_jax.reconstruction.sources.video import VideoSource, is_live
+from logvggt_jax.reconstruction.sources.video import VideoSource, is_live, refuse_address
 
 __all__ = ["FolderSource", "SkippedFrame", "Source", "SourceFrame", "SourceOptions", "VideoSource", "open_source"]
 
@@ -45,7 +45,7 @@ def open_source(path: str | Path, *, masks: str | Path | None = None, **options:
     if not str(path):
         raise InputError(f"{EMPTY_PATH}: {_EXPECTED}")
     if (address := _FILE_ADDRESS.fullmatch(str(path))) and not Path(path).exists():
-        path = unquote(address[1])
+        given = path = unquote(address[1])
     try:
         path = Path(path).expanduser()
         pictures = names_pictures(path)
@@ -53,6 +53,7 @@ def open_source(path: str | Path, *, masks: str | Path | None = None, **options:
             with disk_errors(path):
                 path.stat()
     except MissingInput as error:
+        refuse_address(given)
         raise MissingInput(f"{path} does not exist: {_EXPECTED}") from error
     except (RuntimeError, ValueError) as error:
         # No such user, or a null character.

@@ -28,7 +28,10 @@ from logvggt_jax.reconstruction.sources.source import (
     fingerprint,
 )
 
-_STREAM = re.compile(r"(rtsps?|rtmps?|https?|udp|tcp|rtp|srt|mms):/{1,2}(?=[^/])", re.IGNORECASE)
+_SCHEMES = ("rtsp", "rtsps", "rtmp", "rtmps", "http", "https", "udp", "tcp", "rtp", "srt", "mms")
+# A `Path` keeps one slash only.
+_STREAM = re.compile(rf"({'|'.join(_SCHEMES)}):/{{1,2}}(?=[^/])", re.IGNORECASE)
+_ADDRESS = re.compile(r"([a-z][a-z0-9+.-]+):/{1,2}(?=[^/])", re.IGNORECASE)
 # The releases of PyAV whose interface is known; the extra `video` asks for one of them.
 _PYAV_MAJORS = ("18", "19")
 # Seconds until a network stream that says nothing is given up.
@@ -46,6 +49,16 @@ def is_live(path: str | Path) -> bool:
     text = str(path)
     digits = text.isdecimal() and text.isascii()
     return (digits or _STREAM.match(text) is not None) and not Path(text).exists()
+
+
+def refuse_address(path: str | Path) -> None:
+    """Raises InputError if what is neither a file nor a stream is an address, such as `ftp://…`."""
+    if _ADDRESS.match(str(path)):
+        address = _without_password(_ADDRESS.sub(r"\1://", str(path), count=1))
+        raise InputError(
+            f"{address} is neither a file nor an address that is read, which begins with {', '.join(_SCHEMES[:-1])} or "
+            f"{_SCHEMES[-1]}: fetch it beforehand"
+        )
 
 
 class VideoSource(Source):
@@ -73,7 +86,7 @@ class VideoSource(Source):
     def __init__(self, path: str | Path, options: SourceOptions, masks: Masks | None = None) -> None:
         super().__init__(Path(path), options, masks)
         self._live = is_live(path)
-        self.name = re.sub(r"(?<=://)[^/@]*:[^/@]*@", "", _address(path))
+        self.name = _without_password(_address(path))
         self._header: VideoHeader | None = None
         if self._live and str(path).isdecimal():
             self.name = f"camera {path}"
@@ -304,6 +317,10 @@ def _check_index(path: Path, file: BinaryIO, size: int) -> Iterator[str]:
         )
 
 
+def _without_password(address: str) -> str:
+    return re.sub(r"(?<=://)[^/@]*:[^/@]*@", "", address)
+
+
 def _address(path: str | Path) -> str:
-    """The path as text; of a stream's address, of which `Path` keeps one slash only, with both."""
+    """The path as text; a stream's address with both its slashes."""
     return _STREAM.sub(r"\1://", str(path), count=1) if is_live(path) else str(path)
