@@ -909,9 +909,14 @@ def test_a_matroska_video_cut_short_says_so(tmp_path: Path, library: str) -> Non
         assert len(list(open_source(path, most_broken=1.0))) >= 10
 
 
-def test_an_mxf_video_cut_short_says_so(tmp_path: Path) -> None:
+def test_an_mxf_video_cut_short_says_so(tmp_path: Path, library: str) -> None:
     path = write(tmp_path / "cut.mxf", [busy(i) for i in range(24)], codec="mpeg2video", rate=25)
     assert len(list(open_source(path))) == 24
+    end = packets(path)[-1]
+    # Without its index at the end, but whole pictures.
+    path.write_bytes(path.read_bytes()[: end[0] + 20 + end[1]])
+    source = open_source(path)
+    assert len(list(source)) == 24 and not source.skipped
     path.write_bytes(path.read_bytes()[: packets(path)[12][0]])
     with pytest.warns(UserWarning, match=r"ends early: 0\.4\d* s decoded, its header announces 0\.96 s"):
         assert len(list(open_source(path, most_broken=1.0))) >= 10

@@ -45,6 +45,8 @@ _FRAME_A_PACKET = (
     *(b"mpg1", b"mpg2"),
 )
 _EMPTY_PACKET = 8
+# What files begin with that may lack presentation times: AVI and MXF.
+_LACK_TIMES = (b"RIFF", b"\x06\x0e\x2b\x34")
 # Errors in a row after which nothing more is to be read.
 _MOST_ERRORS = 64
 
@@ -69,7 +71,7 @@ class PacketReader:
     """The packets of a file in the order in which they are stored.
 
     Attributes:
-      frame_each: each is known to show one frame. AVI states no presentation times.
+      frame_each: each is known to show one frame. AVI states no presentation times, nor does MXF without its index.
 
     Args:
       source: the file's absolute path.
@@ -79,7 +81,7 @@ class PacketReader:
         self._capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
         self._codec = (int(self._capture.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF).to_bytes(4, "little").lower()
         with Path(source).open("rb") as file:
-            self.frame_each = self._codec in _FRAME_A_PACKET and file.read(4) != b"RIFF"
+            self.frame_each = self._codec in _FRAME_A_PACKET and file.read(4) not in _LACK_TIMES
 
     def __iter__(self) -> Iterator[Packet | None]:
         """None stands for one that cannot be read."""
