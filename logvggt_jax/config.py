@@ -76,20 +76,23 @@ def to_mapping(config: Any) -> dict[str, Any]:
 
 
 def require_counts(config: Any, *names: str, least: int = 1) -> None:
-    """Raises InputError unless these fields are whole numbers of at least `least`; None passes, where a type allows."""
+    """Raises InputError unless these fields are whole numbers of at least `least`, or None where their type allows."""
     kind = "a positive integer" if least == 1 else f"an integer of at least {least}"
     for name in names:
         value = getattr(config, name)
-        if value is not None and (not _is_number(value, numbers.Integral) or value < least):
+        if value is None and _may_be_none(config, name):
+            continue
+        if not _is_number(value, numbers.Integral) or value < least:
             raise InputError(f"{type(config).__name__}.{name} must be {kind}, got {value!r}")
 
 
 def require_within(config: Any, interval: str, *names: str) -> None:
-    """Raises InputError unless these fields lie in an interval such as "[0, 1)" or "(0, inf)"; None passes."""
+    """Raises InputError unless these fields lie in an interval such as "[0, 1)" or "(0, inf)", or are None where their
+    type allows."""
     low, high = (float(bound) for bound in interval[1:-1].split(","))
     for name in names:
         value = getattr(config, name)
-        if value is None:
+        if value is None and _may_be_none(config, name):
             continue
         number = _is_number(value, numbers.Real)
         above = number and (value >= low if interval[0] == "[" else value > low)
@@ -106,6 +109,11 @@ def require_one_of(config: Any, choices: Sequence[Any], *names: str) -> None:
             raise InputError(
                 f"{type(config).__name__}.{name} must be one of {', '.join(map(repr, choices))}, got {value!r}"
             )
+
+
+def _may_be_none(config: Any, name: str) -> bool:
+    # A string where the module postpones annotations.
+    return "None" in str(next(field.type for field in dataclasses.fields(config) if field.name == name))
 
 
 def check_size(size: Sequence[int], what: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -123,7 +124,8 @@ def test_wrong_usage_exits_with_2(arguments: list[str], capsys: pytest.CaptureFi
     with pytest.raises(SystemExit) as exit_:
         main(arguments)
     assert exit_.value.code == 2
-    assert "usage: logvggt" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert re.fullmatch(r"logvggt.*: error: .*; `logvggt.* --help` tells how it is used\n", said), said
 
 
 def test_module_runs_as_a_program() -> None:
@@ -172,7 +174,7 @@ def test_from_a_room_to_a_point_cloud_and_exports_of_which_one_fails(
     assert_fails(capsys, ["export", str(output), "--format", "tum"], "cameras.json", "'logvggt-cameras-9'")
 
 
-@pytest.mark.filterwarnings("ignore:.*field of view", "always:these weights are public")
+@pytest.mark.filterwarnings("ignore:.*field of view", "always:these weights are")
 def test_public_weights_run_in_chunks_unless_told_otherwise(
     small_config: ModelConfig, small_variables: dict, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -434,7 +436,7 @@ def test_view_saves_a_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
         (["reconstruct", "1.jpg", "2.jpg", "--output", "o", "--checkpoint", "rooms"], r"put a pattern in quotes"),
         (
             ["reconstruct", "1.jpg", "3.jpg", "--output", "o", "--checkpoint", "rooms"],
-            "unrecognized arguments: 3.jpg\n",
+            "unrecognized arguments: 3.jpg; `logvggt --help`",
         ),
     ],
 )

@@ -133,18 +133,21 @@ def test_missing_fields_are_named_with_what_they_should_be() -> None:
 def test_intervals_are_those_of_mathematics(
     interval: str, inside: tuple[float, ...], outside: tuple[float, ...]
 ) -> None:
-    for value in (*inside, None):
-        require_within(types.SimpleNamespace(x=value), interval, "x")
-    for value in (*outside, math.nan, "1", True):
-        with pytest.raises(InputError, match=r"SimpleNamespace\.x must lie in"):
-            require_within(types.SimpleNamespace(x=value), interval, "x")
+    optional, needed = (dataclasses.make_dataclass("Settings", [("x", kind)]) for kind in (float | None, float))
+    require_within(optional(None), interval, "x")
+    for value in inside:
+        require_within(needed(value), interval, "x")
+    for value in (*outside, math.nan, "1", True, None):
+        with pytest.raises(InputError, match=r"Settings\.x must lie in"):
+            require_within(needed(value), interval, "x")
 
 
 def test_counts_and_choices() -> None:
-    require_counts(types.SimpleNamespace(a=1, b=None), "a", "b")
-    for value in (0, True, 1.0, "1"):
-        with pytest.raises(InputError, match="must be a positive integer"):
-            require_counts(types.SimpleNamespace(a=value), "a")
+    settings = dataclasses.make_dataclass("Settings", [("a", int), ("b", "int | None")])
+    require_counts(settings(1, None), "a", "b")
+    for value in (0, True, 1.0, "1", None):
+        with pytest.raises(InputError, match=r"Settings\.a must be a positive integer"):
+            require_counts(settings(value, 1), "a")
     require_one_of(types.SimpleNamespace(a="x"), ("x", "y"), "a")
     with pytest.raises(InputError, match="must be one of 'x', 'y', got 'z'"):
         require_one_of(types.SimpleNamespace(a="z"), ("x", "y"), "a")

@@ -7,6 +7,7 @@ import traceback
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NoReturn
 
 from logvggt_jax.cli import data, doctor, live, models, reconstruct, results
 from logvggt_jax.cli.exit_codes import BAD_INPUT, OUTPUT_LOST
@@ -57,7 +58,7 @@ def _run(arguments: Sequence[str]) -> int:
 
 def command_parser() -> argparse.ArgumentParser:
     """The parser of the whole command line; the function that runs a command is the value of `run`."""
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="logvggt",
         description="LoG-VGGT in JAX: camera poses, depth and point clouds from image sequences of any length.",
         epilog="`logvggt COMMAND --help` shows a command's options and an example.",
@@ -68,6 +69,13 @@ def command_parser() -> argparse.ArgumentParser:
     for module in (models, reconstruct, live, results, data, doctor):
         module.add_to(commands)
     return parser
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says in one line what is wrong; its commands are of this kind, too."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(BAD_INPUT, f"{self.prog}: error: {message}; `{self.prog} --help` tells how it is used\n")
 
 
 def _unquoted(unknown: Sequence[str]) -> str:

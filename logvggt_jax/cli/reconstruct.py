@@ -73,7 +73,10 @@ def _reconstruct(options: argparse.Namespace) -> int:
     if options.precision and (note := check_precision(options.precision)):
         source.notes.append(note)
     enable_compilation_cache(options.compilation_cache)
-    method = choose_method(provenance, None if options.method == "auto" else options.method)
+    asked = None if options.method == "auto" else options.method
+    if asked is not None:
+        _settings(options, asked)  # an error of theirs is told before what is to be expected of the method
+    method = choose_method(provenance, asked)
     check_masks(source, method)
     settings = _settings(options, method)
     decides = what_decides(source, config, method, settings, longer_edge, point_filter, calibration)

@@ -53,6 +53,7 @@ def move(prediction: PlainPrediction, similarity: Similarity) -> PlainPrediction
         depth=(similarity.scale * prediction.depth).astype(np.float32),
         extrinsics=similarity.apply_to_extrinsics(prediction.extrinsics).astype(np.float32),
         points=None if points is None else similarity.apply(points).astype(np.float32),
+        pose_encoding=None,
     )
 
 

@@ -112,7 +112,8 @@ def _predict(model: LogVGGT, variables: Variables, images: jax.Array, merging: T
     out = windows.decode_dense(variables, tokens, mask, size)
     encodings = model.refinement.refine_sequence(variables, out.camera_tokens, out.register_tokens, mask)
     extrinsics, intrinsics = decode_poses(encodings[:, :, -1], size)
-    arrays: Any = (out.depth, out.depth_confidence, extrinsics, intrinsics, out.points, out.points_confidence)
+    dense: Any = (out.points, out.points_confidence)
+    arrays: Any = (out.depth, out.depth_confidence, extrinsics, intrinsics, *dense, encodings[:, :, -1])
     return jax.tree.map(lambda x: x[0], PlainPrediction(*arrays))
 
 

@@ -37,6 +37,7 @@ class PlainPrediction(NamedTuple):
       intrinsics: [n, 3, 3], pixels of the images.
       points: [n, H, W, 3] in the world; None without point head.
       points_confidence: [n, H, W]; None without point head.
+      pose_encoding: [n, 9], the camera head's own, of which the cameras are; None where they were moved since.
     """
 
     depth: np.ndarray
@@ -45,6 +46,7 @@ class PlainPrediction(NamedTuple):
     intrinsics: np.ndarray
     points: np.ndarray | None = None
     points_confidence: np.ndarray | None = None
+    pose_encoding: np.ndarray | None = None
 
 
 def plain_vggt(model: LogVGGT, num_frames: int) -> LogVGGT:
@@ -107,7 +109,9 @@ class FinalFrames:
         if prediction is None:
             return []
         first, size = len(self), prediction.depth.shape[1:]
-        encodings = encode_poses(prediction.extrinsics, prediction.intrinsics, size).astype(np.float32)
+        encodings = prediction.pose_encoding
+        if encodings is None:
+            encodings = encode_poses(prediction.extrinsics, prediction.intrinsics, size).astype(np.float32)
         self._encodings += list(encodings)
         self._extrinsics += list(prediction.extrinsics)
         self._intrinsics += list(prediction.intrinsics)

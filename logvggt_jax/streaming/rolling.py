@@ -60,7 +60,8 @@ class RollingSettings:
         require_one_of(self, CAMERA_CACHES, "camera_cache")
         require_counts(self, "budget", "first_capacity")
         require_within(self, "[1, 2147483647]", "budget", "first_capacity")
-        require_within(self, "(0, inf)", "temperature")
+        # Scores over less leave the numbers of float32.
+        require_within(self, "[1e-6, inf)", "temperature")
         require_counts(self, "anchor", "ahead", least=0)
 
 

@@ -8,8 +8,9 @@ from logvggt_jax.streaming.predictor import METHODS
 _EXPECT: dict[tuple[str | None, str], str] = {
     ("vggt", "windows"): "these weights are public VGGT's, which never learned to pass the first camera on from window "
     "to window: cameras and depth of a sequence longer than one window will be wrong",
-    ("vggt", "causal"): "these weights are public VGGT's, where every frame saw all others, and {method} shows a frame "
-    "earlier ones alone: cameras and depth get worse from the first frame on",
+    ("vggt", "causal"): "these weights are taken for public VGGT's (StreamVGGT's, whose files look the same, are known "
+    "once converted with --trained-for causal), where every frame saw all others, and {method} shows a frame earlier "
+    "ones alone: cameras and depth get worse from the first frame on",
     ("windows", "vggt"): "these weights were trained on windows with memory between them, and {method} shows them more "
     "frames at once than they have ever seen: expect worse cameras and depth",
     ("windows", "causal"): "these weights were trained on windows with memory between them at the key layers, and "

@@ -28,12 +28,13 @@ from logvggt_jax.training.parallel.agreement import (
     any_process,
     check_agreement,
     check_shared,
+    from_all,
     raise_together,
 )
 from logvggt_jax.training.parallel.same_settings import check_same_parameters, check_same_settings
 from logvggt_jax.training.parallel.sharding import check_batch_size
 from logvggt_jax.training.parallel.watchdog import Watchdog
-from logvggt_jax.training.reporting.intervals import report_interval
+from logvggt_jax.training.reporting.intervals import own_facts, report_interval
 from logvggt_jax.training.reporting.metrics_log import MetricsLog, read_metrics
 from logvggt_jax.training.reporting.profile import ProfiledSteps, Profiler
 from logvggt_jax.training.reporting.progress import duration, goodput
@@ -328,17 +329,10 @@ class _Run:
 
     def _log(self, step: int, end: int, stage: StageConfig, broken_clips: int, log: MetricsLog) -> None:
         """One line about the steps since the last one, all of which have finished."""
-        report_interval(
-            log,
-            step,
-            self.in_flight.means.read(),
-            self.times,
-            config=self.config,
-            stage=stage,
-            end=end,
-            broken_clips=broken_clips,
-            memory=most_device_bytes(self.mesh.local_devices),
-        )
+        speed = self.times.read(stage)
+        own = own_facts(speed, broken_clips=broken_clips, memory=most_device_bytes(self.mesh.local_devices))
+        values = self.in_flight.means.read()
+        report_interval(log, step, values, self.times, speed, from_all(own), config=self.config, stage=stage, end=end)
 
     def _validation_is_due(self, step: int) -> bool:
         every = None if self.config.validation is None else self.config.validation.every

@@ -18,6 +18,7 @@ from logvggt_jax.streaming import (
     AnchoredWindowSettings,
     CausalSettings,
     FrameResult,
+    MergedSettings,
     PrunedSettings,
     RollingSettings,
     frame_session,
@@ -69,6 +70,9 @@ def test_causal_on_one_frame_is_vggt_on_one_frame(
     offline.push(IMAGES[0])
     (whole,) = offline.close()
     np.testing.assert_allclose(causal[0].depth, whole.depth, rtol=2e-4)
+    # As the camera head gave it, quaternion and field of view as they are, whoever asks.
+    np.testing.assert_allclose(causal[0].pose_encoding, whole.pose_encoding, rtol=0, atol=2e-5)
+    np.testing.assert_array_equal(offline.cameras().pose_encoding[0], whole.pose_encoding)
     stream = opened("causal", small_config, small_variables, CausalSettings(ahead=0))
     assert len(stream.push(IMAGES[0])) == 1, "with nothing ahead a frame's results come at once"
     np.testing.assert_allclose(stream.cameras().extrinsics, offline.cameras().extrinsics, atol=2e-5)
@@ -300,6 +304,12 @@ def test_a_layer_whose_budget_exceeds_its_share_gets_room(small_config: ModelCon
         (lambda: RollingSettings(budget=0), "RollingSettings.budget must be a positive integer, got 0"),
         (lambda: RollingSettings(budget=2**31), "RollingSettings.budget must lie in"),
         (lambda: RollingSettings(temperature=0.0), "RollingSettings.temperature must lie in"),
+        (lambda: RollingSettings(temperature=1e-38), "RollingSettings.temperature must lie in"),
+        (lambda: RollingSettings(temperature=None), "RollingSettings.temperature must lie in"),
+        (lambda: RollingSettings(budget=None), "RollingSettings.budget must be a positive integer, got None"),
+        (lambda: PrunedSettings(cap=None), "PrunedSettings.cap must be a positive integer, got None"),
+        (lambda: AnchoredWindowSettings(window=None), "AnchoredWindowSettings.window must be a positive integer, got"),
+        (lambda: MergedSettings(ratio=None), "MergedSettings.ratio must lie in"),
         (lambda: RollingSettings(anchor=-1), "RollingSettings.anchor must be an integer of at least 0, got -1"),
     ],
 )

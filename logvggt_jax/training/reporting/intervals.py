@@ -8,10 +8,15 @@ from collections.abc import Mapping
 import numpy as np
 
 from logvggt_jax.training.config import StageConfig, TrainConfig
-from logvggt_jax.training.parallel.agreement import from_all
 from logvggt_jax.training.reporting.metrics_log import COST, MetricsLog
 from logvggt_jax.training.reporting.progress import progress_line
-from logvggt_jax.training.reporting.run_times import RunTimes
+from logvggt_jax.training.reporting.run_times import RunTimes, Speed
+
+
+def own_facts(speed: Speed, *, broken_clips: int, memory: int | None) -> np.ndarray:
+    """float32 [3]: what a process tells the others of an interval: its waiting for clips, the clips that it has
+    replaced so far, and the most bytes that a device of it held, NaN where that is not known."""
+    return np.array([speed.data_share, broken_clips, math.nan if memory is None else memory], np.float32)
 
 
 def report_interval(
@@ -19,22 +24,20 @@ def report_interval(
     step: int,
     values: Mapping[str, float],
     times: RunTimes,
+    speed: Speed,
+    facts: np.ndarray,
     *,
     config: TrainConfig,
     stage: StageConfig,
     end: int,
-    broken_clips: int,
-    memory: int | None,
 ) -> None:
-    """Ends the interval of `times` with `step`, which has finished as all before it have, and says what it was like.
+    """Says what the interval was like that `step` has ended, which has finished as all before it have.
 
-    `values` are its means, `stage` is the one that its steps belong to, with `end` its last step. Of `broken_clips`,
-    which this process has replaced, the sum over all processes is told, of `memory`, the most bytes that a device of
-    this one held, and of the waiting for clips the largest. All processes have to call it at the same point.
+    `values` are its means and `speed` is its, as `times` told; `stage` is the one that its steps belong to, with `end`
+    its last step. Of the `facts` of all processes, [processes, 3] as `own_facts` gives them, the longest waiting, the
+    sum of the broken clips and the fullest device are told.
     """
-    speed = times.read(stage)
-    own = (speed.data_share, broken_clips, math.nan if memory is None else memory)
-    shares, broken, held = from_all(np.array(own, np.float32)).T
+    shares, broken, held = facts.T
     speed = speed._replace(data_share=float(shares.max()))
     waited = int(shares.argmax()) if len(shares) > 1 else None
     memory = None if np.isnan(held).all() else int(np.nanmax(held))

@@ -92,11 +92,7 @@ def test_means_are_of_finite_values_and_counters_are_the_last() -> None:
     assert math.isnan(means.read()["loss/total"])
 
 
-def test_a_line_tells_of_all_processes(
-    config: TrainConfig, clock: Clock, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    others = [[0.5, 2.0, 3.0 * 2**30], [0.0, 0.0, math.nan]]
-    monkeypatch.setattr(intervals, "from_all", lambda own: np.stack([own, *np.array(others, own.dtype)]))
+def test_a_line_tells_of_all_processes(config: TrainConfig, clock: Clock, tmp_path: Path) -> None:
     times = RunTimes(config)
     times.count()
     with times.waiting():
@@ -105,9 +101,13 @@ def test_a_line_tells_of_all_processes(
     shown = io.StringIO()
     values = {"loss/total": 1.0, "train/abs_rel": 0.1, "train/rotation_over_identity": 0.9, "learning_rate": 3e-4}
     values |= {"train/translation_direction": 50.0}
-    options = {"config": config, "stage": config.stages[0], "end": 100, "broken_clips": 1, "memory": 2**30}
+    options = {"config": config, "stage": config.stages[0], "end": 100}
+    speed = times.read(config.stages[0])
+    facts = [intervals.own_facts(speed, broken_clips=1, memory=2**30)]
+    for share, broken, memory in ((0.5, 2, 3 * 2**30), (0.0, 0, None)):
+        facts.append(intervals.own_facts(speed._replace(data_share=share), broken_clips=broken, memory=memory))
     with MetricsLog(tmp_path, first_step=0, console=Console(file=shown, width=1000)) as log:
-        intervals.report_interval(log, 1, values, times, **options)
+        intervals.report_interval(log, 1, values, times, speed, np.stack(facts), **options)
     assert "waiting for data 50% (process 1), memory 3.0 GiB" in shown.getvalue()
     assert read_metrics(tmp_path / FILE_NAME)[-1]["broken_clips"] == 3.0
     assert read_metrics(tmp_path / TIMES_NAME)[-1]["data_share"] == 0.5
