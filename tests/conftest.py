@@ -88,7 +88,7 @@ SPAWNED = ("data.feeding.batches", "data.registry", "evaluation.records", "recon
 # Bytes of a test process at its peak: laptops of 8 GB run two.
 MOST_MEMORY = 2_500_000_000
 # Bytes held after a file at which what is compiled is dropped; dropping it after every file took half a minute.
-MUCH_MEMORY = 1_900_000_000
+MUCH_MEMORY = 1_500_000_000
 # Bytes that have to be free for temporary files, three times what a whole run writes.
 LEAST_ROOM = 2_000_000_000
 SHARED = Path(os.environ.get("LOGVGGT_SHARED", Path(__file__).parents[2] / "shared"))
