@@ -41,7 +41,7 @@ class RunTimes:
         costs: Mapping[str, float] | None = None,
         peak: float | None = None,
     ) -> None:
-        """Args: `costs` are those that an earlier session found, `peak` operations a second of all devices at their
+        """Args: `costs` are those that an earlier start found, `peak` operations a second of all devices at their
         best."""
         self.productive = productive
         self._config, self._peak = config, peak
@@ -92,7 +92,7 @@ class RunTimes:
 
     @property
     def costs(self) -> dict[str, float]:
-        """Seconds that one of each kind of `other` takes: the mean of this session, else that of the one before."""
+        """Seconds that one of each kind of `other` takes: the mean since the start, else that of the start before."""
         return self._earlier | {kind: sum(seconds) / len(seconds) for kind, seconds in self._others.items()}
 
     def remaining_seconds(self, step: int, end: int | None = None, *, compilations: int = 0) -> float:
