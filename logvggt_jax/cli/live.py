@@ -48,7 +48,7 @@ def _live(options: argparse.Namespace) -> int:
         if (count := getattr(options, name)) is not None and count < 1:
             raise InputError(f"--{name.replace('_', '-')} must be at least 1, got {count}")
     check_watch(options)
-    recording, calibration = None, Calibration(options.intrinsics, options.shared_intrinsics)
+    target, recording, calibration = None, None, Calibration(options.intrinsics, options.shared_intrinsics)
     if options.output is not None:
         target = check_request(
             source,
@@ -57,12 +57,13 @@ def _live(options: argparse.Namespace) -> int:
             overwrite=options.overwrite,
             calibration=calibration,
         )
-        check_apart(target, [resolve(options.checkpoint)])
         recording = Recording(options.output, calibration=calibration, overwrite=options.overwrite)
     elif calibration != Calibration():
         raise InputError("--intrinsics and --shared-intrinsics are of a result: give --output, too")
     online = OnlineSettings(options.period, options.context, options.max_registers)
     checkpoint = resolve(options.checkpoint)
+    if target is not None:
+        check_apart(target, [checkpoint])
     provenance = read_provenance(checkpoint)
     if doubt := expectation(provenance.trained_for, "windows"):
         warnings.warn(doubt, stacklevel=1)
