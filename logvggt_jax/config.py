@@ -58,7 +58,7 @@ def from_mapping(cls: type[Config], values: Any, path: str) -> Config:
         optional = field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
         if name not in values and not optional:
             raise InputError(f"missing field {_joined(path, name)}, {_described(hints[name])}; {known}")
-    arguments = {name: _read(hints[name], value, _joined(path, name)) for name, value in values.items()}
+    arguments = {name: typed(hints[name], value, _joined(path, name)) for name, value in values.items()}
     try:
         return cls(**arguments)
     except InputError as error:
@@ -135,8 +135,9 @@ def freeze_lists(config: Any) -> None:
         object.__setattr__(config, field.name, _frozen(getattr(config, field.name)))
 
 
-def _read(hint: Any, value: Any, path: str) -> Any:
-    """`value` as the type `hint`; InputError where it is another."""
+def typed(hint: Any, value: Any, path: str) -> Any:
+    """`value` as the type `hint`, of those that `from_mapping` reads; InputError, which calls it `path`, where it is
+    another."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if hint is Any:
         return _frozen(value)
@@ -145,10 +146,10 @@ def _read(hint: Any, value: Any, path: str) -> Any:
             return None
         others = [other for other in arguments if other is not types.NoneType]
         if len(others) == 1 and (dataclasses.is_dataclass(others[0]) or typing.get_origin(others[0])):
-            return _read(others[0], value, path)  # whose message says which part is wrong
+            return typed(others[0], value, path)  # whose message says which part is wrong
         for other in others:
             with contextlib.suppress(InputError):
-                return _read(other, value, path)
+                return typed(other, value, path)
     elif dataclasses.is_dataclass(hint) and isinstance(hint, type):
         return value if isinstance(value, hint) else from_mapping(hint, value, path)
     elif origin is tuple and arguments[-1] is Ellipsis and isinstance(value, Mapping):
@@ -156,10 +157,10 @@ def _read(hint: Any, value: Any, path: str) -> Any:
     elif origin is tuple and isinstance(value, list | tuple):
         items = [arguments[0]] * len(value) if arguments[-1] is Ellipsis else arguments
         if len(items) == len(value):
-            return tuple(_read(items[i], part, f"{path}[{i}]") for i, part in enumerate(value))
+            return tuple(typed(items[i], part, f"{path}[{i}]") for i, part in enumerate(value))
     elif origin is not None and isinstance(origin, type) and issubclass(origin, Mapping):
         if isinstance(value, Mapping):
-            return {key: _read(arguments[1], part, _joined(path, key)) for key, part in value.items()}
+            return {key: typed(arguments[1], part, _joined(path, key)) for key, part in value.items()}
     elif origin is typing.Literal:
         if value in arguments:
             return value
@@ -178,12 +179,12 @@ def _read_named(item: Any, values: Mapping[str, Any], path: str) -> tuple[Any, .
         for name, fields in values.items():
             if not isinstance(fields, Mapping):
                 raise InputError(f"{_joined(path, name)} must be {_described(item)}, got {fields!r}")
-        return tuple(_read(item, {"name": name, **fields}, _joined(path, name)) for name, fields in values.items())
+        return tuple(typed(item, {"name": name, **fields}, _joined(path, name)) for name, fields in values.items())
     pair = typing.get_args(item)
     if typing.get_origin(item) is not tuple or len(pair) != 2 or Ellipsis in pair:
         raise InputError(f"{path} must be {_described(tuple[item, ...])}, got {values!r}")
     return tuple(
-        (_read(pair[0], name, path), _read(pair[1], value, _joined(path, name))) for name, value in values.items()
+        (typed(pair[0], name, path), typed(pair[1], value, _joined(path, name))) for name, value in values.items()
     )
 
 

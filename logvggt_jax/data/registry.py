@@ -1,10 +1,12 @@
 """Data sets by name."""
 
 import inspect
-from collections.abc import Collection
+import typing
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from logvggt_jax.config import typed
 from logvggt_jax.data.dataset import Reader
 from logvggt_jax.data.packed.index import is_packed
 from logvggt_jax.data.readers.arkitscenes import ARKitScenes
@@ -77,7 +79,7 @@ def open_dataset(name: str, root: str | Path | None, split: str = "all", **optio
       InputError: unknown name or option, a split that the set does not have, or a wrong `root`.
       MissingFiles: the folder or a file in it is missing; named.
     """
-    check_options(name, options)
+    options = checked_options(name, options)
     reader = READERS[name]
     if root is not None and is_packed(root):
         # Grain, which reads shards, takes a second to load.
@@ -94,11 +96,17 @@ def open_dataset(name: str, root: str | Path | None, split: str = "all", **optio
     return make(root=root, split=split, **options)
 
 
-def check_options(name: str, options: Collection[str]) -> None:
-    """Raises InputError for an unknown data set, or names of options that its reader does not have."""
+def checked_options(name: str, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Options of a data set's reader, each as the type that the reader has for it.
+
+    Raises InputError for an unknown data set, for names of options that its reader does not have, and for values of
+    another type.
+    """
     if name not in READERS:
         raise InputError(f"unknown data set {name!r}: choose one of {', '.join(DATASETS)}")
     known = [option for option in inspect.signature(READERS[name]).parameters if option not in ("root", "split")]
     for option in options:
         if option not in known:
             raise InputError(f"{name}: unknown option {option!r}; known are {', '.join(known) or 'none'}")
+    hints = typing.get_type_hints(READERS[name].__init__)
+    return {option: typed(hints[option], value, f"{name}: {option}") for option, value in options.items()}

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from logvggt_jax.data.dataset import Dataset, Reader
-from logvggt_jax.data.registry import READERS, check_options, open_dataset
+from logvggt_jax.data.registry import READERS, checked_options, open_dataset
 from logvggt_jax.errors import InputError
 from logvggt_jax.evaluation.methods.baselines import all_baselines, static_camera, unit_depth
 from logvggt_jax.evaluation.methods.method import Method
@@ -84,7 +84,7 @@ def open_benchmarks(
     not a folder, or has none of the data sets that were asked for, and for an option that no reader has.
     """
     for name, options in settings.options.items():
-        check_options(name, options)
+        checked_options(name, options)
     root = None if data_root is None else Path(data_root)
     if root is not None and not root.is_dir():
         raise InputError(f"{root}: no such folder; --data_root is the folder that holds one folder a data set")

@@ -13,7 +13,7 @@ from logvggt_jax.data.errors import EmptySplit
 from logvggt_jax.data.feeding.frame_range import FrameRange
 from logvggt_jax.data.feeding.holdouts import check_disjoint, check_held_out
 from logvggt_jax.data.packed.index import is_packed
-from logvggt_jax.data.registry import DATASETS, READERS, check_options, open_dataset
+from logvggt_jax.data.registry import DATASETS, READERS, checked_options, open_dataset
 from logvggt_jax.errors import InputError
 from logvggt_jax.training.config import DataConfig, SourceConfig
 
@@ -93,7 +93,7 @@ def _check_folders(config: DataConfig, validation: Sequence[SourceConfig]) -> No
     """Raises InputError naming all data sets, to train and to validate on, that have to have a folder and have none, or
     one that does not exist."""
     for source in (*config.sources, *validation):
-        check_options(source.name, dict(source.options))
+        checked_options(source.name, dict(source.options))
     problems = []
     missing = _without_folder(config.sources)
     if missing and len(missing) == len(config.sources):
