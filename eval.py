@@ -24,7 +24,7 @@ with one_line_at_ctrl_c("eval.py"):
     from logvggt_jax.evaluation.report.report import print_report
     from logvggt_jax.evaluation.run import run_evaluation
     from logvggt_jax.program_flags import define_config, flags_parser
-    from logvggt_jax.terminal import forgiving_streams, one_log_handler
+    from logvggt_jax.terminal import forgiving_streams, one_log_handler, plain_warnings
 
 _CONFIG = define_config("eval.py", "what to evaluate: a file of configs/eval")
 _CHECKPOINT = flags.DEFINE_string(
@@ -70,5 +70,5 @@ def main(arguments: Sequence[str]) -> None:
 if __name__ == "__main__":
     flags.mark_flags_as_required(["config", "checkpoint", "output"])
     one_log_handler()
-    with forgiving_streams(), one_line_at_ctrl_c("eval.py"):
+    with forgiving_streams(), plain_warnings("eval.py"), one_line_at_ctrl_c("eval.py"):
         app.run(main, flags_parser=flags_parser("eval.py"))

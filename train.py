@@ -29,7 +29,7 @@ with one_line_at_ctrl_c("train.py"):
     from logvggt_jax.compile import check_devices, check_nccl, enable_compilation_cache
     from logvggt_jax.errors import InputError, one_line
     from logvggt_jax.program_flags import define_config, flags_parser
-    from logvggt_jax.terminal import forgiving_streams, one_log_handler
+    from logvggt_jax.terminal import forgiving_streams, one_log_handler, plain_warnings
     from logvggt_jax.training.config import TrainConfig
     from logvggt_jax.training.dry_run import described_mesh, dry_run
     from logvggt_jax.training.loop import NonFiniteTraining, train
@@ -169,5 +169,5 @@ if __name__ == "__main__":
         "a run needs --workdir; --described goes with --dry_run",
     )
     one_log_handler()
-    with forgiving_streams(), one_line_at_ctrl_c("train.py"):
+    with forgiving_streams(), plain_warnings("train.py"), one_line_at_ctrl_c("train.py"):
         app.run(main, flags_parser=flags_parser("train.py"))

@@ -5,11 +5,14 @@ from __future__ import annotations
 import logging
 import os
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, TextIO
 
 from absl import logging as absl_logging
+
+from logvggt_jax.errors import printable
 
 
 class ForgivingStream:
@@ -79,6 +82,19 @@ def forgiving_streams() -> Iterator[ForgivingStream]:
         output.flush()
         errors.flush()
         sys.stdout, sys.stderr = before
+
+
+@contextmanager
+def plain_warnings(program: str) -> Iterator[None]:
+    """Warnings are a line on standard error that begins with the program's name, without the line of code that Python
+    shows."""
+
+    def show(message: Warning | str, *_: object, **__: object) -> None:
+        print(f"{program}: warning: {printable(str(message))}", file=sys.stderr)
+
+    with warnings.catch_warnings():
+        warnings.showwarning = show
+        yield
 
 
 def one_log_handler() -> None:

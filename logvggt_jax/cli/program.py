@@ -4,16 +4,15 @@ import argparse
 import signal
 import sys
 import traceback
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
 from logvggt_jax.cli import data, doctor, live, models, reconstruct, results
 from logvggt_jax.cli.exit_codes import BAD_INPUT, OUTPUT_LOST
-from logvggt_jax.errors import InputError, one_line, printable
+from logvggt_jax.errors import InputError, one_line
 from logvggt_jax.interruption import INTERRUPTED, Interrupted, one_line_at_ctrl_c
-from logvggt_jax.terminal import forgiving_streams
+from logvggt_jax.terminal import forgiving_streams, plain_warnings
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -40,8 +39,7 @@ def _run(arguments: Sequence[str]) -> int:
     if unknown:
         parser.error(f"unrecognized arguments: {' '.join(unknown)}{_unquoted(unknown)}")
     try:
-        with warnings.catch_warnings():
-            warnings.showwarning = _show_warning
+        with plain_warnings("logvggt"):
             return options.run(options) or 0
     except KeyboardInterrupt:
         print("logvggt: interrupted", file=sys.stderr)
@@ -109,7 +107,3 @@ def with_dashes(arguments: Sequence[str]) -> list[str]:
             argument = name.replace("_", "-") + equals + value
         result.append(argument)
     return result
-
-
-def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
-    print(f"logvggt: warning: {printable(str(message))}", file=sys.stderr)

@@ -11,14 +11,16 @@ from logvggt_jax.evaluation.costs.throughput import measured_costs, measured_tim
 from logvggt_jax.evaluation.datasets import open_run
 from logvggt_jax.evaluation.methods.method import Checkpoint, Method, model_row
 from logvggt_jax.evaluation.methods.variants import variant_methods
+from logvggt_jax.evaluation.plan import Benchmark
 from logvggt_jax.evaluation.protocols.images import Fit
 from logvggt_jax.evaluation.records import RECORDS_FILE
 from logvggt_jax.evaluation.report.report import write_report
 from logvggt_jax.evaluation.runner import evaluate
 from logvggt_jax.evaluation.settings import ClipRun, PaperRun, read_run
 from logvggt_jax.files import check_output
-from logvggt_jax.streaming import expectation
-from logvggt_jax.weights.checkpoints import read_provenance
+from logvggt_jax.streaming import METHODS, expectation
+from logvggt_jax.weights.address import resolve
+from logvggt_jax.weights.checkpoints import read_config, read_provenance
 
 # Rows that a run has unless it says otherwise.
 _REFERENCES = ("offline", "chunks")
@@ -56,6 +58,8 @@ def run_evaluation(
     asks = isinstance(run, ClipRun) and run.evaluation.image_size is None
     longer_edge = read_provenance(checkpoint).longer_edge if asks else None
     benchmarks, baselines = open_run(run, data_root, longer_edge)
+    if isinstance(run, ClipRun):
+        _check_room(run, checkpoint, _clip_size(benchmarks))
     loaded = Checkpoint.load(checkpoint)
     trained_for = read_provenance(checkpoint).trained_for
     rows = {method: _row(method, loaded, run.settings_of(method), trained_for) for method in run.methods}
@@ -69,14 +73,12 @@ def run_evaluation(
                 measured_timings, loaded, others, run.timings, output, longer_edge=edge, fresh=fresh
             )
         else:
-            images = benchmarks[0].protocol.images
-            assert isinstance(images, Fit)  # clips'
             timings = functools.partial(
                 measured_costs,
                 list(rows.values()),
                 run.timings,
                 output,
-                image_size=images.size,
+                image_size=_clip_size(benchmarks),
                 dtype=loaded.model.config.dtype,
                 fresh=fresh,
             )
@@ -95,6 +97,21 @@ def run_evaluation(
     )
     write_report(results, output)
     return results
+
+
+def _clip_size(benchmarks: Sequence[Benchmark]) -> tuple[int, int]:
+    """(H, W) of the images of a run over clips, all of one size."""
+    images = benchmarks[0].protocol.images
+    assert isinstance(images, Fit)  # clips'
+    return images.size
+
+
+def _check_room(run: ClipRun, checkpoint: str | Path, image_size: tuple[int, int]) -> None:
+    """Raises InputError for a method whose budget or cap is below one frame, before any parameter is read."""
+    config = read_config(resolve(checkpoint))
+    for name in run.methods:
+        method, settings = METHODS[name], run.settings_of(name)
+        method.check(config, image_size, method.settings() if settings is None else settings)
 
 
 def _row(method: str, checkpoint: Checkpoint, settings: Any, trained_for: str | None) -> Method:

@@ -14,12 +14,13 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import numpy as np
 
+from logvggt_jax.config import ModelConfig
 from logvggt_jax.errors import InputError
 from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.streaming.anchored_window import AnchoredWindowSettings, KeepWindow
 from logvggt_jax.streaming.causal import CausalSettings, KeepAll
 from logvggt_jax.streaming.chunks import ChunkPlan, ChunkSession, chunk_program
-from logvggt_jax.streaming.frame_session import FrameSession, Keeping, frame_program
+from logvggt_jax.streaming.frame_session import FrameSession, Keeping, frame_program, tokens_a_frame
 from logvggt_jax.streaming.merged import MergedSession, MergedSettings, merged_program
 from logvggt_jax.streaming.offline import OfflineSession, OfflineSettings, offline_program
 from logvggt_jax.streaming.program import Program
@@ -104,6 +105,8 @@ class Method(NamedTuple):
       summary: what the method does, in a few words.
       program: model, (H, W) of the images, settings and number of frames (None: not known) to the program in which the
         method spends its time.
+      check: configuration of a model, (H, W) of the images and settings; raises InputError where what the method keeps
+        cannot hold one such frame.
       takes_masks: whether `push` takes masks of pixels that are not to be seen.
       in_batches: whether many frames are predicted together, when all are there or a chunk is, so that the time of a
         single `push` tells nothing.
@@ -115,6 +118,7 @@ class Method(NamedTuple):
     trained_for: str
     summary: str
     program: Callable[[LogVGGT, tuple[int, int], Any, int | None], Program]
+    check: Callable[[ModelConfig, tuple[int, int], Any], None] = lambda config, image_size, settings: None
     takes_masks: bool = False
     in_batches: bool = False
 
@@ -125,16 +129,21 @@ def _frame_by_frame(title: str, settings: type, keeping: Callable[[Any, int], Ke
     Its program is the step of the sequence's last frame, the costliest.
     """
 
-    def kept(model: LogVGGT, chosen: Any) -> Keeping:
-        return keeping(chosen, model.config.camera_head.iterations)
+    def kept(config: ModelConfig, chosen: Any) -> Keeping:
+        return keeping(chosen, config.camera_head.iterations)
+
+    def check(config: ModelConfig, image_size: tuple[int, int], chosen: Any) -> None:
+        # Shapes alone: nothing is allocated.
+        jax.eval_shape(lambda: kept(config, chosen).start(config, tokens_a_frame(config, image_size)))
 
     return Method(
         title,
-        lambda model, variables, chosen: FrameSession(model, variables, kept(model, chosen), ahead=chosen.ahead),
+        lambda model, variables, chosen: FrameSession(model, variables, kept(model.config, chosen), ahead=chosen.ahead),
         settings,
         "causal",
         summary,
-        lambda model, size, chosen, num_frames: frame_program(model, size, kept(model, chosen), num_frames),
+        lambda model, size, chosen, num_frames: frame_program(model, size, kept(model.config, chosen), num_frames),
+        check,
     )
 
 

@@ -10,7 +10,7 @@ import pytest
 from root_programs import RootPrograms
 
 from logvggt_jax.config import ModelConfig
-from logvggt_jax.weights import save_model
+from logvggt_jax.weights import Provenance, save_model
 
 ROOT = Path(__file__).parents[2]
 
@@ -24,7 +24,7 @@ def run_eval(programs: RootPrograms) -> Callable[..., subprocess.CompletedProces
 def test_an_evaluation_leaves_tables_json_and_figures(
     run_eval: Callable, small_config: ModelConfig, small_variables: dict, tmp_path: Path
 ) -> None:
-    save_model(tmp_path / "model", small_config, small_variables["params"])
+    save_model(tmp_path / "model", small_config, small_variables["params"], Provenance("vggt", 42))
     result = run_eval(
         "--config=configs/eval/rooms.py",
         f"--checkpoint={tmp_path / 'model'}",
@@ -36,6 +36,7 @@ def test_an_evaluation_leaves_tables_json_and_figures(
         "--config.evaluation.clip_lengths=(4,)",
     )
     assert result.returncode == 0, result.stderr
+    assert "\neval.py: warning: these weights were trained for vggt, not for windows" in f"\n{result.stderr}"
     results = json.loads((tmp_path / "out" / "results.json").read_text())
     assert not results["skipped"]
     assert [(entry["frames"], entry["method"]) for entry in results["summary"]] == [(4, "LoG-VGGT")]
