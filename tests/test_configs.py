@@ -17,6 +17,8 @@ from logvggt_jax.data.feeding.holdouts import PUBLISHED
 from logvggt_jax.data.rooms.rooms import Rooms
 from logvggt_jax.described import cudnn_by_description
 from logvggt_jax.errors import InputError, MissingInput
+from logvggt_jax.evaluation.datasets import open_evaluation_set
+from logvggt_jax.evaluation.settings import ClipRun, read_run
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.parallel.sharding import check_batch_size, data_mesh
 from logvggt_jax.training.step.costs import abstract_clips
@@ -314,6 +316,32 @@ def test_fields_that_a_file_leaves_out_can_be_changed_on_the_command_line(
     assert changed != before
     for field, value in OPTIONAL.items():
         assert operator.attrgetter(field)(changed) == value, field
+
+
+@pytest.mark.parametrize("name", ["tiny", "rooms", "small", "distill_rooms"])
+def test_options_that_a_file_leaves_to_the_reader_can_be_given_on_the_command_line(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(ROOT))
+    values = importlib.import_module(f"configs.{name}").get_config()
+    values.lock()
+    left = dict(TrainConfig.from_dict(values.to_dict()).data.sources[0].options)
+    assert "lights" not in left and None not in left.values(), "a run of an earlier version is still the same"
+    values.update_from_flattened_dict({"data.sources.rooms.options.lights": 2})
+    assert dict(TrainConfig.from_dict(values.to_dict()).data.sources[0].options) == {**left, "lights": 2}
+
+
+def test_options_of_rooms_that_are_evaluated_can_be_given_on_the_command_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT))
+    for name in ("rooms", "ablations", "methods"):
+        values = importlib.import_module(f"configs.eval.{name}").get_config()
+        values.lock()
+        for lights in (None, 2):
+            values.options.lights = lights
+            run = read_run(values.to_dict())
+            assert isinstance(run, ClipRun)
+            reader = open_evaluation_set(run.dataset, None, split="test", image_size=(28, 42), options=run.options)
+            assert isinstance(reader, Rooms) and reader.furnishing.lights == (lights or 0), name
 
 
 def test_frozen_encoder_is_configured_by_the_model(monkeypatch: pytest.MonkeyPatch) -> None:

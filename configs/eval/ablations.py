@@ -12,6 +12,8 @@ frames it is a global path of its own, which hides what the parts do. Another da
 from ml_collections import ConfigDict
 from ml_collections.config_dict import placeholder
 
+from logvggt_jax.data.option_fields import option_fields
+
 
 def get_config() -> ConfigDict:
     """Clips of procedural rooms, the full model and its variants; fields of `ClipRun`."""
@@ -20,7 +22,7 @@ def get_config() -> ConfigDict:
     config.dataset = "rooms"
     config.split = "test"
     # Rooms of the kind that configs/tiny.py trains on, walked round seven times, each time a little aside.
-    config.options = ConfigDict({"num_rooms": 24, "style": "compass", "num_frames": 600, "laps": 7})
+    config.options = option_fields("rooms", {"num_rooms": 24, "style": "compass", "num_frames": 600, "laps": 7})
     config.baselines = True
     # Rows of the model: LoG-VGGT's windows, VGGT offline up to max_frames, and VGGT on overlapping chunks, as long as
     # the model was trained at.

@@ -13,6 +13,8 @@ others show what they make of weights that are not theirs. Some of them:
 from ml_collections import ConfigDict
 from ml_collections.config_dict import placeholder
 
+from logvggt_jax.data.option_fields import option_fields
+
 LENGTHS = (12, 25, 50, 100)
 
 
@@ -23,7 +25,7 @@ def get_config() -> ConfigDict:
     config.dataset = "rooms"
     config.split = "test"
     # Rooms of the kind that configs/tiny.py trains on, once round at stride 2.
-    config.options = ConfigDict({"num_rooms": 8, "style": "compass", "num_frames": 200})
+    config.options = option_fields("rooms", {"num_rooms": 8, "style": "compass", "num_frames": 200})
     config.baselines = True
     # Rows of the model, names of logvggt_jax.streaming.METHODS; the first one is drawn.
     config.methods = (

@@ -10,6 +10,8 @@ co3dv2. What is missing is named and counted. An interrupted evaluation goes on 
 
 from ml_collections import ConfigDict, config_dict
 
+from logvggt_jax.data.option_fields import option_fields
+
 
 def get_config() -> ConfigDict:
     """All benchmarks at the size of VGGT-1B; fields of `PaperRun`."""
@@ -40,5 +42,6 @@ def get_config() -> ConfigDict:
     protocol.icp_threshold = 0.1
     protocol.seed = 0
     # Of data sets' readers, by name.
-    protocol.options = ConfigDict({"rooms": {"num_rooms": 24, "style": "compass", "num_frames": 96}})
+    rooms = option_fields("rooms", {"num_rooms": 24, "style": "compass", "num_frames": 96})
+    protocol.options = ConfigDict({"rooms": rooms})
     return config

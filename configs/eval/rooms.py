@@ -6,6 +6,8 @@ python eval.py --config=configs/eval/rooms.py --checkpoint=runs/tiny/model --out
 from ml_collections import ConfigDict
 from ml_collections.config_dict import placeholder
 
+from logvggt_jax.data.option_fields import option_fields
+
 
 def get_config() -> ConfigDict:
     """Clips of 12 and 32 frames of each test room; fields of `ClipRun`."""
@@ -14,7 +16,7 @@ def get_config() -> ConfigDict:
     config.dataset = "rooms"
     config.split = "test"
     # Rooms of the kind that configs/tiny.py trains on.
-    config.options = ConfigDict({"num_rooms": 24, "style": "compass", "num_frames": 96})
+    config.options = option_fields("rooms", {"num_rooms": 24, "style": "compass", "num_frames": 96})
     config.baselines = True
     # Rows of the model: LoG-VGGT's windows, VGGT offline up to max_frames, and VGGT on overlapping chunks, as long as
     # the model was trained at.

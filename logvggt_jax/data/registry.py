@@ -102,11 +102,17 @@ def checked_options(name: str, options: Mapping[str, Any]) -> dict[str, Any]:
     Raises InputError for an unknown data set, for names of options that its reader does not have, and for values of
     another type.
     """
+    types = option_types(name)
+    for option in options:
+        if option not in types:
+            raise InputError(f"{name}: unknown option {option!r}; known are {', '.join(types) or 'none'}")
+    return {option: typed(types[option], value, f"{name}: {option}") for option, value in options.items()}
+
+
+def option_types(name: str) -> dict[str, Any]:
+    """Types of the options of a data set's reader, by their names; InputError for an unknown data set."""
     if name not in READERS:
         raise InputError(f"unknown data set {name!r}: choose one of {', '.join(DATASETS)}")
-    known = [option for option in inspect.signature(READERS[name]).parameters if option not in ("root", "split")]
-    for option in options:
-        if option not in known:
-            raise InputError(f"{name}: unknown option {option!r}; known are {', '.join(known) or 'none'}")
     hints = typing.get_type_hints(READERS[name].__init__)
-    return {option: typed(hints[option], value, f"{name}: {option}") for option, value in options.items()}
+    parameters = inspect.signature(READERS[name]).parameters
+    return {option: hints[option] for option in parameters if option not in ("root", "split")}

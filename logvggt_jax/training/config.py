@@ -133,7 +133,7 @@ class SourceConfig:
     `weight` is its share of the clips relative to the others'. `stride`, smallest and largest, takes the place of
     the stage's. Of every sequence the `frames`, first and the one after the last, are taken, as a slice of Python does:
     (None, 700) the first 700, (-200, None) the last 200. `options` (sorted pairs) are further arguments of the set's
-    reader.
+    reader; those that are None are its defaults.
     """
 
     name: str
@@ -146,7 +146,8 @@ class SourceConfig:
 
     def __post_init__(self) -> None:
         freeze_lists(self)
-        object.__setattr__(self, "options", tuple(sorted(self.options)))
+        # None is a field that no flag has filled.
+        object.__setattr__(self, "options", tuple(sorted(pair for pair in self.options if pair[1] is not None)))
         require_within(self, "(0, inf)", "weight")
         if self.stride is not None and not (len(self.stride) == 2 and 1 <= self.stride[0] <= self.stride[1]):
             raise InputError(f"SourceConfig.stride must be a pair 1 <= low <= high, got {self.stride}")

@@ -10,7 +10,9 @@ from typing import Any
 from ml_collections import ConfigDict
 from ml_collections.config_dict import placeholder
 
-from logvggt_jax.training.config import TrainConfig
+from logvggt_jax.data.option_fields import option_fields
+from logvggt_jax.data.registry import DATASETS
+from logvggt_jax.training.config import SourceConfig, TrainConfig
 
 
 def with_all_fields(config: ConfigDict) -> ConfigDict:
@@ -47,9 +49,12 @@ def _complete_value(config: ConfigDict, name: str, kind: Any) -> None:
         _complete(value, kind)
     elif isinstance(value, ConfigDict) and typing.get_origin(kind) is tuple:
         item = typing.get_args(kind)[0]
-        for each in value.values():
+        for part, each in value.items():
             if dataclasses.is_dataclass(item) and isinstance(each, ConfigDict):
                 _complete(each, item)
+            if item is SourceConfig and part in DATASETS and (options := option_fields(part, dict(each.options))):
+                del each.options  # of another type where the set has none
+                each.options = options
     elif value is None:
         _hold_a_place(config, name, kind)
 
