@@ -57,9 +57,16 @@ def _live(options: argparse.Namespace) -> int:
             overwrite=options.overwrite,
             calibration=calibration,
         )
-        recording = Recording(options.output, calibration=calibration, overwrite=options.overwrite)
+        recording = Recording(
+            options.output,
+            calibration=calibration,
+            keep_originals=options.keep_originals,
+            overwrite=options.overwrite,
+        )
     elif calibration != Calibration():
         raise InputError("--intrinsics and --shared-intrinsics are of a result: give --output, too")
+    elif options.keep_originals:
+        raise InputError("--keep-originals is of a result: give --output, too")
     online = OnlineSettings(options.period, options.context, options.max_registers)
     checkpoint = resolve(options.checkpoint)
     if target is not None:
@@ -122,6 +129,12 @@ def add_to(commands: Any) -> None:
         help="folder to make, as `logvggt reconstruct` does",
     )
     overwrite_option(sub, "an earlier reconstruction")
+    sub.add_argument(
+        "--keep-originals",
+        action="store_true",
+        help="keep the frames that are used at the camera's own size, too (originals/, as JPEG), so that `logvggt "
+        "export` has them",
+    )
     longer_edge_option(sub)
     sub.add_argument(
         "--queue",

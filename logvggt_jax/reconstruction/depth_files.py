@@ -20,7 +20,7 @@ from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE
 
 # Numpy parses an array's header with `ast`, which in Python 3.11 fails now and then where several threads do so.
 _ONE_AT_A_TIME = threading.Lock()
-DEPTH_FOLDER, IMAGE_FOLDER = "depth", "images"
+DEPTH_FOLDER, IMAGE_FOLDER, ORIGINAL_FOLDER = "depth", "images", "originals"
 _END_OF_JPEG = b"\xff\xd9"
 _JPEG = (
     *(cv2.IMWRITE_JPEG_QUALITY, 95),
@@ -36,6 +36,11 @@ def depth_file(folder: Path, name: str) -> Path:
 def image_file(folder: Path, name: str) -> Path:
     """Where a result folder keeps the image of the frame of this name."""
     return folder / IMAGE_FOLDER / f"{name}.jpg"
+
+
+def original_file(folder: Path, name: str) -> Path:
+    """Where a result folder keeps the picture of the frame of this name at its own size, if it does."""
+    return folder / ORIGINAL_FOLDER / f"{name}.jpg"
 
 
 def write_depth(path: str | Path, depth: np.ndarray, confidence: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -18,6 +18,7 @@ from logvggt_jax.reconstruction.depth_files import (
     IMAGE_FOLDER,
     depth_file,
     image_file,
+    original_file,
     write_depth,
     write_picture,
 )
@@ -35,7 +36,7 @@ _NARROWEST_FIELD_OF_VIEW = 0.01  # radians
 
 class Picture(NamedTuple):
     """A frame at the model's size, uint8 [h, w, 3]; where the source has masks with its own, bool [h, w], and without
-    what lies under it."""
+    what lies under it. `original`, uint8 [H, W, 3], is what the camera gave, where the result is to keep it."""
 
     name: str
     timestamp: float
@@ -43,6 +44,7 @@ class Picture(NamedTuple):
     transform: ResizeTransform
     focal_length: float | None = None
     mask: np.ndarray | None = None
+    original: np.ndarray | None = None
 
 
 class FrameWriter:
@@ -82,6 +84,10 @@ class FrameWriter:
         self.timestamps.append(picture.timestamp)
         if picture.mask is not None:
             self.masked.append(1 - float(picture.mask.mean()))
+        if picture.original is not None:
+            file = original_file(self._folder, picture.name)
+            file.parent.mkdir(exist_ok=True)
+            self._pool.submit(write_picture, file, picture.original)
         self.transform = picture.transform
         if picture.focal_length:
             self.focal_lengths.append(picture.focal_length)
@@ -109,8 +115,8 @@ class FrameWriter:
         """
         count = next(index for index in range(most + 1) if index == most or index not in self._written)
         for name in self.names[count:]:
-            depth_file(self._folder, name).unlink(missing_ok=True)
-            image_file(self._folder, name).unlink(missing_ok=True)
+            for file in (depth_file, image_file, original_file):
+                file(self._folder, name).unlink(missing_ok=True)
         del self.names[count:], self.timestamps[count:], self.masked[count:]
         self.images.clear()
         return count

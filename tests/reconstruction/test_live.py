@@ -25,6 +25,9 @@ from logvggt_jax.errors import DiskError, InputError
 from logvggt_jax.interruption import Interrupted
 from logvggt_jax.reconstruction import Reconstruction, Source, SourceFrame, SourceOptions, frame_writer
 from logvggt_jax.reconstruction.calibration import Calibration
+from logvggt_jax.reconstruction.exporters.pictures import Pictures, picture_size
+from logvggt_jax.reconstruction.frame_pool import FramePool
+from logvggt_jax.reconstruction.fusion.rescale import rescale
 from logvggt_jax.reconstruction.live import (
     LiveResult,
     LiveSession,
@@ -220,6 +223,39 @@ def test_a_recording_has_the_intrinsics_that_are_known_and_a_camera_the_mask_of_
     with pytest.raises(InputError, match=r"principal point 420,14 lies outside of images of 42 x 28 pixels"):
         follow(FakeCamera(5), session(recording=Recording(tmp_path / "none", calibration=outside)))
     assert not (tmp_path / "none").exists()
+
+
+def test_a_recording_that_keeps_originals_is_exported_at_the_cameras_size(tmp_path: Path) -> None:
+    large = np.repeat(np.repeat(PICTURES, 3, axis=1), 3, axis=2)
+    with session(recording=Recording(tmp_path / "out", keep_originals=True, num_previews=0)) as live:
+        for picture in large[:4]:
+            live.push(picture)
+    result = live.reconstruction
+    assert result is not None and result.image_size == (84, 126) and result.depth_size == (28, 42)
+    metric = rescale(result, tmp_path / "metres", frames=("0", "3"), distance=6.0, progress=False)
+    for kept_by in (result, metric.result):
+        pictures = Pictures.of(kept_by)
+        assert pictures.size == picture_size(kept_by) == (84, 126)
+        np.testing.assert_array_equal(pictures.intrinsics, result.intrinsics)
+        with FramePool() as pool:
+            found = list(pictures.read(pool))
+        assert len(found) == 4
+        assert all(np.abs(a.astype(int) - b).mean() < 6 for a, b in zip(found, large, strict=False))
+    (tmp_path / "out" / "originals" / "frame-000002.jpg").unlink()
+    with FramePool() as pool, pytest.raises(InputError, match=r"originals/frame-000002\.jpg does not exist"):
+        list(Pictures.of(result).read(pool))
+
+
+def test_of_a_recording_that_an_error_ends_the_originals_of_what_is_kept_stay(tmp_path: Path) -> None:
+    def broken(result: LiveResult) -> None:
+        if result.result.index == 3:
+            raise RuntimeError("the robot fell over")
+
+    live = session(on_result=broken, recording=Recording(tmp_path / "out", keep_originals=True, workers=1))
+    with pytest.raises(RuntimeError, match="fell over"), pytest.warns(match=r"4 frames that were final are kept"):
+        follow(FakeCamera(8), live)
+    kept = sorted((tmp_path / "out" / "originals").iterdir())
+    assert [file.name for file in kept] == [f"frame-{index:06d}.jpg" for index in range(4)]
 
 
 def test_an_unplugged_camera_leaves_what_is_final_and_one_line(tmp_path: Path) -> None:
@@ -432,6 +468,8 @@ def test_a_video_without_realtime_is_refused_before_a_model_is_looked_for(
     assert "--period must be at least 1, got 0" in capsys.readouterr().err
     assert main([*arguments, "--queue", "0"]) == 2
     assert "--queue must be at least 1 frame, got 0" in capsys.readouterr().err
+    assert main([*arguments, "--keep-originals"]) == 2
+    assert "--keep-originals is of a result: give --output, too" in capsys.readouterr().err
     assert main([*arguments, "--shared-intrinsics"]) == 2
     assert "--intrinsics and --shared-intrinsics are of a result: give --output, too" in capsys.readouterr().err
     assert main(["live", "0", "--checkpoint", "nowhere", "--masks", str(tmp_path / "walk")]) == 2

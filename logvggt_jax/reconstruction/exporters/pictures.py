@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from logvggt_jax.errors import InputError, one_line
-from logvggt_jax.reconstruction.depth_files import write_picture
+from logvggt_jax.reconstruction.depth_files import ORIGINAL_FOLDER, original_file, read_picture, write_picture
 from logvggt_jax.reconstruction.exporters.cloud import tracked
 from logvggt_jax.reconstruction.frame_pool import FramePool
 from logvggt_jax.reconstruction.result import Reconstruction
@@ -21,11 +21,17 @@ from logvggt_jax.reconstruction.sources.record import reopen
 
 def picture_size(result: Reconstruction) -> tuple[int, int]:
     """(H, W) of the pictures that `Pictures.of` would give."""
+    if _keeps_originals(result):
+        return result.image_size
     if result.source is not None:
         with contextlib.suppress(InputError):
             reopen(result.source)
             return result.image_size
     return result.depth_size
+
+
+def _keeps_originals(result: Reconstruction) -> bool:
+    return (result.folder / ORIGINAL_FOLDER).is_dir()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,15 +40,20 @@ class Pictures:
 
     Attributes:
       result: whose frames they are.
-      source: where they are read; None for the images that the result keeps.
+      source: where they are read; None for what the result keeps.
+      originals: whether the result keeps them at their own size, and they are read there.
     """
 
     result: Reconstruction
     source: Source | None
+    originals: bool = False
 
     @classmethod
     def of(cls, result: Reconstruction) -> Pictures:
-        """Of the source where it is still there; else of the result, and a warning says why."""
+        """Those that a result keeps at their own size, or else of the source where it is still there; else the images
+        of the result, and a warning says why."""
+        if _keeps_originals(result):
+            return cls(result, None, originals=True)
         if result.source is None:
             reason = "the result does not say where its frames came from"
         else:
@@ -60,12 +71,16 @@ class Pictures:
     @property
     def size(self) -> tuple[int, int]:
         """(H, W) of the pictures."""
-        return self.result.depth_size if self.source is None else self.result.image_size
+        return self.result.image_size if self._at_own_size else self.result.depth_size
 
     @property
     def intrinsics(self) -> np.ndarray:
         """[N, 3, 3] float64, pixels of the pictures, centres at integers."""
-        return self.result.depth_intrinsics if self.source is None else self.result.intrinsics
+        return self.result.intrinsics if self._at_own_size else self.result.depth_intrinsics
+
+    @property
+    def _at_own_size(self) -> bool:
+        return self.originals or self.source is not None
 
     def read(self, pool: FramePool) -> Iterator[np.ndarray]:
         """The pictures in order, [H, W, 3] uint8 RGB.
@@ -73,6 +88,9 @@ class Pictures:
         Raises:
           InputError: the source does not give a frame that it once gave.
         """
+        if self.originals:
+            yield from pool.map(self._original, iter(self.result.names))
+            return
         if self.source is None:
             yield from pool.map(self.result.image, iter(range(self.result.num_frames)))
             return
@@ -92,6 +110,9 @@ class Pictures:
                 f"{self.source.path}: frame {wanted!r} cannot be read as it was before; move the source away to export "
                 "the images that the result keeps"
             )
+
+    def _original(self, name: str) -> np.ndarray:
+        return read_picture(original_file(self.result.folder, name), self.result.image_size)
 
     def write(self, folder: Path, stems: Sequence[str], *, progress: bool) -> list[str]:
         """Writes all pictures as JPEG into a folder, which is made; gives the names of the files."""

@@ -15,9 +15,11 @@ from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE, write_cameras
 from logvggt_jax.reconstruction.depth_files import (
     DEPTH_FOLDER,
     IMAGE_FOLDER,
+    ORIGINAL_FOLDER,
     check_range,
     depth_file,
     image_file,
+    original_file,
     write_depth,
 )
 from logvggt_jax.reconstruction.exporters.ply import export_ply
@@ -86,7 +88,8 @@ def write_derived(
     names = [result.names[index] for index in frames]
     recorder = HealthRecorder()
     with atomic_folder(target, replace=overwrite) as folder, disk_errors(target), FramePool() as pool:
-        for name in (DEPTH_FOLDER, IMAGE_FOLDER):
+        keeps_originals = (result.folder / ORIGINAL_FOLDER).is_dir()
+        for name in (DEPTH_FOLDER, IMAGE_FOLDER, *([ORIGINAL_FOLDER] if keeps_originals else [])):
             (folder / name).mkdir()
 
         def write(place: int) -> None:
@@ -98,6 +101,8 @@ def write_derived(
                 with without_harm():
                     recorder.see(place, *stored, result.image(frames[place]))
             shutil.copyfile(image_file(result.folder, names[place]), image_file(folder, names[place]))
+            if keeps_originals:
+                shutil.copyfile(original_file(result.folder, names[place]), original_file(folder, names[place]))
 
         for _ in pool.map(write, iter(range(len(frames)))):
             pass

@@ -37,9 +37,13 @@ class Recording:
       output: folder to make.
       point_filter: which pixels become points.
       calibration: intrinsics that are known; None takes those that the model predicts, frame by frame.
+      keep_originals: keep the frames that were used at their own size, too, for exports; a camera shows nothing twice.
       num_previews: pictures of frames beside their depth, evenly over the sequence.
       overwrite: replace an earlier result.
       workers: threads that write; None for one a core, at most eight.
+
+    Attributes:
+      keeps_originals: whether frames are to be added with what the camera gave.
     """
 
     def __init__(
@@ -48,6 +52,7 @@ class Recording:
         *,
         point_filter: PointFilter | None = None,
         calibration: Calibration | None = None,
+        keep_originals: bool = False,
         num_previews: int = 8,
         overwrite: bool = False,
         workers: int | None = None,
@@ -56,6 +61,7 @@ class Recording:
             raise InputError(f"num_previews must not be negative, got {num_previews}")
         self._target = user_path(output, resolved=True)
         self._filter, self._calibration = point_filter or PointFilter(), calibration or Calibration()
+        self.keeps_originals = keep_originals
         self._num_previews, self._overwrite, self._workers = num_previews, overwrite, workers
         self._stack = contextlib.ExitStack()
 

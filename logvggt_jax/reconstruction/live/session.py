@@ -232,7 +232,9 @@ class LiveSession:
             image, mask, transform = resized(frame.image, frame.mask, longer_edge=self._longer_edge)
             at_size = time.monotonic()
             self.times.add("resize", at_size - taken)
-            picture = Picture(f"frame-{frame.number:06d}", frame.timestamp, image, transform, mask=mask)
+            original = frame.image if self._recording is not None and self._recording.keeps_originals else None
+            name = f"frame-{frame.number:06d}"
+            picture = Picture(name, frame.timestamp, image, transform, mask=mask, original=original)
             self._pictures[self._used] = picture, frame.pushed
             self._used += 1
             self._used_at.append(taken)
