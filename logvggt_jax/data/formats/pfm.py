@@ -9,7 +9,7 @@ from logvggt_jax.data.errors import BrokenPicture
 from logvggt_jax.data.formats.source_files import read_regular
 
 # One white space ends the header; what follows belongs to the numbers.
-_HEADER = re.compile(rb"(P[fF])\s+(\d{1,9})\s+(\d{1,9})\s+([+-]?[0-9.]+(?:[eE][+-]?\d+)?)\s")
+_HEADER = re.compile(rb"(P[fF])\s+(\d{1,9})\s+(\d{1,9})\s+([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s")
 
 
 def read_pfm(path: str | Path) -> np.ndarray:

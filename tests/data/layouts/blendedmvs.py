@@ -77,6 +77,7 @@ LAYOUT = Layout(
             for content, complaint in (
                 (pfm_bytes(np.ones(SIZE))[:-8], "12288 bytes after its header, got 12280"),
                 (pfm_bytes(np.ones(SIZE)).replace(b"Pf", b"PF", 1), "single-channel"),
+                (pfm_bytes(np.ones(SIZE)).replace(b"-1.0", b"-1..", 1), "single-channel"),
                 (b"Pf\n0 0\n-1\n", "0 x 0"),
             )
         ),
