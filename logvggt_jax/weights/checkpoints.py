@@ -227,7 +227,7 @@ def from_pretrained(
       path_or_repo: A model folder of this package, a training run's folder, or the name of a model that ships
         (`rooms`); a VGGT checkpoint as `open_state_dict` reads it; or a hub repository, `hf:owner/name` or
         `owner/name` (`resolve`).
-      dtype: Compute type of the model, `float32` or `bfloat16`; None keeps the checkpoint's (VGGT: float32).
+      dtype: Compute type of the model, `float32`, `bfloat16` or `float16`; None keeps the checkpoint's (VGGT: float32).
       point_head: Keep VGGT's point head. A model folder has it or not.
       on_host: Give numpy arrays, which no device has seen. Those of a VGGT checkpoint are so in any case.
 
