@@ -197,8 +197,8 @@ def scores_of(query: jax.Array, key: jax.Array, *, special: int) -> jax.Array:
 
 def _appended(stored: jax.Array, new: jax.Array, length: jax.Array) -> jax.Array:
     """[B, capacity + N, …] with the N new tokens after the first `length` that are stored."""
-    room = [(0, new.shape[1] if axis == 1 else 0) for axis in range(stored.ndim)]
-    return jax.lax.dynamic_update_slice_in_dim(jnp.pad(stored, room), new.astype(stored.dtype), length, axis=1)
+    roomy = with_places(stored, new.shape[1], axis=1)
+    return jax.lax.dynamic_update_slice_in_dim(roomy, new.astype(stored.dtype), length, axis=1)
 
 
 def _taken(x: jax.Array, places: jax.Array) -> jax.Array:

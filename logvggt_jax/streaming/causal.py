@@ -10,13 +10,13 @@ from typing import Literal
 
 from logvggt_jax.config import ModelConfig, require_counts, require_one_of, require_within
 from logvggt_jax.model.key_value_cache import Caches, GrowingCache, empty
+from logvggt_jax.model.padding import doubled
 from logvggt_jax.streaming.frame_session import (
     CAMERA_CAPACITY,
     StreamMemory,
     block_shape,
     camera_memory,
     camera_with_room,
-    doubled,
     with_room,
 )
 

@@ -17,6 +17,7 @@ from logvggt_jax.model.frame_by_frame import FrameByFrame
 from logvggt_jax.model.key_value_cache import Caches, CameraMemory, KeyValueCache, empty
 from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.model.memory import Memory, RoundMemory
+from logvggt_jax.model.padding import doubled
 from logvggt_jax.model.parameters import in_compute_type
 from logvggt_jax.streaming.program import Program, abstract_variables, flops_of
 from logvggt_jax.streaming.results import (
@@ -266,13 +267,6 @@ def camera_memory(
     if config.refinement.enabled:
         registers = empty(kind, (1, capacity, config.aggregator.num_registers, width), config.dtype)
     return CameraMemory(RoundMemory(each=trunk) if per_round else RoundMemory(shared=trunk), registers)
-
-
-def doubled(capacity: int, wanted: int) -> int:
-    """The first of `capacity`, twice it, four times it … that is at least `wanted`."""
-    while capacity < wanted:
-        capacity *= 2
-    return capacity
 
 
 def with_room(memory: Memories, entries: int, *, at_most: int | None = None) -> Memories:

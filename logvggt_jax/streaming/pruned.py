@@ -10,13 +10,13 @@ from logvggt_jax.config import ModelConfig, require_counts, require_one_of, requ
 from logvggt_jax.errors import InputError
 from logvggt_jax.model.key_value_cache import AnchoredCache, Caches, CameraMemory, empty
 from logvggt_jax.model.memory import RoundMemory
+from logvggt_jax.model.padding import doubled
 from logvggt_jax.model.pruned_cache import PrunedCache, empty_packed, empty_pruned
 from logvggt_jax.streaming.causal import CAMERA_CACHES
 from logvggt_jax.streaming.frame_session import (
     CAMERA_CAPACITY,
     StreamMemory,
     block_shape,
-    doubled,
     with_room,
 )
 

@@ -18,6 +18,7 @@ from logvggt_jax.config import ModelConfig, require_counts, require_one_of, requ
 from logvggt_jax.errors import InputError
 from logvggt_jax.model.key_value_cache import GrowingCache, empty
 from logvggt_jax.model.memory import Memory
+from logvggt_jax.model.padding import doubled
 from logvggt_jax.model.rolling_cache import RollingCache, RollingMemory
 from logvggt_jax.streaming.causal import CAMERA_CACHES
 from logvggt_jax.streaming.frame_session import (
@@ -26,7 +27,6 @@ from logvggt_jax.streaming.frame_session import (
     block_shape,
     camera_memory,
     camera_with_room,
-    doubled,
     with_room,
 )
 

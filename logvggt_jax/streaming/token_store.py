@@ -13,7 +13,7 @@ import numpy as np
 
 from logvggt_jax.model.gccr import RegisterKeys
 from logvggt_jax.model.kept_registers import is_kept
-from logvggt_jax.model.padding import with_places
+from logvggt_jax.model.padding import doubled, with_places
 
 Tokens = TypeVar("Tokens")
 
@@ -163,7 +163,7 @@ class TokenStore:
     def reserve(self, frames: int) -> None:
         """Makes room until `frames` frames fit; call after the first `append`."""
         if self._max_frames is None and self.registers is not None and frames > self._register_capacity:
-            self._grow_registers(self._doubled(frames) - self._register_capacity)
+            self._grow_registers(doubled(self._first_capacity, frames) - self._register_capacity)
         if self.position(frames) <= self.capacity:
             return
         if self._reach is not None and self.capacity:
@@ -172,14 +172,7 @@ class TokenStore:
             self.camera, self.refined = _slide(buffers, jnp.int32(forgotten - self._forgotten))
             self._forgotten = forgotten
             return
-        self._grow(self._doubled(frames) - self.capacity)
-
-    def _doubled(self, frames: int) -> int:
-        """The smallest capacity that holds so many frames."""
-        capacity = self._first_capacity
-        while capacity < frames:
-            capacity *= 2
-        return capacity
+        self._grow(doubled(self._first_capacity, frames) - self.capacity)
 
     @property
     def _register_capacity(self) -> int:
