@@ -65,6 +65,13 @@ def _fire_all(
     return model.refinement.fire_all(variables, camera_tokens, registers, count[None])[0, :, -1]
 
 
+def in_one_mode(model: LogVGGT) -> LogVGGT:
+    """The model with one mode of refinement, whichever it has: sessions that differ in it share programs that do not
+    depend on it."""
+    mode = dataclasses.replace(model.config.refinement, enabled=True, period=None, context=None, max_registers=None)
+    return LogVGGT(dataclasses.replace(model.config, refinement=mode))
+
+
 def relative_change(before: jax.Array, after: jax.Array) -> jax.Array:
     """‖after − before‖ / ‖before‖ over the last axis."""
     return jnp.linalg.norm(after - before, axis=-1) / jnp.linalg.norm(before, axis=-1)
@@ -97,9 +104,8 @@ class PoseStream:
     def __init__(self, model: LogVGGT, variables: Variables, *, first_capacity: int, late: int) -> None:
         self._model, self._variables, self._first_capacity = model, variables, first_capacity
         config = model.config.refinement
-        # The registers of a frame are projected alike in every mode: sessions share the program.
-        plain = dataclasses.replace(config, enabled=True, period=None, context=None, max_registers=None)
-        self._projecting = LogVGGT(dataclasses.replace(model.config, refinement=plain))
+        # The registers of a frame are projected alike in every mode.
+        self._projecting = in_one_mode(model)
         reach = max_frames = None
         if config.period is not None and config.context is not None:
             reach = config.period + config.context + late + 2 * model.config.windows.size

@@ -21,7 +21,7 @@ from logvggt_jax.model.parameters import in_compute_type
 from logvggt_jax.model.windows import WindowState
 from logvggt_jax.streaming.loops import LoopCloser, LoopSettings, frame_describer, loop_settings
 from logvggt_jax.streaming.offline import predict_plain
-from logvggt_jax.streaming.pose_stream import Poses, PoseStream, relative_change
+from logvggt_jax.streaming.pose_stream import Poses, PoseStream, in_one_mode, relative_change
 from logvggt_jax.streaming.program import Program, abstract_variables, flops_of
 from logvggt_jax.streaming.results import (
     Cameras,
@@ -75,7 +75,7 @@ def window_program(
     model: LogVGGT, image_size: tuple[int, int], settings: WindowSettings, num_frames: int | None
 ) -> Program:
     """The step of a stream whose frames are all real."""
-    plain, config = _without_refinement(model), model.config.windows
+    plain, config = in_one_mode(model), model.config.windows
     variables = abstract_variables(model.config)
 
     def frames(count: int) -> jax.ShapeDtypeStruct:
@@ -85,13 +85,6 @@ def window_program(
     arguments = (variables, state, frames(config.stride))
     flops = flops_of(plain, lambda chosen: lambda v, s, f: chosen.step(v, s, f, None), *arguments)
     return Program(_step.lower(plain, *arguments, None), flops, config.stride)
-
-
-def _without_refinement(model: LogVGGT) -> LogVGGT:
-    """The model with one mode of refinement for all, so that sessions which differ in it share their programs: windows
-    know nothing of it."""
-    plain = dataclasses.replace(model.config.refinement, enabled=True, period=None, context=None, max_registers=None)
-    return LogVGGT(dataclasses.replace(model.config, refinement=plain))
 
 
 class _Frame(NamedTuple):
@@ -173,7 +166,7 @@ class StreamSession:
         self._model, self._settings = model, dataclasses.replace(settings, **options)
         # Once, not at every call: cast, and brought to the device where they are numpy arrays.
         self._variables = jax.device_put(in_compute_type(variables, model.config))
-        self._windows = _without_refinement(model)
+        self._windows = in_one_mode(model)  # of which windows know nothing
         self._poses = PoseStream(
             model,
             self._variables,

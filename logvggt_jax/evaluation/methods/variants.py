@@ -12,6 +12,7 @@ from logvggt_jax.errors import InputError
 from logvggt_jax.evaluation.methods.method import Checkpoint, ClipPrediction, Method, handed_out, model_row, scaled
 from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.streaming import ChunkPlan, StreamSession, WindowSettings
+from logvggt_jax.streaming.pose_stream import in_one_mode
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,16 +100,15 @@ class _SharedStream:
 
     def __init__(self, variables: Variables) -> None:
         self._variables = variables
-        self._last: tuple[np.ndarray, ModelConfig, bool, StreamSession, np.ndarray] | None = None
+        self._last: tuple[np.ndarray, LogVGGT, bool, StreamSession, np.ndarray] | None = None
 
     def predict(self, config: ModelConfig, images: np.ndarray, *, loops: bool) -> ClipPrediction:
         """The variant's prediction of images [T, H, W, 3]."""
-        settings = dataclasses.replace(config.refinement, enabled=True, period=None, context=None, max_registers=None)
-        windows = dataclasses.replace(config, refinement=settings)
-        if self._last is None or self._last[0] is not images or self._last[1:3] != (windows, loops):
+        model = in_one_mode(LogVGGT(config))
+        if self._last is None or self._last[0] is not images or self._last[1:3] != (model, loops):
             self._last = None  # before the next is made
-            session = StreamSession(LogVGGT(windows), self._variables, loops=loops)
-            self._last = images, windows, loops, session, handed_out(session, images)
+            session = StreamSession(model, self._variables, loops=loops)
+            self._last = images, model, loops, session, handed_out(session, images)
         *_, session, depth = self._last
         cameras = session.cameras_with(config.refinement)
         return ClipPrediction(scaled(depth, cameras.depth_scale), cameras.extrinsics, cameras.intrinsics)
