@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from logvggt_jax.frames import evenly_spaced
 from logvggt_jax.geometry import NoSimilarity, Similarity, robust_similarity, unproject_pixels
 from logvggt_jax.streaming.offline import PlainPrediction
 
@@ -71,6 +72,4 @@ def confident(source: PlainPrediction, target: PlainPrediction) -> np.ndarray:
 def _some(valid: np.ndarray) -> np.ndarray:
     """Flat places of `valid`, at most `_MOST_POINTS`, evenly spread."""
     chosen = np.flatnonzero(valid)
-    if len(chosen) > _MOST_POINTS:
-        chosen = chosen[np.linspace(0, len(chosen) - 1, _MOST_POINTS).round().astype(int)]
-    return chosen
+    return chosen[evenly_spaced(len(chosen), _MOST_POINTS)]
