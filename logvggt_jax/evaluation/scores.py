@@ -139,7 +139,7 @@ def benchmark_score(
     """
     result: dict[str, float] = {"clips": planned, "clips_measured": sum(bool(score.metrics) for _, score in scores)}
     if protocol.depth is not None and method.depth:
-        result |= _depth_means([score.metrics for _, score in scores], protocol.depth)
+        result |= _depth_means([score.metrics for _, score in scores])
     second = any(key.startswith(SFM) for _, score in scores for key in score.metrics)
     for prefix in ("", SFM) if second else ("",):
         if protocol.poses and method.pose:
@@ -279,7 +279,7 @@ def _finite_depth(prediction: ClipPrediction) -> np.ndarray:
     return depth
 
 
-def _depth_means(metrics: Sequence[Mapping[str, float]], measure: DepthMeasure) -> dict[str, float]:
+def _depth_means(metrics: Sequence[Mapping[str, float]]) -> dict[str, float]:
     """Means over the clips that have depth errors, weighted by valid pixels."""
     measured = [m for m in metrics if "valid_pixels" in m]
     result: dict[str, float] = {"clips_depth": len(measured)}
