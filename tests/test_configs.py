@@ -16,6 +16,7 @@ from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.data.feeding.holdouts import PUBLISHED
 from logvggt_jax.data.rooms.rooms import Rooms
 from logvggt_jax.described import cudnn_by_description
+from logvggt_jax.doctor import training as doctors_step
 from logvggt_jax.errors import InputError, MissingInput
 from logvggt_jax.evaluation.datasets import open_evaluation_set
 from logvggt_jax.evaluation.settings import ClipRun, read_run
@@ -199,6 +200,11 @@ def _shallow(config: TrainConfig) -> TrainConfig:
         camera_head=dataclasses.replace(config.model.camera_head, depth=1),
     )
     return dataclasses.replace(config, model=model)
+
+
+def test_doctor_times_the_step_of_h20(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = _config("h20", monkeypatch)
+    assert (config.loss, config.optimizer) == (doctors_step.LOSS, doctors_step.OPTIMIZER)
 
 
 def test_h20_trains_all_but_the_encoder(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -27,7 +27,7 @@ from logvggt_jax.training.step.state import TrainState, initial_state
 from logvggt_jax.training.step.train_step import make_loss_terms, make_train_step
 
 # As configs/h20.py has them; what they are changes no time.
-_LOSS = LossConfig(
+LOSS = LossConfig(
     name="log_vggt",
     camera_weight=1.0,
     depth_weight=1.0,
@@ -37,14 +37,14 @@ _LOSS = LossConfig(
     gamma=0.6,
     alpha=0.2,
 )
-_OPTIMIZER = OptimizerConfig(
+OPTIMIZER = OptimizerConfig(
     learning_rate=5e-5,
-    final_learning_rate=0.0,
+    final_learning_rate=1e-8,
     schedule="cosine",
     warmup_fraction=0.05,
-    restart_each_stage=False,
+    restart_each_stage=True,
     b1=0.9,
-    b2=0.95,
+    b2=0.999,
     weight_decay=0.05,
     decay_all=False,
     clip_norm=1.0,
@@ -86,9 +86,9 @@ def examine(subject: Subject) -> Iterator[Finding]:
 def h20_step(model: LogVGGT, params: Any, mesh: Mesh) -> tuple[jax.stages.Wrapped, optax.GradientTransformation]:
     """The training step of `configs/h20.py` for a model whose layers are stacked in `params` (arrays, or their shapes),
     and its optimiser, see `make_train_step`."""
-    optimizer = make_optimizer(_OPTIMIZER, params, frozen=(ENCODER,))
+    optimizer = make_optimizer(OPTIMIZER, params, frozen=(ENCODER,))
     layout = parameter_layout(params, mesh, shard=False)
-    return make_train_step(make_loss_terms(model, _LOSS), _LOSS, optimizer, lambda _: 1e-6, layout), optimizer
+    return make_train_step(make_loss_terms(model, LOSS), LOSS, optimizer, lambda _: 1e-6, layout), optimizer
 
 
 def _measured(

@@ -31,9 +31,9 @@ POINT_KEYS = (
 ACCURACY_KEYS = ("rra@5", "rra@30", "rta@30", "auc@30")
 POSE_KEYS = (*ACCURACY_KEYS, "rotation_error", "identity_rotation_error")
 TRAJECTORY_KEYS = ("ate", "ate_ratio", "rpe_translation", "rpe_rotation")
-# Errors against a second set of true poses carry this before their names.
 # `scale` (one scale a clip) is what the paper's tables are compared with.
 _ALIGNMENTS = ("scale", "median")
+# Errors against a second set of true poses carry this before their names.
 SFM = "sfm/"
 
 
