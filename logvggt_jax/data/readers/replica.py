@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from logvggt_jax.data.dataset import TRAINING, About
-from logvggt_jax.data.formats.calibration import pinhole, relative, scaled, world_to_camera
+from logvggt_jax.data.formats.calibration import in_pixels, pinhole, relative, world_to_camera
 from logvggt_jax.data.formats.image import read_depth, read_rgb
 from logvggt_jax.data.formats.json_values import expecting, read_json
 from logvggt_jax.data.formats.numbered_files import numbered_frames, without_gaps
@@ -51,8 +51,9 @@ class Replica(FolderDataset):
         return files.folders_with(("results", "traj.txt"), self.root, "scenes")
 
     def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
-        calibration = self.root / "cam_params.json"
-        camera = _camera(calibration, files)
+        path = self.root / "cam_params.json"
+        calibration = path if files.exists(path) else None
+        camera = _CAMERA if calibration is None else _camera(calibration, files)
         results, trajectory = folder / "results", folder / "traj.txt"
         paths = without_gaps(numbered_frames(files, (results, "frame{:06d}.jpg"), (results, "depth{:06d}.png")))
         poses = read_pose_list(files, trajectory, count=len(paths))
@@ -67,12 +68,10 @@ class Replica(FolderDataset):
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         image = read_rgb(record.image)
         depth = (read_depth(record.depth) * record.depth_scale).astype(np.float32)
-        return image, depth, scaled(record.intrinsics, image.shape[1], image.shape[0])
+        return image, depth, in_pixels(record.intrinsics, image.shape[:2], record.image, record.calibration)
 
 
 def _camera(path: Path, files: SourceFiles) -> Mapping[str, float]:
-    if not files.exists(path):
-        return _CAMERA
     content = read_json(files.text(path, "the camera"), path)
     with expecting(path, f'{{"camera": {{{", ".join(_CAMERA)}}}}} with numbers'):
         values = {key: float(content["camera"][key]) for key in _CAMERA}

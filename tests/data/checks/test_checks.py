@@ -112,7 +112,7 @@ def test_every_kind_of_damage_is_named_and_counted_and_the_rest_goes_on(root: Pa
 
 
 def test_absurd_intrinsics_are_reported_for_every_frame_and_the_text_is_cut(root: Path):
-    write_camera(root, fx=4e5)
+    write_camera(root, fx=4e5, fy=4e5)
     report = check_copy("replica", root, all_images=True)
     assert report.problem_counts() == {"absurd intrinsics": 6}
     assert all("calibration" in problem.message for problem in report.problems)
