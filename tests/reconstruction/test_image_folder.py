@@ -415,6 +415,16 @@ def test_a_picture_that_breaks_while_it_is_decoded_is_left_out_once(tmp_path: Pa
         list(open_source(tmp_path, strict=True))
 
 
+def test_what_is_left_out_is_listed_in_order_whichever_thread_is_first(tmp_path: Path) -> None:
+    write_numbered(tmp_path, 60)
+    for number in (4, 17, 29):
+        damage_pixels(tmp_path / f"{number}.png")
+    source = open_source(tmp_path)
+    for load in reversed(list(source.loaders())):
+        load()
+    assert [skipped.name for skipped in source.skipped] == ["4", "17", "29"]
+
+
 @pytest.mark.parametrize("damage", [truncate, damage_pixels])
 def test_only_a_share_of_the_pictures_may_be_broken(tmp_path: Path, damage: Any) -> None:
     write_numbered(tmp_path, 40)

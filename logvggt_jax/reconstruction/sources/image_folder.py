@@ -76,7 +76,7 @@ class FolderSource(Source):
         names = _names([files[position] for position in chosen], listing.root)
         stamps = [float(position) for position in range(len(files))] if times is None else times
         self.is_timed = times is not None
-        self._asked_for = len(chosen)
+        self._places = {name: place for place, name in enumerate(names)}
         pictures = self._with_headers(
             [(name, stamps[position], files[position]) for name, position in zip(names, chosen, strict=True)]
         )
@@ -148,16 +148,18 @@ class FolderSource(Source):
         return SourceFrame(picture.name, picture.timestamp, image[part], header.focal_length, mask)
 
     def _leave_out(self, name: str, error: InputError) -> None:
-        """Lists a broken picture, once however often it is loaded."""
+        """Lists a broken picture in its place, once however often it is loaded."""
         if self.options.strict:
             raise error
         if all(skipped.name != name for skipped in self.skipped):
             self.skipped.append(SkippedFrame(name, str(error)))
+            # Whichever thread was first. A run that is taken up may remember one that has gone since.
+            self.skipped.sort(key=lambda skipped: self._places.get(skipped.name, len(self._places)))
 
     def _check_share(self) -> None:
-        if self.options.too_many_broken(len(self.skipped), self._asked_for):
+        if self.options.too_many_broken(len(self.skipped), len(self._places)):
             raise InputError(
-                f"{len(self.skipped)} of {self._asked_for} images of {self.path} cannot be read, more than the "
+                f"{len(self.skipped)} of {len(self._places)} images of {self.path} cannot be read, more than the "
                 f"{self.options.most_broken:.0%} that may be left out: {_reasons(self.skipped)}"
             )
 
