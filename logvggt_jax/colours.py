@@ -22,6 +22,16 @@ def depth_picture(depth: np.ndarray, *, near: float, far: float) -> np.ndarray:
     return coloured(np.where(valid, depth_levels(np.where(valid, depth, 1.0), near=near, far=far), np.nan))
 
 
+def depth_limits(depth: np.ndarray) -> tuple[float, float]:
+    """Near and far end of a scale for depth [...]: nearly all that is valid lies between them, the 2nd and the 98th
+    percentile. They differ; 1 and 2 where nothing is valid."""
+    valid = depth[np.isfinite(depth) & (depth > 0)]
+    if not valid.size:
+        return 1.0, 2.0
+    near, far = np.percentile(valid, (2, 98)).tolist()
+    return near, max(far, 1.001 * near)
+
+
 def depth_levels(depth: np.ndarray, *, near: float, far: float) -> np.ndarray:
     """Where valid depths [...] lie between `far` (0) and `near` (1) by their inverses; may be beyond."""
     return (1.0 / depth - 1.0 / far) / max(1.0 / near - 1.0 / far, 1e-12)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from logvggt_jax.colours import depth_picture
+from logvggt_jax.colours import depth_limits, depth_picture
 from logvggt_jax.frames import evenly_spaced
 from logvggt_jax.reconstruction.depth_files import write_picture
 from logvggt_jax.reconstruction.frame_pool import FramePool
@@ -37,17 +37,12 @@ def write_previews(result: Reconstruction, frames: Sequence[int], pool: FramePoo
 
 
 def depth_range(result: Reconstruction) -> tuple[float, float]:
-    """The depths between which nearly all pixels of a sequence lie: its 2nd and 98th percentile, from a sample."""
+    """`depth_limits` of a sequence, from a sample of its pixels."""
     samples = []
     for index in evenly_spaced(result.num_frames, _RANGE_FRAMES):
         depth = result.depth(index).reshape(-1)
-        depth = depth[:: max(1, len(depth) // _RANGE_PIXELS)]
-        samples.append(depth[np.isfinite(depth) & (depth > 0)])
-    valid = np.concatenate(samples)
-    if not valid.size:
-        return 1.0, 2.0
-    near, far = np.percentile(valid, (2, 98)).tolist()
-    return near, max(far, 1.001 * near)
+        samples.append(depth[:: max(1, len(depth) // _RANGE_PIXELS)])
+    return depth_limits(np.concatenate(samples))
 
 
 def preview(image: np.ndarray, depth: np.ndarray, near: float, far: float, unit: str) -> np.ndarray:

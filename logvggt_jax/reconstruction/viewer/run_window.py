@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from logvggt_jax.colours import depth_picture
+from logvggt_jax.colours import depth_limits, depth_picture
 from logvggt_jax.errors import one_line, printable
 from logvggt_jax.frames import evenly_spaced
 from logvggt_jax.geometry import camera_centres
@@ -164,11 +164,10 @@ class RunWindow:
 
     def _show_newest(self, scene: Scene) -> None:
         depth = scene.newest.result.depth
-        shown = depth[np.isfinite(depth) & (depth > 0)]
-        near, far = np.percentile(shown, (2, 98)).tolist() if len(shown) else (1.0, 2.0)
+        near, far = depth_limits(depth)
         self._image.image, self._depth.image = (
             shrunk(scene.newest.image),
-            shrunk(depth_picture(depth, near=near, far=max(far, near * 1.001))),
+            shrunk(depth_picture(depth, near=near, far=far)),
         )
         self._image.visible = self._depth.visible = True
         self._image.label = f"newest frame, {printable(scene.newest.name)}"

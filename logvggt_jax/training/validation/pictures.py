@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from logvggt_jax.colours import coloured, depth_picture
+from logvggt_jax.colours import coloured, depth_limits, depth_picture
 from logvggt_jax.frames import Frames, evenly_spaced
 from logvggt_jax.geometry import camera_centres, relative_to_first
 
@@ -32,7 +32,7 @@ def clip_picture(clip: Frames, depth: np.ndarray, confidence: np.ndarray) -> np.
       [h, w, 3] uint8 RGB.
     """
     valid = clip.depth > 0
-    near, far = (float(x) for x in np.percentile(clip.depth[valid], (2, 98))) if valid.any() else (1.0, 2.0)
+    near, far = depth_limits(clip.depth)
     with np.errstate(all="ignore"):  # a model may have lost its numbers, and is looked at all the more
         ratio = np.median(clip.depth[valid]) / np.median(depth[valid]) if valid.any() else 1.0
         aligned = ratio * depth
