@@ -148,10 +148,13 @@ def main() -> None:
     parser.add_argument("--masks", action="store_true", help="a step of a stream with masks of pixels")
     parser.add_argument("--train", metavar="CLIPSxFRAMES", help="the training step, for described devices")
     options = parser.parse_args()
+    targets = options.target or ["cpu"]
+    if options.train and (options.masks or {"cpu", "cuda"} & set(targets)):
+        parser.error("--train is for described devices, such as --target h100, and has no masks")
     config = ModelConfig(dtype=options.dtype)
     what = f"training step, clips {options.train} of" if options.train else "one step of 2 new frames"
     print(f"VGGT-1B sizes, {what} {IMAGE_SIZE[0]}x{IMAGE_SIZE[1]}, {options.dtype}")
-    for target in options.target or ["cpu"]:
+    for target in targets:
         if target == "cpu":
             lowering, compilation, compiled = compile_for_cpu(config, options.masks)
             print(f"cpu: lowered in {lowering:.1f} s, compiled in {compilation:.1f} s; {describe_memory(compiled)}")

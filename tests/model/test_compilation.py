@@ -5,6 +5,7 @@ The compilers run in processes of their own: JAX in this one is tied to the CPU,
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import os
 import re
@@ -84,6 +85,17 @@ def test_lowers_for_cuda_with_cudnn_attention(options: tuple[str, ...]) -> None:
 def test_lowers_and_compiles_for_a_cpu_within_a_minute() -> None:
     line = described("cpu")
     assert figure(r"lowered in ([\d.]+) s", line) + figure(r"compiled in ([\d.]+) s", line) < 60
+
+
+@pytest.mark.parametrize("options", [(), ("--target", "cuda"), ("--target", "h100", "--masks")])
+def test_a_training_step_is_not_announced_where_another_would_be_compiled(
+    options: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("JAX_PLATFORMS", "cpu")  # which the script sets where nothing does
+    monkeypatch.setattr(sys, "argv", ["compile_step.py", "--train", "4x12", *options])
+    with pytest.raises(SystemExit):
+        importlib.import_module("compile_step").main()
+    assert "--train is for described devices" in capsys.readouterr().err
 
 
 def test_kernels_are_counted_as_often_as_they_run() -> None:
