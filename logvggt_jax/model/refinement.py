@@ -239,10 +239,12 @@ class Refinement:
 
     @property
     def camera_head(self) -> CameraHead:
+        """From camera tokens to pose encodings, in rounds."""
         return CameraHead(self.config.camera_head, self.config.attention)
 
     @property
     def gccr(self) -> GCCR:
+        """From camera tokens to refined ones."""
         return GCCR(self._width, self.config.refinement.num_heads, self.config.dtype, self.config.attention)
 
     @property

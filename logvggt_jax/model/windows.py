@@ -325,18 +325,22 @@ class Windows:
 
     @property
     def encoder(self) -> DinoV2:
+        """From images to patch tokens."""
         return DinoV2(self.config.encoder, self.config.dtype, self.config.attention, self.remat)
 
     @property
     def aggregator(self) -> Aggregator:
+        """From patch tokens of a window to its tokens, frame and global blocks in turns."""
         return Aggregator(self.config, self.remat)
 
     @property
     def depth_head(self) -> DPTHead:
+        """From tokens of the key layers to depth and its confidence."""
         return DPTHead(self.config.depth_head, 2, self.config.dtype)
 
     @property
     def point_head(self) -> DPTHead:
+        """Likewise to points and theirs; ValueError for a model without it."""
         if self.config.point_head is None:
             raise ValueError("this model has no point head: set ModelConfig.point_head")
         return DPTHead(self.config.point_head, 4, self.config.dtype)

@@ -41,6 +41,7 @@ class Lens:
 
     @property
     def is_pinhole(self) -> bool:
+        """Whether it distorts nothing."""
         return not self.fisheye and not any(self.coefficients)
 
     def as_pinhole(
