@@ -394,7 +394,9 @@ def test_no_depth_is_nan_for_ros(tmp_path: Path) -> None:
     (folder,) = export(result, ["rosbag2"], progress=False)
     with AnyReader([folder]) as reader:
         wanted = [connection for connection in reader.connections if connection.topic == "/camera/depth/image_raw"]
-        for index, (connection, _, content) in enumerate(reader.messages(wanted)):
+        messages = list(reader.messages(wanted))
+        assert len(messages) == result.num_frames
+        for index, (connection, _, content) in enumerate(messages):
             depth = reader.deserialize(content, connection.msgtype).data.view(np.float32).reshape(result.image_size)
             there = depth_at(result.depth(index), result.image_size) > 0
             assert not there.all() and (depth[there] > 0).all() and np.isnan(depth[~there]).all()
@@ -403,7 +405,9 @@ def test_no_depth_is_nan_for_ros(tmp_path: Path) -> None:
 def test_masks_go_with_the_pictures_of_nerfstudio(tmp_path: Path) -> None:
     result = masked_result(tmp_path)
     (folder,) = export(result, ["nerfstudio"], point_filter=FEW_POINTS, progress=False)
-    for index, frame in enumerate(json.loads((folder / "transforms.json").read_text())["frames"]):
+    frames = json.loads((folder / "transforms.json").read_text())["frames"]
+    assert len(frames) == result.num_frames
+    for index, frame in enumerate(frames):
         with Image.open(folder / frame["mask_path"]) as mask:
             assert mask.mode == "L" and mask.size == (frame["w"], frame["h"])
             np.testing.assert_array_equal(
