@@ -6,7 +6,7 @@ import numpy as np
 
 from logvggt_jax.reconstruction.points.cloud_file import Cloud
 
-# A browser turns so many smoothly; they are 16 bytes each on their way there.
+# A browser turns so many smoothly; they are 15 bytes each on their way there.
 MOST_SHOWN = 2_000_000
 USUALLY_SHOWN = 500_000
 _BLOCK = 1_000_000
