@@ -209,7 +209,7 @@ def _crops(frames: Frames, size: tuple[int, int]) -> list[tuple[float, float, fl
 
 
 def _rescaled(intrinsics: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    result = intrinsics.copy()
+    result = intrinsics.astype(np.result_type(intrinsics, np.float32))
     result[..., :2, :2] *= scale[:, None]
     result[..., :2, 2] = (intrinsics[..., :2, 2] + 0.5) * scale - 0.5
     return result

@@ -168,6 +168,14 @@ def test_resampled_pictures_follow_their_cameras(seed: int):
     assert np.abs(fitted.depth - 3 - expected[..., 0]).max() < 0.51 * source_pixel + 0.01 * pixel
 
 
+def test_intrinsics_in_whole_numbers_are_numbers_too():
+    transform = ResizeTransform((480, 640), (392, 518))
+    whole = np.array([[525, 0, 320], [0, 525, 240], [0, 0, 1]])
+    np.testing.assert_array_equal(
+        transform.intrinsics_from_original(whole), transform.intrinsics_from_original(whole.astype(np.float64))
+    )
+
+
 def test_frames_that_fit_are_returned_as_they_are():
     rooms = Rooms("val", height=28, width=42, num_frames=2, num_rooms=1)
     frames = rooms.read(rooms.sequences[0], [0, 1])
