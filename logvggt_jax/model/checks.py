@@ -13,9 +13,7 @@ _SLACK = 1e-2
 
 def check_array(name: str, array: jax.Array, shape: tuple[int | None, ...], kind: Any) -> None:
     """Raises ValueError unless an array has this shape (None: any size) and its dtype is of this kind."""
-    if not hasattr(array, "shape"):
-        raise ValueError(f"{name} must be an array, got {type(array).__name__}")
-    found = tuple(array.shape)
+    found = _shape(name, array)
     fits = len(found) == len(shape) and all(a in (b, None) for a, b in zip(shape, found, strict=True))
     if not fits or not jnp.issubdtype(array.dtype, kind):
         wanted = ", ".join("any" if size is None else str(size) for size in shape)
@@ -25,7 +23,7 @@ def check_array(name: str, array: jax.Array, shape: tuple[int | None, ...], kind
 
 def check_images(images: jax.Array, patch_size: int, name: str = "images") -> None:
     """Raises ValueError unless images are [B, T, H, W, 3], uint8 or floating point, H and W multiples of a patch."""
-    shape = tuple(images.shape)
+    shape = _shape(name, images)
     if len(shape) != 5 or shape[-1] != 3 or 0 in shape:
         raise ValueError(f"{name} must have shape [B, T, H, W, 3] with T >= 1, got {shape}")
     check_pixels(images, patch_size, name)
@@ -66,3 +64,9 @@ def checked_mask(images: jax.Array, mask: jax.Array | None) -> jax.Array:
         return jnp.ones(images.shape[:2], bool)
     check_array("frame_mask", mask, images.shape[:2], jnp.bool_)
     return jnp.asarray(mask)
+
+
+def _shape(name: str, array: Any) -> tuple[int, ...]:
+    if not hasattr(array, "shape"):
+        raise ValueError(f"{name} must be an array, got {type(array).__name__}")
+    return tuple(array.shape)

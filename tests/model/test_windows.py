@@ -263,6 +263,7 @@ def test_donated_state_holds_no_buffer_twice(small_config, small_variables):
     ("images", "mask", "message"),
     [
         (np.zeros((1, 2, 28, 42)), None, "shape"),
+        ([np.zeros((2, 28, 42, 3), np.uint8)], None, "images must be an array, got list"),
         (np.zeros((1, 2, 28, 40, 3), np.float32), None, "multiples of 14"),
         (np.zeros((1, 2, 28, 42, 3), np.int32), None, "dtype int32"),
         (np.zeros((1, 0, 28, 42, 3), np.float32), None, "T >= 1"),
