@@ -7,6 +7,8 @@ frame, gives the same numbers.
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -124,14 +126,20 @@ def with_registers(cache: KeyValueCache, new: RegisterKeys) -> tuple[RegisterKey
     return RegisterKeys(keys.key, keys.value), keys.valid, cache
 
 
+Cache = TypeVar("Cache", bound=KeyValueCache)
+
+
 def empty(
-    kind: type[KeyValueCache], shape: tuple[int, ...], dtype: str = "float32", *, rounds: int | None = None
-) -> KeyValueCache:
-    """A cache of keys [B, capacity, heads, head_dim] that has seen nothing; one for each of `rounds`, if given."""
+    kind: type[Cache], shape: tuple[int, ...], dtype: str = "float32", *, rounds: int | None = None, **others: int
+) -> Cache:
+    """A cache of keys [B, capacity, heads, head_dim] that has seen nothing; one for each of `rounds`, if given.
+
+    `others` are the fields that this kind of cache has besides.
+    """
     leading = () if rounds is None else (rounds,)
     # Two buffers: a donated state holds none twice.
     key, value = (jnp.zeros((*leading, *shape), dtype) for _ in range(2))
-    return kind(key, value, jnp.zeros(leading, jnp.int32))
+    return kind(key, value, jnp.zeros(leading, jnp.int32), **others)
 
 
 def _keys_of(cache: KeyValueCache) -> Keys:

@@ -138,14 +138,6 @@ class PackedPrunedCache(PrunedCache):
         )
 
 
-def empty_pruned(shape: tuple[int, ...], dtype: str, *, special: int, rounds: int | None = None) -> PrunedCache:
-    """A cache [B, capacity, heads, head_dim] in full precision that has seen nothing; one for each of `rounds`."""
-    leading = () if rounds is None else (rounds,)
-    # Two buffers: a donated state holds none twice.
-    key, value = (jnp.zeros((*leading, *shape), dtype) for _ in range(2))
-    return PrunedCache(key, value, jnp.zeros(leading, jnp.int32), special)
-
-
 def empty_packed(shape: tuple[int, ...], *, special: int, tokens: int) -> PackedPrunedCache:
     """A packed cache [B, capacity, heads, head_dim] for frames of so many tokens that has seen nothing."""
     batch, capacity, heads, width = shape

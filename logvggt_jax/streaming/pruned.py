@@ -11,7 +11,7 @@ from logvggt_jax.errors import InputError
 from logvggt_jax.model.key_value_cache import AnchoredCache, Caches, CameraMemory, empty
 from logvggt_jax.model.memory import RoundMemory
 from logvggt_jax.model.padding import doubled
-from logvggt_jax.model.pruned_cache import PrunedCache, empty_packed, empty_pruned
+from logvggt_jax.model.pruned_cache import PrunedCache, empty_packed
 from logvggt_jax.streaming.causal import CAMERA_CACHES
 from logvggt_jax.streaming.frame_session import (
     CAMERA_CAPACITY,
@@ -70,7 +70,7 @@ class KeepWanted:
         def layer() -> PrunedCache:
             if settings.bits == 4:
                 return empty_packed(shape, special=special, tokens=tokens)
-            return empty_pruned(shape, config.dtype, special=special)
+            return empty(PrunedCache, shape, config.dtype, special=special)
 
         blocks = Caches(tuple(layer() for _ in range(config.aggregator.depth)))
         return StreamMemory(blocks, self._camera(config, tokens))
@@ -97,7 +97,7 @@ class KeepWanted:
         per_round = self.settings.camera_cache == "per_round"
         entries = min(CAMERA_CAPACITY * (1 if per_round else self.rounds), self._most(1))
         shape, rounds = (1, entries, head.num_heads, width // head.num_heads), self.rounds if per_round else None
-        trunk = Caches(tuple(empty_pruned(shape, "float32", special=1, rounds=rounds) for _ in range(head.depth)))
+        trunk = Caches(tuple(empty(PrunedCache, shape, rounds=rounds, special=1) for _ in range(head.depth)))
         registers = None
         if config.refinement.enabled:
             frames = min(CAMERA_CAPACITY, self._most(tokens) // tokens)
