@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import functools
+import inspect
 import json
 import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import jax
@@ -20,13 +23,21 @@ from result_folder import write_result
 from logvggt_jax import ModelConfig
 from logvggt_jax.cli import main
 from logvggt_jax.cli.choices import FORMATS, METHOD_NAMES
+from logvggt_jax.cli.program import command_parser
 from logvggt_jax.compile import default_cache_folder, enable_compilation_cache
 from logvggt_jax.data import DATASETS
+from logvggt_jax.data.packed.pack import pack
 from logvggt_jax.errors import DiskError
 from logvggt_jax.operations import matmul_flops_per_second
 from logvggt_jax.reconstruction import EXPORTERS, Reconstruction
 from logvggt_jax.reconstruction.exporters import Format
+from logvggt_jax.reconstruction.fusion.rescale import rescale
+from logvggt_jax.reconstruction.live import OnlineSettings
 from logvggt_jax.reconstruction.points.cloud_file import read_points
+from logvggt_jax.reconstruction.points.point_filter import PointFilter
+from logvggt_jax.reconstruction.reconstruct import reconstruct
+from logvggt_jax.reconstruction.sources import SourceOptions
+from logvggt_jax.reconstruction.viewer import open_viewer
 from logvggt_jax.streaming import METHODS
 from logvggt_jax.weights.checkpoints import save_model
 from logvggt_jax.weights.provenance import Provenance
@@ -85,6 +96,30 @@ def test_help_names_every_command_and_each_shows_an_example(capsys: pytest.Captu
 def test_every_method_is_a_mode_and_every_exporter_a_format() -> None:
     assert set(METHOD_NAMES) == set(METHODS)
     assert tuple(EXPORTERS) == FORMATS
+
+
+def test_defaults_are_those_of_the_functions_behind() -> None:
+    """The parser writes them out, since it is built before anything is imported."""
+
+    def differing(command: str, function: Callable[..., Any], **renamed: str) -> set[str]:
+        """Parameters whose default is not that of the option of this name, or of the one that it is renamed to."""
+        given = vars(command_parser().parse_args(command.split()))
+        parameters = inspect.signature(function).parameters.values()
+        expected = {each.name: each.default for each in parameters if each.default is not each.empty}
+        assert set(renamed) <= set(expected) and set(renamed.values()) <= set(given)
+        known = {name: option for name in expected if (option := renamed.get(name, name)) in given}
+        assert known
+        return {name for name, option in known.items() if given[option] != expected[name]}
+
+    command = "reconstruct walk.mp4 --checkpoint rooms --output walk"
+    assert differing(command, PointFilter) == set()
+    assert differing(command, SourceOptions) == set()
+    # These follow from the checkpoint.
+    assert differing(command, reconstruct, num_previews="previews") == {"method", "longer_edge"}
+    assert differing("live 0 --checkpoint rooms", OnlineSettings) == set()
+    assert differing("view walk", open_viewer) == set()
+    assert differing("scale walk --output metres --depth sensor", rescale) == {"depth"}
+    assert differing("data pack scannet scans --output shards", pack) == set()
 
 
 def test_help_does_not_wait_for_jax() -> None:
