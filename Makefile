@@ -67,5 +67,6 @@ docs: install
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 	@echo "The documentation: runs/site/index.html"
 
+# What the targets above made. The other folders in runs/ are somebody's hours of training.
 clean:
-	rm -rf $(VENV) runs
+	rm -rf $(VENV) $(DEMO) runs/test runs/test-all runs/site

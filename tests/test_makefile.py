@@ -5,6 +5,7 @@ import importlib.util
 import operator
 import re
 import shlex
+import shutil
 import subprocess
 from pathlib import Path
 
@@ -69,6 +70,18 @@ def test_the_demo_uses_the_model_that_ships(commands: list[list[str]]) -> None:
         given += [words[i + 1] for i, word in enumerate(words) if word == "--checkpoint"]
         given += [word.partition("=")[2] for word in words if word.startswith("--checkpoint=")]
     assert given == ["rooms"] * 2
+
+
+def test_cleaning_leaves_what_others_have_made(tmp_path: Path) -> None:
+    shutil.copy(ROOT / "Makefile", tmp_path)
+    for folder in (".venv", "runs/demo/room", "runs/test", "runs/test-all", "runs/site", "runs/h20/model"):
+        (tmp_path / folder).mkdir(parents=True)
+    subprocess.run(["make", "--no-print-directory", "clean"], cwd=tmp_path, capture_output=True, check=True, timeout=60)
+    assert {path.name for path in tmp_path.iterdir()} == {"Makefile", "runs"}
+    assert [path.relative_to(tmp_path / "runs").as_posix() for path in (tmp_path / "runs").rglob("*")] == [
+        "h20",
+        "h20/model",
+    ]
 
 
 def test_one_duration_of_the_demo_is_stated() -> None:
