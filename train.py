@@ -96,12 +96,12 @@ def main(arguments: Sequence[str]) -> None:
         profile = ProfiledSteps.parse(_PROFILE.value) if _PROFILE.value else None
         use_cpu_cores(config, num_processes=_NUM_PROCESSES.value or 1)
         check_nccl()
-        apart = (_COORDINATOR, _NUM_PROCESSES, _PROCESS_ID)
+        apart = (_COORDINATOR, _NUM_PROCESSES, _PROCESS_ID, _JOIN_SECONDS)
         if not (_WORKDIR.value is None or _WORKDIR.value.strip()):
             raise InputError("--workdir is empty: name a folder, which is made if need be")
         if _PREFLIGHT.value and _DRY_RUN.value:
             raise InputError("--preflight tries what --dry_run only compiles: give one of them")
-        if given := [flag for flag in apart if flag.value is not None and not _DISTRIBUTED.value]:
+        if given := [flag for flag in apart if flag.present and not _DISTRIBUTED.value]:
             raise InputError(f"--{given[0].name} is of runs of several processes: add --distributed, or leave it out")
         if _DISTRIBUTED.value:
             watched = join_processes(

@@ -169,6 +169,7 @@ def test_an_argument_that_is_no_flag_is_one_line(run_train: Callable, tmp_path: 
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
+        (["--join_seconds=600"], "--join_seconds is of runs of several processes: add --distributed"),
         (["--num_processes=2", "--process_id=0"], "--num_processes is of runs of several processes: add --distributed"),
         (["--workdir="], "--workdir is empty: name a folder"),
         (["--preflight", "--dry_run"], "--preflight tries what --dry_run only compiles: give one of them"),
