@@ -83,10 +83,10 @@ def nearest_rotation(matrix: Any) -> Any:
     return ((u * signs[..., None, :])[..., :, :, None] * vt[..., None, :, :]).sum(-2)
 
 
-def is_rotation(matrix: Any, tolerance: float = 1e-3) -> Any:
-    """Whether matrices [..., 3, 3] are rotations, to `tolerance` in every entry of R^T R; bool [...]."""
+def is_rotation(matrix: Any) -> Any:
+    """Whether matrices [..., 3, 3] are rotations, to 1e-3 in every entry of R^T R; bool [...]."""
     xp = namespace(matrix)
     gram = (matrix[..., :, :, None] * matrix[..., :, None, :]).sum(-3)
-    orthogonal = (xp.abs(gram - xp.eye(3)) <= tolerance).all((-2, -1))
+    orthogonal = (xp.abs(gram - xp.eye(3)) <= 1e-3).all((-2, -1))
     turned = xp.linalg.cross(matrix[..., 0, :], matrix[..., 1, :])
     return orthogonal & ((turned * matrix[..., 2, :]).sum(-1) > 0)

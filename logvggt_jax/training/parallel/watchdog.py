@@ -11,7 +11,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator
-from typing import IO
 
 # Not before this, however quick the steps are: a network disk may be slow for minutes.
 LEAST_SECONDS = 300.0
@@ -29,19 +28,10 @@ class Watchdog:
       factor: of the median time of the last steps.
       least: seconds, below which nothing ends the process.
       other: seconds for what is no step.
-      file: of the stacks, with a descriptor; standard error if None.
     """
 
-    def __init__(
-        self,
-        factor: float,
-        *,
-        least: float = LEAST_SECONDS,
-        other: float = OTHER_SECONDS,
-        file: IO[str] | None = None,
-    ) -> None:
+    def __init__(self, factor: float, *, least: float = LEAST_SECONDS, other: float = OTHER_SECONDS) -> None:
         self._factor, self._least, self._other = factor, least, other
-        self._file = file
         self._seconds: deque[float] = deque(maxlen=_REMEMBERED)
         self._last: float | None = None
         self._deadline, self._reason = 0.0, ""
@@ -49,7 +39,7 @@ class Watchdog:
         self._entered = False
 
     def __enter__(self) -> Watchdog:
-        if self._factor and (file := self._file or sys.__stderr__) is not None:
+        if self._factor and (file := sys.__stderr__) is not None:
             self._stacks = file
             self._entered = True
             self._allow(self._other, "nothing has ended")
