@@ -179,7 +179,13 @@ def add_to(commands: Any) -> None:
         help="two pixels of original images that show points --distance apart",
     )
     sub.add_argument("--distance", type=float, default=None, metavar="METRES", help="between the two frames or pixels")
-    sub.add_argument("--depth-unit", type=float, default=0.001, metavar="METRES", help="what a level of the depth is")
+    sub.add_argument(
+        "--depth-unit",
+        type=float,
+        default=None,
+        metavar="METRES",
+        help="what a level of the sensor's depth is (default: 0.001)",
+    )
     output_option(sub)
     overwrite_option(sub, "an earlier reconstruction")
 

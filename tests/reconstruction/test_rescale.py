@@ -131,6 +131,7 @@ def test_from_poses_in_metres(truth: Reconstruction, result: Reconstruction, tmp
         ({"frames": ("0", "1")}, "cameras of 0 and 1 are apart is not said: give the distance in metres"),
         ({"frames": ("2", "2"), "distance": 1.0}, "at one place in the result"),
         ({"poses": "poses.txt", "distance": 1.0}, "a distance is one between two frames or two pixels"),
+        ({"frames": ("0", "1"), "distance": 1.0, "depth_unit": 0.01}, "a unit of depth is that of a sensor's depth"),
         (
             {"frames": ("0", "9"), "distance": 1.0},
             "no frame '9': give a name such as 'view 0', or a number from 0 to 3",

@@ -28,7 +28,7 @@ def rescale(
     *,
     poses: str | Path | None = None,
     depth: str | Path | None = None,
-    depth_unit: float = 0.001,
+    depth_unit: float | None = None,
     frames: tuple[str, str] | None = None,
     pixels: tuple[str, str] | None = None,
     distance: float | None = None,
@@ -42,7 +42,7 @@ def rescale(
       output: folder of the new result.
       poses: cameras in metres, see `read_poses`.
       depth: folder with a sensor's depth, 16-bit PNG files whose names begin as the frames'.
-      depth_unit: metres that a level of these is.
+      depth_unit: metres that a level of these is; None for 0.001.
       frames: two frames by name or number from 0, whose cameras are `distance` apart.
       pixels: two pixels as FRAME,U,V (of the original images, centres at integers), whose points are `distance` apart.
       distance: metres.
@@ -57,6 +57,8 @@ def rescale(
         raise InputError("a scale comes from poses, depth, two frames or two pixels: give one of them")
     if distance is not None and frames is None and pixels is None:
         raise InputError("a distance is one between two frames or two pixels: poses and depth have metres already")
+    if depth_unit is not None and depth is None:
+        raise InputError("a unit of depth is that of a sensor's depth, which is not given: leave it out")
     read = [path for path in (poses, depth) if path is not None]
     check_derived(result, output, overwrite=overwrite, read=read)
     notes: list[str] = []
@@ -65,7 +67,7 @@ def rescale(
         factor = similarity.scale
         notes.append(said)
     elif depth is not None:
-        factor = _from_depth(result, user_path(depth), depth_unit, notes)
+        factor = _from_depth(result, user_path(depth), 0.001 if depth_unit is None else depth_unit, notes)
     elif frames is not None:
         centres = camera_centres(result.extrinsics[[find_frame(result, name) for name in frames]])
         factor = _from_distance(centres, distance, f"the cameras of {frames[0]} and {frames[1]}", notes)
