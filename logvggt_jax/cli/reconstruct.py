@@ -53,7 +53,8 @@ def _reconstruct(options: argparse.Namespace) -> int:
         pixel_stride=options.pixel_stride,
         max_points=options.max_points or None,
     )
-    check_formats(options.export)
+    formats = list(dict.fromkeys(options.export))
+    check_formats(formats)
     check_watch(options)
     calibration = Calibration(options.intrinsics, options.shared_intrinsics)
     target = check_request(
@@ -82,7 +83,7 @@ def _reconstruct(options: argparse.Namespace) -> int:
     decides = what_decides(source, config, method, settings, longer_edge, point_filter, calibration)
     check_leftovers(target, decides, source, overwrite=options.overwrite)
     compiled = config if options.dry_run else None
-    needs = describe(source, target, compiled, method, settings, longer_edge, point_filter, options.export)
+    needs = describe(source, target, compiled, method, settings, longer_edge, point_filter, formats)
     if provenance.longer_edge not in (None, longer_edge):
         source.notes.append(f"these weights were trained at {provenance.longer_edge} pixels, not {longer_edge}")
     if options.precision and options.dry_run:
@@ -115,8 +116,8 @@ def _reconstruct(options: argparse.Namespace) -> int:
         print(result.summary())
         code = INTERRUPTED
         if result.complete:
-            code = _exports(result, options.export)
-        elif options.export:
+            code = _exports(result, formats)
+        elif formats:
             print("logvggt: note: not exported, since it is incomplete; see logvggt export --help", file=sys.stderr)
         stay_open(window, result)
     return code
