@@ -128,8 +128,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     frames = max(options.frames // PART, 3) * PART
     with counted_compilations() as compilations:
         parts = run(lambda: open_predictor("windows", chosen, variables), size, frames, compilations)
-    second, half, last = parts[1], parts[len(parts) // 2], parts[-1]
-    grown = (last.memory - half.memory) / (PART * (len(parts) - 1 - len(parts) // 2))
+    # The last thousand's memory is that at its beginning, before there was another stream.
+    before_last, middle = len(parts) - 2, (len(parts) - 2) // 2
+    second, half, last = parts[1], parts[middle], parts[-1]
+    grown = (last.memory - half.memory) / (PART * (before_last - middle))
     print(
         f"last thousand over the second of the same stream: {last.processor / second.processor:.2f} of processor time, "
         f"{last.clock / second.clock:.2f} by the clock; {grown:.0f} bytes a frame in the second half, "
