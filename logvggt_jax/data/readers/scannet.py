@@ -2,9 +2,10 @@
 
 Layout, as exported by the SensReader of the official repository: `<root>/<part>/<scene>/` with
 `color/<n>.jpg`, `depth/<n>.png`, `pose/<n>.txt` and `intrinsic/intrinsic_depth.txt`. `<part>` is `scans_train`,
-`scans_test` or `scannetv2`, or is left out; scenes are named `scene0000_00`. Numbers are not padded (`0.jpg`), or are,
-as other exporters write them (`000000.jpg`). Depth is uint16 in millimetres, 0 where invalid. Poses are camera-to-world
-in metres, OpenCV axes; a lost frame's entries are `-inf`. Intrinsics are 4x4.
+`scans_test`, `scannetv2` or, as the set's download script names the scenes of training and validation, `scans`; or it
+is left out. Scenes are named `scene0000_00`. Numbers are not padded (`0.jpg`), or are, as other exporters write them
+(`000000.jpg`). Depth is uint16 in millimetres, 0 where invalid. Poses are camera-to-world in metres, OpenCV axes; a
+lost frame's entries are `-inf`. Intrinsics are 4x4.
 
 Also read, where a scene has no `color`, is the form that published evaluations prepare (MonST3R's script):
 `color_90/frame_0000.jpg`, `depth_90/frame_0000.png` and `pose_90.txt` with 16 numbers a line, and likewise for other
@@ -31,7 +32,9 @@ from logvggt_jax.errors import InputError
 
 _SCENE = re.compile(r"scene\d{4}_\d{2}")
 _PREPARED = re.compile(r"color_(\d+)")
-_PARTS = {"scans_train": "train", "scans_test": "test", "scannetv2": None}
+# The download script's folder, whose scenes may have been exported to another.
+_DOWNLOADED = "scans"
+_PARTS = {_DOWNLOADED: None, "scans_train": "train", "scans_test": "test", "scannetv2": None}
 _ASPECT_TOLERANCE = 0.05  # 1296 x 968 and 640 x 480 differ by 0.004
 
 
@@ -48,7 +51,9 @@ class ScanNet(FolderDataset):
 
     name = "scannet"
     title = "ScanNet"
-    expects = "scans_train, scans_test or scannetv2 with scene0000_00/{color,depth,pose,intrinsic} (export the .sens)"
+    expects = (
+        "scans, scans_train, scans_test or scannetv2 with scene0000_00/{color,depth,pose,intrinsic} (export the .sens)"
+    )
     metric = True
     plausible_depth = INDOORS
     splits = ("train", "val", "test", "all")
@@ -123,6 +128,8 @@ class ScanNet(FolderDataset):
             if other or not files.exists(self.root / part):
                 continue
             for name, folder in files.folders(self.root / part, "scenes", _SCENE).items():
+                if part == _DOWNLOADED and not _is_exported(folder, files):
+                    continue
                 if name in scenes:
                     raise InputError(f"{folder} and {scenes[name]} are the same scene: remove one of them")
                 scenes[name] = folder
@@ -140,6 +147,11 @@ class ScanNet(FolderDataset):
                     f"{self.root}: no folder of scene {name}, but {path.name} lists it; export it or edit the list"
                 )
         return {name: scenes[name] for name in names}
+
+
+def _is_exported(scene: Path, files: SourceFiles) -> bool:
+    """Whether a scene's folder has pictures, and not only the files that the set's owners publish of it."""
+    return any(name == "color" or _PREPARED.fullmatch(name) for name in files.names(scene, "color, depth and pose"))
 
 
 def _calibration(scene: Path) -> Path:

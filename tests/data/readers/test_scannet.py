@@ -53,6 +53,16 @@ def test_other_folders_of_scenes_are_read(tmp_path: Path, part: str):
     check_views(scans.read("scene0011_01", range(4)), VIEWS, **ERRORS)
 
 
+def test_scenes_of_the_download_folder_are_read_where_they_were_exported_there(root: Path):
+    write_scene(root / "scans/scene0011_01")
+    sens = root / "scans/scene0000_00/scene0000_00.sens"  # exported to scans_train
+    sens.parent.mkdir()
+    sens.touch()
+    assert ScanNet(root).sequences == ("scene0000_00", "scene0011_01", "scene0707_00")
+    # Which of them are for training is not known without the lists.
+    assert ScanNet(root, "train").sequences == ("scene0000_00",)
+
+
 def test_the_prepared_form_comes_back(tmp_path: Path):
     scene = tmp_path / "scannetv2/scene0707_00"
     write_prepared(scene)
