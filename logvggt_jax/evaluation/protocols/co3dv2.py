@@ -19,6 +19,7 @@ def poses(settings: ProtocolSettings, num_frames: int) -> Protocol:
         decisions=(
             f"min({num_frames}, n) of a sequence's n frames (most have 100 to 200, so that 500 are all of them), "
             f"drawn with seed {settings.seed} for each sequence, fed in time order (the paper does not say).",
-            "Sequences of the official test lists with viewpoint quality above 0.5. Co3Dv2 is a training set as well.",
+            "Sequences of the official test lists, or in a copy without them (split all) of all that is there, with "
+            "viewpoint quality above 0.5. Co3Dv2 is a training set as well.",
         ),
     )

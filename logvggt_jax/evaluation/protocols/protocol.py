@@ -65,7 +65,8 @@ class Protocol:
 
     def takes(self, sequence: str) -> bool:
         """Whether a sequence of the data set belongs to the benchmark."""
-        return re.fullmatch(self.sequences, sequence) is not None
+        # A folder's name can hold a line's end.
+        return re.fullmatch(self.sequences, sequence, re.DOTALL) is not None
 
     def measures(self) -> dict[str, Any]:
         """What decides the numbers of given frames: the images' rule and the metrics, as JSON values."""

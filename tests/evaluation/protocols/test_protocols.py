@@ -69,6 +69,17 @@ def test_video_depth_has_the_peers_frames_masks_and_sequences() -> None:
     assert PROTOCOLS["kitti-depth-110"].splits == ("val",)
 
 
+@pytest.mark.parametrize("name", ["scannet-poses-500", "scannet-ate-50"])
+def test_scannet_is_evaluated_on_its_test_scenes_alone(name: str) -> None:
+    # A copy without split lists has the scenes of training as well.
+    assert all(PROTOCOLS[name].takes(scene) for scene in ("scene0707_00", "scene0806_00", "scene0710_00/color_90"))
+    assert not any(PROTOCOLS[name].takes(scene) for scene in ("scene0000_00", "scene0706_00", "scene0000_00/color_90"))
+
+
+def test_a_sequence_belongs_to_a_benchmark_whatever_is_in_its_name() -> None:
+    assert PROTOCOLS["nrgbd-reconstruction-10"].takes("two\nlines")
+
+
 def test_prepared_sequences_are_not_cut_twice() -> None:
     assert frames("bonn-depth-110", 110, "rgbd_bonn_crowd2/rgb_110") == tuple(range(110))
     assert frames("scannet-ate-50", 90, "scene0707_00/color_90") == tuple(range(50))
