@@ -133,8 +133,8 @@ def add_to(commands: Any) -> None:
         "logvggt data pack scannet /data/scannet --split train --output /packed/scannet --workers 8",
         details=" Training on the packed folder (--config.data.sources.scannet.root=/packed/scannet) draws the same "
         "clips. Every frame is stored as the reader hands it out, without loss, so that nothing is decoded again. The "
-        "same command goes on after an interruption, and writes anew what is damaged. What cannot be read is named and "
-        "fails in training as it did before.",
+        "same command goes on after an interruption, and writes anew what is damaged, and what was corrected in the "
+        "data set since. What cannot be read is named and fails in training as it did before.",
     )
     _copy_arguments(sub)
     sub.add_argument("--output", type=given_path, required=True, metavar="FOLDER", help="folder to write the shards to")

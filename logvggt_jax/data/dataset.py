@@ -157,6 +157,13 @@ class Reader(Dataset):
         """As of `Dataset`."""
         return None
 
+    def content_digest(self, sequence: str) -> str:
+        """What tells the frames of `sequence` from those of a copy that was corrected since, and not where it lies.
+
+        Empty where the `identity` and the sequence's name decide everything.
+        """
+        return ""
+
 
 def check_split(split: str, reader: Reader) -> None:
     """Raises InputError unless `reader` has `split`."""

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from logvggt_jax.data.dataset import Dataset, Reader
+from logvggt_jax.data.dataset import Reader
 from logvggt_jax.data.option_fields import given_options
 from logvggt_jax.data.registry import READERS, checked_options, open_dataset
 from logvggt_jax.errors import InputError
@@ -90,7 +90,7 @@ def open_benchmarks(
     root = None if data_root is None else Path(data_root)
     if root is not None and not root.is_dir():
         raise InputError(f"{root}: no such folder; --data_root is the folder that holds one folder a data set")
-    opened: dict[tuple[str, tuple[str, ...]], tuple[Dataset | None, str, str]] = {}
+    opened: dict[tuple[str, tuple[str, ...]], tuple[Reader | None, str, str]] = {}
     for protocol in protocols:
         key = (protocol.dataset, protocol.splits)
         if key in opened:
@@ -110,7 +110,7 @@ def open_benchmarks(
     return benchmarks
 
 
-def _first_split(protocol: Protocol, folder: Path, settings: ProtocolSettings) -> tuple[Dataset | None, str, str]:
+def _first_split(protocol: Protocol, folder: Path, settings: ProtocolSettings) -> tuple[Reader | None, str, str]:
     """The first of the protocol's splits that the folder has, its name; or why there is none."""
     if not folder.is_dir():
         return None, "", f"{folder}: no such folder"
@@ -123,7 +123,7 @@ def _first_split(protocol: Protocol, folder: Path, settings: ProtocolSettings) -
     return None, "", "; ".join(reasons)
 
 
-def _opened(protocol: Protocol, folder: Path | None, split: str, settings: ProtocolSettings) -> Dataset:
+def _opened(protocol: Protocol, folder: Path | None, split: str, settings: ProtocolSettings) -> Reader:
     return open_evaluation_set(
         protocol.dataset,
         folder,

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
-from logvggt_jax.data.dataset import Dataset
+from logvggt_jax.data.dataset import Reader
 from logvggt_jax.errors import InputError
 from logvggt_jax.evaluation.environment import code_version
 from logvggt_jax.evaluation.methods.method import Method
@@ -17,7 +17,7 @@ class Benchmark:
     """A protocol and the data it finds."""
 
     protocol: Protocol  # frames, images, metrics
-    dataset: Dataset | None  # None where the data set is missing
+    dataset: Reader | None  # None where the data set is missing
     split: str  # the one that is evaluated
     missing: str = ""  # why `dataset` is None
 
@@ -31,11 +31,12 @@ class Benchmark:
 
 @dataclasses.dataclass(frozen=True)
 class Clip:
-    """Frames `indices` of `sequence` of a benchmark."""
+    """Frames `indices` of `sequence` of a benchmark, which has this `content` (see `Reader.content_digest`)."""
 
     benchmark: Benchmark
     sequence: str
     indices: tuple[int, ...]
+    content: str = ""
 
     @property
     def address(self) -> dict[str, Any]:
@@ -48,7 +49,7 @@ class Clip:
         protocol, dataset = self.benchmark.protocol, self.benchmark.dataset
         assert dataset is not None  # only a data set that is there has clips
         names = [protocol.name, method.name]
-        data = [protocol.dataset, dataset.identity, self.sequence, self.indices]
+        data = [protocol.dataset, dataset.identity, self.sequence, self.indices, self.content]
         claims = [method.depth, method.pose, method.points, method.static]
         return record_key(code_version(), names, data, protocol.measures(), claims, method.identity)
 
@@ -65,8 +66,9 @@ def plan_clips(
             try:
                 count = benchmark.dataset.num_frames(sequence)
                 chosen = benchmark.protocol.frames(sequence, count)
+                content = benchmark.dataset.content_digest(sequence)
             except (InputError, OSError) as error:
                 skipped.append({**Clip(benchmark, sequence, ()).address, "reason": str(error)})
                 continue
-            clips += [Clip(benchmark, sequence, indices) for indices in chosen]
+            clips += [Clip(benchmark, sequence, indices, content) for indices in chosen]
     return clips, skipped

@@ -51,9 +51,9 @@ def evaluate(
     """Evaluates all methods on the same clips.
 
     Every clip's metrics are appended to `output`/clips.jsonl as soon as they are known; results.json follows at the
-    end. What decides a clip's numbers is their key: the code that measures, the data set's frames, the images' rule,
-    the measures, and the method with its parameters. A later run takes over what it finds under its keys. Results of
-    other runs in the folder stay until this one is complete, and then make place for it.
+    end. What decides a clip's numbers is their key: the code that measures, the frames and their truth, the images'
+    rule, the measures, and the method with its parameters. A later run takes over what it finds under its keys. Results
+    of other runs in the folder stay until this one is complete, and then make place for it.
 
     A clip that is to be drawn and whose pictures are not there is predicted and measured again for the first method.
 

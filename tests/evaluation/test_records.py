@@ -7,11 +7,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from known_answers import SETTINGS, benchmarks_of, failing, run
-from layouts import co3dv2
+from layouts import co3dv2, seven_scenes
 
 from logvggt_jax.data.readers.co3dv2 import Co3Dv2
+from logvggt_jax.data.readers.seven_scenes import SevenScenes
 from logvggt_jax.data.rooms.rooms import Rooms
 from logvggt_jax.errors import InputError
 from logvggt_jax.evaluation import environment, plan, runner
@@ -117,6 +119,23 @@ def test_a_sequence_whose_frames_differ_by_split_is_measured_again(tmp_path: Pat
     for split, expected in (("all", 1), ("test", 2), ("test", 2)):
         run(Co3Dv2(root, split), [method], tmp_path / "out", settings)
         assert len(calls) == expected, split
+
+
+def test_a_data_set_whose_truth_was_corrected_is_measured_again(tmp_path: Path) -> None:
+    seven_scenes.LAYOUT.write(tmp_path / "set", seven_scenes.LAYOUT.views)
+    method, calls = failing("", at_call=-1)
+    settings = dataclasses.replace(SETTINGS, clip_lengths=(2,), stride=1)
+    first = run(SevenScenes(tmp_path / "set"), [method], tmp_path / "out", settings)
+    run(SevenScenes(tmp_path / "set"), [method], tmp_path / "out", settings)
+    assert len(calls) == 1
+    pose = next((tmp_path / "set").rglob("*000001.pose.txt"))
+    np.savetxt(pose, np.eye(4))
+    corrected = run(SevenScenes(tmp_path / "set"), [method], tmp_path / "out", settings)
+    assert len(calls) == 2 and corrected["summary"] != first["summary"]
+    # Elsewhere it is the same.
+    (tmp_path / "set").rename(tmp_path / "moved")
+    run(SevenScenes(tmp_path / "moved"), [method], tmp_path / "out", settings)
+    assert len(calls) == 2
 
 
 def test_rooms_measured_among_fewer_are_taken_over_by_a_run_over_more(tmp_path: Path) -> None:

@@ -127,6 +127,10 @@ class PackedDataset(Reader):
         found = np.array(stored, np.float32)[check_indices(indices, self.num_frames(sequence), sequence)]
         return found if np.isfinite(found).any() else None
 
+    def content_digest(self, sequence: str) -> str:
+        """As of the reader that was packed."""
+        return str(self._notes(sequence).get("content", ""))
+
     def _frame(self, record: int, place: PackedSequence) -> Frames:
         path = shard_file(self._root, place.shard)
         try:

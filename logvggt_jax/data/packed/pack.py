@@ -79,8 +79,8 @@ def pack(
 
     Sequences lie whole, in order, a shard being full with `frames_per_shard` frames. Shards appear when they are
     complete, with their digests; the same command goes on after an interruption, and on a finished folder writes anew
-    what is damaged. What cannot be read is kept as such: reading it back fails with the same message. `workers`
-    processes read at once.
+    what is damaged, and what has changed in the data set since (see `Reader.content_digest`). What cannot be read is
+    kept as such: reading it back fails with the same message. `workers` processes read at once.
 
     Raises OutputExists where `output` holds something else, InputError where it was begun with other data or settings
     or another run is at work on it, DiskError where it cannot be written; and as `open_dataset`.
@@ -116,7 +116,7 @@ def _pack(
 ) -> PackReport:
     console = Console(stderr=True, quiet=not progress)
     with console.status("Listing sequences"):
-        sequences = _placed(reader, frames_per_shard)
+        sequences, contents = _placed(reader, frames_per_shard)
     plan = json_digest([dict(reader.identity), dict(options), split, [asdict(each) for each in sequences]])
     path = output / PLAN
     if path.exists() and read_json_object(path).get("digest") != plan:
@@ -132,7 +132,8 @@ def _pack(
     with Progress(console=console, transient=True) as bar:
         task = bar.add_task("Shards", total=count)
         for number in range(count):
-            found = _whole(output, number, plan)
+            names = [each.name for each in sequences if each.shard == number and each.error is None]
+            found = _whole(output, number, plan, {name: contents[name] for name in names})
             if found is not None:
                 shards[number] = found
                 bar.advance(task)
@@ -141,7 +142,7 @@ def _pack(
         if kept < count:
             (output / INDEX).unlink(missing_ok=True)
         left = [number for number in range(count) if number not in shards]
-        for number, made in _written(reader, output, sequences, left, plan, workers):
+        for number, made in _written(reader, output, sequences, contents, left, plan, workers):
             shards[number] = made
             bar.advance(task)
     index = PackedIndex(
@@ -175,13 +176,17 @@ def _splits(reader: Reader, root: str | Path, split: str, options: Mapping[str, 
     return found
 
 
-def _placed(reader: Reader, frames_per_shard: int) -> list[PackedSequence]:
-    """Every sequence with its place."""
+def _placed(reader: Reader, frames_per_shard: int) -> tuple[list[PackedSequence], dict[str, str]]:
+    """Every sequence with its place, and digests of the content of those that can be listed."""
     placed: list[PackedSequence] = []
+    contents: dict[str, str] = {}
     shard = records = 0
     for name in reader.sequences:
         try:
             frames, size, error = reader.num_frames(name), _size(reader, name), None
+            if isinstance(reader, CovisibleDataset):
+                reader.covisibility(name)
+            contents[name] = reader.content_digest(name)
         # Whatever a decoder raises: one damaged sequence is not to keep the others from being packed.
         except Exception as reason:
             frames, size, error = 0, None, describe(reason)
@@ -189,7 +194,7 @@ def _placed(reader: Reader, frames_per_shard: int) -> list[PackedSequence]:
             shard, records = shard + 1, 0
         placed.append(PackedSequence(name, shard, records, frames, size, error))
         records += frames
-    return placed
+    return placed, contents
 
 
 def _size(reader: Reader, name: str) -> tuple[int, int] | None:
@@ -199,13 +204,17 @@ def _size(reader: Reader, name: str) -> tuple[int, int] | None:
         return None
 
 
-def _whole(output: Path, number: int, plan: str) -> tuple[PackedShard, list[str]] | None:
-    """A shard of an earlier run, and what in it cannot be read; None unless it is what that run wrote."""
+def _whole(output: Path, number: int, plan: str, contents: Mapping[str, str]) -> tuple[PackedShard, list[str]] | None:
+    """A shard of an earlier run, and what in it cannot be read; None unless it is what that run wrote, of sequences
+    with these `contents`."""
     try:
         notes = read_json_object(notes_file(output, number))
         shard, path = PackedShard(**notes["shard"]), shard_file(output, number)
         content = {name: value for name, value in notes.items() if name != "digest"}
-        if notes["plan"] != plan or notes["digest"] != json_digest(content) or file_digest(path) != shard.sha256:
+        packed = {name: notes["sequences"][name]["content"] for name in contents}
+        if notes["plan"] != plan or packed != contents or notes["digest"] != json_digest(content):
+            return None
+        if file_digest(path) != shard.sha256:
             return None
     except (InputError, LookupError, TypeError):
         return None
@@ -213,16 +222,24 @@ def _whole(output: Path, number: int, plan: str) -> tuple[PackedShard, list[str]
 
 
 def _written(
-    reader: Reader, output: Path, sequences: list[PackedSequence], numbers: list[int], plan: str, workers: int
+    reader: Reader,
+    output: Path,
+    sequences: list[PackedSequence],
+    contents: Mapping[str, str],
+    numbers: list[int],
+    plan: str,
+    workers: int,
 ) -> Iterator[tuple[int, tuple[PackedShard, list[str]]]]:
     """Writes shards; their numbers and what `_whole` gives of them, as they are done."""
     parts = {number: [each for each in sequences if each.shard == number] for number in numbers}
     if workers == 1 or len(numbers) < 2:
         for number in numbers:
-            yield number, _write(reader, output, number, parts[number], plan)
+            yield number, _write(reader, output, number, parts[number], contents, plan)
         return
     with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
-        futures = {pool.submit(_write, reader, output, number, parts[number], plan): number for number in numbers}
+        futures = {
+            pool.submit(_write, reader, output, number, parts[number], contents, plan): number for number in numbers
+        }
         try:
             for future in as_completed(futures):
                 yield futures[future], future.result()
@@ -232,7 +249,12 @@ def _written(
 
 
 def _write(
-    reader: Reader, output: Path, number: int, sequences: list[PackedSequence], plan: str
+    reader: Reader,
+    output: Path,
+    number: int,
+    sequences: list[PackedSequence],
+    contents: Mapping[str, str],
+    plan: str,
 ) -> tuple[PackedShard, list[str]]:
     path = shard_file(output, number)
     notes: dict[str, Any] = {}
@@ -243,7 +265,7 @@ def _write(
         for sequence in sequences:
             if sequence.error is not None:
                 continue
-            notes[sequence.name] = _notes(reader, sequence)
+            notes[sequence.name] = _notes(reader, sequence, contents[sequence.name])
             for index in range(sequence.frames):
                 try:
                     record = frame_record(reader.read(sequence.name, [index]))
@@ -261,9 +283,9 @@ def _write(
     return shard, broken
 
 
-def _notes(reader: Reader, sequence: PackedSequence) -> dict[str, Any]:
+def _notes(reader: Reader, sequence: PackedSequence, content: str) -> dict[str, Any]:
     """What a reader knows of a sequence besides its frames, as JSON values."""
-    notes: dict[str, Any] = {"frame_names": list(reader.frame_names(sequence.name))}
+    notes: dict[str, Any] = {"frame_names": list(reader.frame_names(sequence.name)), "content": content}
     sfm = reader.sfm_extrinsics(sequence.name, range(sequence.frames))
     if sfm is not None:
         notes["sfm_extrinsics"] = sfm.tolist()

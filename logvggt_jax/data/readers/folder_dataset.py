@@ -2,6 +2,7 @@
 
 import abc
 import contextlib
+import hashlib
 import io
 import json
 import os
@@ -21,7 +22,7 @@ from logvggt_jax.data.errors import EmptySequence, MissingFiles, UnequalSizes
 from logvggt_jax.data.formats.calibration import check_intrinsics
 from logvggt_jax.data.formats.image import read_depth
 from logvggt_jax.data.formats.lens import Lens
-from logvggt_jax.data.formats.source_files import SourceFiles, refused
+from logvggt_jax.data.formats.source_files import SourceFiles, file_state, refused
 from logvggt_jax.data.readers.listing_index import ListingIndex, code_digest
 from logvggt_jax.errors import InputError
 from logvggt_jax.frames import Frames
@@ -180,6 +181,20 @@ class FolderDataset(Reader):
     def extrinsics(self, sequence: str) -> np.ndarray:
         """World-to-camera [T, 4, 4] float32 of these frames, as `read` gives them; no picture is opened."""
         return np.stack([record.extrinsics for record in self._listing(sequence).frames]).astype(np.float32)
+
+    def content_digest(self, sequence: str) -> str:
+        """As of `Reader`: of what is known of the frames before their pictures are opened, poses and calibrations
+        among it, of the number of bytes of their files, and of poses from structure from motion."""
+        records = self._listing(sequence).frames
+        digest = hashlib.sha256()
+        for record in records:
+            paths = [path for path in (record.image, record.depth, record.companion) if path is not None]
+            files = [(os.path.relpath(path, self.root), file_state(path)[1]) for path in paths]
+            digest.update(repr((record.name, files, record.depth_scale, record.quarter_turns)).encode())
+            digest.update(np.concatenate([record.intrinsics.ravel(), record.extrinsics.ravel(), record.lens]).tobytes())
+        sfm = self.sfm_extrinsics(sequence, range(len(records)))
+        digest.update(b"" if sfm is None else sfm.tobytes())
+        return digest.hexdigest()[:24]
 
     def neighbours(self, sequence: str, index: int) -> list[int]:
         """Frames that may see what frame `index` sees, those seen from farther away first.

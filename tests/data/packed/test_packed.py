@@ -1,6 +1,7 @@
 """A packed data set is the data set that was packed: its frames, its errors, its clips."""
 
 import pickle
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -155,6 +156,36 @@ def test_a_damaged_shard_is_named_and_written_anew(scenes: Path, packed: Path, t
     report = pack(NAME, scenes, output, frames_per_shard=8)
     assert (report.written, report.kept) == (1, 1)
     assert shard.read_bytes() == (packed / shard.name).read_bytes()
+
+
+def test_what_was_corrected_since_is_written_anew_and_nothing_else(tmp_path: Path) -> None:
+    scenes = write_scenes(tmp_path / "scenes")
+    output = tmp_path / "packed"
+    pack(NAME, scenes, output, frames_per_shard=4)
+    pose = next((scenes / "scene/seq-03").glob("frame-000001.pose.txt"))
+    np.savetxt(pose, np.eye(4))
+    damaged = next((scenes / "scene/seq-02").glob("frame-000002.color.*"))
+    damaged.write_bytes(damaged.with_name(damaged.name.replace("000002", "000001")).read_bytes())
+    report = pack(NAME, scenes, output, frames_per_shard=4)
+    assert (report.written, report.kept, report.broken) == (2, 1, ())
+    original, found = open_dataset(NAME, scenes), open_dataset(NAME, output)
+    for name in original.sequences:
+        same(found.read(name, range(4)), original.read(name, range(4)))
+        assert found.content_digest(name) == original.content_digest(name)
+
+
+def test_damage_beside_the_frames_of_one_scene_keeps_no_other_from_being_packed(tmp_path: Path) -> None:
+    layout = blendedmvs.LAYOUT
+    layout.write(tmp_path / "set", layout.views)
+    whole = "f" * 24
+    shutil.copytree(tmp_path / "set" / layout.sequence, tmp_path / "set" / whole)
+    (tmp_path / "set" / layout.sequence / "cams/pair.txt").unlink()
+    report = pack("blendedmvs", tmp_path / "set", tmp_path / "packed")
+    assert len(report.broken) == 1 and "pair.txt: no such file" in report.broken[0]
+    found = open_dataset("blendedmvs", tmp_path / "packed")
+    assert found.num_frames(whole) == len(layout.views)
+    with pytest.raises(InputError, match=r"pair\.txt: no such file"):
+        found.num_frames(layout.sequence)
 
 
 def test_an_index_that_was_changed_is_refused(packed: Path, tmp_path: Path) -> None:
