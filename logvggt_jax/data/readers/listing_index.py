@@ -54,7 +54,7 @@ class ListingIndex:
 
     def put(self, key: str, payload: bytes, count: int, sources: SourceFiles) -> None:
         """Keeps a listing and the state of its sources, replacing an older one."""
-        row = (key, self._code, count, json.dumps(sources.states), payload)
+        row = (_as_text(key), self._code, count, json.dumps(sources.states), payload)
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             with closing(self._connect()) as connection, connection:
@@ -70,7 +70,7 @@ class ListingIndex:
         query = f"SELECT {column}, sources FROM listings WHERE key = ? AND code = ?"
         try:
             with closing(self._connect()) as connection:
-                row = connection.execute(query, (key, self._code)).fetchone()
+                row = connection.execute(query, (_as_text(key), self._code)).fetchone()
         except sqlite3.OperationalError:  # no table yet, or locked for longer than the timeout
             return None
         except sqlite3.DatabaseError as error:
@@ -88,6 +88,11 @@ class ListingIndex:
     def _connect(self) -> sqlite3.Connection:
         # A connection a call: it can neither be pickled for worker processes nor survive a fork.
         return sqlite3.connect(self.path, timeout=_TIMEOUT)
+
+
+def _as_text(key: str) -> str:
+    """A key that SQLite takes: names of folders need not be UTF-8."""
+    return key.encode(errors="backslashreplace").decode()
 
 
 def code_digest(reader: type) -> str:

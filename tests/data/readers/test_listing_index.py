@@ -130,6 +130,14 @@ def test_sequences_added_and_removed_are_seen(root: Path):
     assert Replica(root).sequences == ("room1", "room2")
 
 
+def test_names_that_are_no_unicode_are_listed(root: Path, reads: Counter[str]):
+    (root / "room0").rename(root / os.fsdecode(b"k\xfcche"))
+    (name,) = Replica(root).sequences
+    assert Replica(root).num_frames(name) == 3
+    reads.clear()
+    assert Replica(root).num_frames(name) == 3 and not reads
+
+
 def test_an_edited_calibration_and_pose_are_seen(root: Path):
     before = Replica(root).read("room0", [0])
     write_camera(root, fx=50.0)
