@@ -32,6 +32,9 @@ from logvggt_jax.files import write_text
 from logvggt_jax.metrics import NotMeasurable
 from logvggt_jax.streaming import PredictionError
 
+# Bytes of a sequence's name in those of pictures, which have 255 with all that stands around it.
+_LONGEST_SEQUENCE = 120
+
 
 def evaluate(
     benchmarks: Sequence[Benchmark],
@@ -227,7 +230,8 @@ def _draw(
     from logvggt_jax.evaluation.report import figures as plots
 
     protocol, data = clip.benchmark.protocol, truth.clip
-    stem = f"{protocol.name}_{clip.sequence.replace('/', '_')}_from_{clip.indices[0]}_{len(clip.indices)}_frames"
+    sequence = clip.sequence.replace("/", "_").encode(errors="ignore")[:_LONGEST_SEQUENCE].decode(errors="ignore")
+    stem = f"{protocol.name}_{sequence}_from_{clip.indices[0]}_{len(clip.indices)}_frames"
     stem = f"{stem}_{key[:8]}"
     drawn: list[Path] = []
     if method.depth and prediction.depth is not None and data.depth is not None:

@@ -138,6 +138,15 @@ def test_a_data_set_whose_truth_was_corrected_is_measured_again(tmp_path: Path) 
     assert len(calls) == 2
 
 
+def test_pictures_of_a_sequence_with_a_long_name_are_drawn(tmp_path: Path) -> None:
+    seven_scenes.LAYOUT.write(tmp_path / "set", seven_scenes.LAYOUT.views)
+    (scene,) = (tmp_path / "set").iterdir()
+    scene.rename(scene.with_name(120 * "ü"))
+    settings = dataclasses.replace(SETTINGS, clip_lengths=(2,), stride=1, figures=1)
+    results = run(SevenScenes(tmp_path / "set"), [static_camera()], tmp_path / "out", settings)
+    assert results["figures"] and all((tmp_path / "out" / picture).is_file() for picture in results["figures"])
+
+
 def test_rooms_measured_among_fewer_are_taken_over_by_a_run_over_more(tmp_path: Path) -> None:
     method, calls = failing("", at_call=-1)
     for num_rooms, expected in ((1, 2), (2, 4)):
