@@ -36,6 +36,7 @@ from logvggt_jax.reconstruction.sources import (
 )
 from logvggt_jax.reconstruction.sources.decoding import Picture
 from logvggt_jax.reconstruction.sources.sampling import FrameClock, expected_frames
+from logvggt_jax.reconstruction.sources.source import SkippedFrame
 
 HEIGHT, WIDTH = 48, 64
 COLOURS = np.array([[[230, 30, 30], [30, 200, 30]], [[30, 30, 230], [220, 220, 60]]], np.uint8)
@@ -738,6 +739,38 @@ def test_a_picture_of_mpeg_that_vanishes_is_named(tmp_path: Path, library: str, 
     assert names(frames) == [i for i in range(12) if i != number]
     assert [frame.name for frame in source.skipped] == [f"frame-{number:06d}"]
     np.testing.assert_array_equal(frames[0].image, truth[0].image)
+
+
+@pytest.mark.parametrize("name", ["whole.mp4", "whole.mkv", "whole.webm"])
+def test_a_picture_of_av1_that_vanishes_is_named(tmp_path: Path, name: str) -> None:
+    """Each packet shows one frame, however many it holds; of what is noise its decoder says nothing."""
+    whole = write(tmp_path / name, [busy(i) for i in range(24)], codec="libsvtav1", options={"preset": "10", "g": "12"})
+    source = open_source(whole)
+    assert names(list(source)) == list(range(24)) and not source.skipped and not source.notes
+    content = bytearray(whole.read_bytes())
+    with av.open(str(whole)) as container:
+        stored = [bytes(packet) for packet in container.demux(video=0)]
+    number = max(range(6, 12), key=lambda at: len(stored[at]))
+    place = content.index(stored[number])
+    # Units of a reserved kind, which are to be passed over.
+    content[place : place + len(stored[number])] = (b"\x7a\x01\x00" * len(stored[number]))[: len(stored[number])]
+    whole.write_bytes(content)
+    source = open_source(whole, most_broken=1.0)
+    assert number not in names(list(source))
+    assert source.skipped[0] == SkippedFrame(f"frame-{number:06d}", "gives no picture")
+
+
+@pytest.mark.parametrize("slices", [1, 2])
+def test_damage_within_a_picture_of_h264_is_counted(tmp_path: Path, slices: int) -> None:
+    images = [busy(i).repeat(2, 0).repeat(2, 1) for i in range(8)]
+    path = write(tmp_path / "walk.mp4", images, options={"bf": "0", "x264-params": f"slices={slices}"})
+    content = bytearray(path.read_bytes())
+    position, size, _ = packets(path)[5]
+    content[position + size // 4] ^= 255
+    path.write_bytes(content)
+    source = open_source(path)
+    assert names(list(source)) == list(range(8))
+    assert source.notes == [f"{path}: frames with damaged parts, which the decoder filled by guesses: 1"]
 
 
 @pytest.mark.parametrize(

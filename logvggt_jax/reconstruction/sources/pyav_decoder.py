@@ -42,8 +42,8 @@ _LONGEST_LEAD = 300
 # Pixels above which frames are decoded side by side.
 _LARGE = 1920 * 1088
 # Codecs of which every packet shows a frame of its own, but for those of interlaced material and for empty ones, which
-# stand for no change. A decoder may drop a damaged packet of theirs without an error.
-_FRAME_A_PACKET = ("mpeg4", "h264", "hevc", "mjpeg", "mpeg1video", "mpeg2video")
+# stand for no change. A decoder may drop a damaged packet of theirs without an error. The last two decode AV1.
+_FRAME_A_PACKET = ("mpeg4", "h264", "hevc", "mjpeg", "mpeg1video", "mpeg2video", "av1", "libdav1d")
 _EMPTY_PACKET = 8
 # Codecs of which a packet that ends too soon gives a picture that is half grey, unless any error is to be one.
 _EASILY_PLEASED = ("mjpeg",)
@@ -180,10 +180,13 @@ class PyAVDecoder:
             )
         if stream.codec_context.name in _EASILY_PLEASED:
             stream.codec_context.options = {"err_detect": "explode"}
-        # Threads within a frame lose nothing when a packet is damaged. With threads over frames, which large pictures
-        # need, the library drops what follows a damaged packet among the last few of the file.
+        # Threads within a frame lose nothing when a packet is damaged, but for H.264's mark of frames that are guessed
+        # in part. With threads over frames, which large pictures need, the library drops what follows a damaged packet
+        # among the last few of the file.
         if stream.width * stream.height > _LARGE:
             stream.thread_type = "AUTO"
+        elif stream.codec_context.name == "h264":
+            stream.thread_type = "NONE"
         return stream
 
     def _decode(
