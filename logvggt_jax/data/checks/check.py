@@ -166,11 +166,16 @@ def _check_sequence(
     if has_poses:
         figure, compared = _consistency(dataset, sequence, extrinsics, set(wanted) - set(frames), problems)
     if figure is not None and figure > INCONSISTENT:
+        cause = "poses, intrinsics or depth belong to another sequence or another release: fetch the sequence again"
+        if dataset.own:
+            cause = (
+                "direction or axes of the poses, the unit of depth or the calibration's picture size are not what "
+                f"{dataset.title} have: compare them with the documentation"
+            )
         problems.add(
             "inconsistent depth and poses",
             f"{dataset.root}, {sequence}: depth carried into another frame differs from the depth there by "
-            f"{figure:.0%} (median; up to {INCONSISTENT:.0%} expected): poses, intrinsics or depth belong to another "
-            "sequence or another release: fetch the sequence again",
+            f"{figure:.0%} (median; up to {INCONSISTENT:.0%} expected): {cause}",
         )
     decoded = list(frames)
     return SequenceReport(

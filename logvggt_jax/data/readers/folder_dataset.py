@@ -227,14 +227,16 @@ class FolderDataset(Reader):
             if record.quarter_turns:
                 image, depth = np.rot90(image, record.quarter_turns), np.rot90(depth, record.quarter_turns)
             if depth.shape != image.shape[:2]:
+                mend = "bring it to that, each pixel with its nearest's depth" if self.own else "fetch both again"
                 raise UnequalSizes(
                     f"{record.depth}: size {depth.shape} differs from {image.shape[:2]} of {record.image.name}: "
-                    "depth must have the picture's size; fetch both again"
+                    f"depth must have the picture's size; {mend}"
                 )
             if images and image.shape != images[0].shape:
+                mend = "make those of another size a recording of their own" if self.own else "fetch both again"
                 raise UnequalSizes(
                     f"{record.image}: size {image.shape[:2]} differs from {images[0].shape[:2]} of "
-                    f"{chosen[0].image.name}: frames of one sequence must have one size; fetch both again"
+                    f"{chosen[0].image.name}: frames of one sequence must have one size; {mend}"
                 )
             check_intrinsics(matrix, image.shape[:2], record.image, record.calibration)
             images.append(image)
@@ -298,7 +300,7 @@ class FolderDataset(Reader):
                 raise EmptySequence(
                     f"{self._places[sequence]}: no frame of {self.title} counts here "
                     f"(dropped: {dict(listing.dropped) or 'none'}{f'; see {culprit}' if culprit else ''}): "
-                    "fetch the sequence again or remove its folder"
+                    f"{'add what they lack' if self.own else 'fetch the sequence again'} or remove its folder"
                 )
             self._index.put(key, _packed(listing, self.root), len(listing.frames), files)
         self._recent[sequence] = listing

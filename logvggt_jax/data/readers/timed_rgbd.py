@@ -32,7 +32,7 @@ _SIZE = (480, 640)  # that the calibrations belong to
 UNITS_PER_METRE = 5000.0
 _MAX_TIME = 1e12  # seconds; much larger ones have no milliseconds in float64
 _PREPARED = re.compile(r"rgb_(\d+)")
-_TIMED_FILE = re.compile(r"(\d+(?:\.\d+)?)\.(?:png|jpg|jpeg)")
+_TIMED_FILE = re.compile(r"(\d+(?:\.\d+)?)\.(?:png|jpg|jpeg)", re.IGNORECASE)
 
 
 def associate(first: np.ndarray, second: np.ndarray, tolerance: float = TOLERANCE) -> np.ndarray:

@@ -33,6 +33,7 @@ from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame, read_depth_of
 from logvggt_jax.data.readers.own_recordings import find_recordings, without_distortion
 from logvggt_jax.data.readers.timed_rgbd import (
+    TOLERANCE,
     UNITS_PER_METRE,
     Trajectory,
     associate,
@@ -87,10 +88,10 @@ class TUMRecording(FolderDataset):
         intrinsics, lens, units = _camera(files, calibration)
         times, images = _stream(folder, "rgb", files)
         trajectory = Trajectory(folder / "groundtruth.txt", files)
-        pose_of = associate(times, trajectory.times)
+        pose_of = _partners(times, trajectory.times, "poses", trajectory.path)
         if files.exists(folder / "depth.txt") or files.exists(folder / "depth"):
             depth_times, depths = _stream(folder, "depth", files)
-            depth_of = associate(times, depth_times)
+            depth_of = _partners(times, depth_times, "depth", folder / "depth")
         else:
             depths, depth_of = images, np.arange(len(images))  # a picture in depth's place stands for no depth
         for image, depth_index, pose_index in zip(images, depth_of, pose_of, strict=True):
@@ -124,12 +125,23 @@ def _stream(folder: Path, kind: str, files: SourceFiles) -> tuple[np.ndarray, li
     return listed_files(listing, files) if files.exists(listing) else named_files(folder / kind, files)
 
 
+def _partners(times: np.ndarray, others: np.ndarray, kind: str, path: Path) -> np.ndarray:
+    """As `associate`; InputError where no picture has a partner, naming both recorders' times."""
+    found = associate(times, others)
+    if (found < 0).all():
+        raise InputError(
+            f"{path}: no {kind} within {TOLERANCE} s of any picture: {kind} from {others[0]:.2f} to "
+            f"{others[-1]:.2f} s, pictures from {times[0]:.2f} to {times[-1]:.2f} s: give both one clock's times"
+        )
+    return found
+
+
 def _camera(files: SourceFiles, path: Path) -> tuple[np.ndarray, Lens, float]:
     """Intrinsics [3, 3] of a picture of one pixel, the lens, and units of depth a metre."""
     known = (*_NEEDED, _DEPTH_SCALE, *_DISTORTION)
     values: dict[str, float] = {}
     for line, text in content_lines(files.text(path, f"the calibration, lines 'name value' of {', '.join(known)}")):
-        name, _, value = text.partition(" ")
+        name, value = [*text.split(maxsplit=1), ""][:2]
         if name not in known or name in values:
             raise InputError(
                 f"{path}, line {line}: expected each of {', '.join(known)} once, got {name!r}: edit the file"

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from analytic_room import camera_to_world
+from layouts import tum_recording
 from layouts.replica import write, write_camera
 from room_views import SIZE, room_views
 
@@ -52,6 +53,18 @@ def test_a_sound_copy_is_clean(root: Path):
         assert 0.3 < sequence.depth.minimum < sequence.depth.median < sequence.depth.maximum < 7
         assert sequence.depth.valid_share == 1
     assert "problems: none" in report.text() and "12 frames" in report.text()
+
+
+def test_own_recordings_of_other_axes_are_told_what_to_compare(tmp_path: Path):
+    tum_recording.write(tmp_path, room_views(5))
+    poses = tmp_path / tum_recording.NAME / "groundtruth.txt"
+    times_and_poses = np.loadtxt(poses)
+    # As OpenGL has them: half a turn about x.
+    x, y, z, w = times_and_poses[:, 4:].T
+    times_and_poses[:, 4:] = np.stack([w, z, -y, -x], axis=1)
+    np.savetxt(poses, times_and_poses)
+    ((kind, message),) = problems_of(check_copy("tum_recording", tmp_path), tum_recording.NAME)
+    assert kind == "inconsistent depth and poses" and "axes of the poses, the unit of depth or the calib" in message
 
 
 def test_every_kind_of_damage_is_named_and_counted_and_the_rest_goes_on(root: Path):

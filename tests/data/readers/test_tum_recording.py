@@ -37,6 +37,31 @@ def test_jpeg_pictures_named_by_their_time_are_read(recording: Path):
     check_views(TUMRecording(recording.parent).read(NAME, range(5)), VIEWS, **(ERRORS | {"picture_error": 3.0}))
 
 
+def test_suffixes_as_cameras_write_them_and_a_calibration_with_tabs_are_read(recording: Path):
+    for kind in ("rgb", "depth"):
+        (recording / f"{kind}.txt").unlink()
+        for path in (recording / kind).iterdir():
+            path.rename(path.with_suffix(".PNG"))
+    calibration = recording / "calibration.txt"
+    calibration.write_text(calibration.read_text().replace(" ", "\t"))
+    check_views(TUMRecording(recording).read(NAME, range(5)), VIEWS, **ERRORS)
+
+
+@pytest.mark.parametrize(("table", "kind"), [("groundtruth.txt", "poses"), ("depth.txt", "depth")])
+def test_recorders_with_clocks_of_their_own_are_told_apart(recording: Path, table: str, kind: str):
+    lines = [line.split() for line in (recording / table).read_text().splitlines() if not line.startswith("#")]
+    (recording / table).write_text("".join(f"{float(time) + 100} {' '.join(rest)}\n" for time, *rest in lines))
+    with pytest.raises(InputError, match=rf": no {kind} within 0\.02 s of any picture: {kind} from .* one clock"):
+        TUMRecording(recording).num_frames(NAME)
+
+
+def test_depth_of_another_size_is_told_how_to_mend(recording: Path):
+    for path in (recording / "depth").iterdir():
+        cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[::2, ::2])
+    with pytest.raises(InputError, match="depth must have the picture's size; bring it to that"):
+        TUMRecording(recording).read(NAME, [0])
+
+
 def test_the_root_itself_may_be_the_recording(recording: Path, monkeypatch: pytest.MonkeyPatch):
     check_views(TUMRecording(recording).read(NAME, range(5)), VIEWS, **ERRORS)
     monkeypatch.chdir(recording)
