@@ -5,6 +5,8 @@ import stat
 from collections.abc import Sequence
 from pathlib import Path
 
+from absl import logging
+
 from logvggt_jax.data.errors import MissingFiles, missing_file
 from logvggt_jax.errors import DiskError, InputError
 
@@ -64,9 +66,17 @@ class SourceFiles:
         check_regular(path, f"; expected {expected}")
 
     def exists(self, path: Path) -> bool:
-        """Whether a file or folder is there now."""
+        """Whether a file or folder is there now; warns of a folder at which the operating system refuses to look."""
         self._note(path)
-        return self.states[str(path)] != [_ABSENT, _ABSENT]
+        if self.states[str(path)] != [_ABSENT, _ABSENT]:
+            return True
+        try:
+            path.stat()
+        except PermissionError as error:
+            logging.warning("%s: %s: nothing in it counts", path.parent, error.strerror)
+        except OSError:
+            pass
+        return False
 
     def _note(self, path: Path) -> None:
         self.states[str(path)] = file_state(path)
