@@ -24,6 +24,7 @@ from logvggt_jax.reconstruction import PointFilter, Reconstruction, export, fuse
 from logvggt_jax.reconstruction.fusion.bundle_adjustment import _largest_steps
 from logvggt_jax.reconstruction.fusion.matching import match_poses
 from logvggt_jax.reconstruction.fusion.pose_files import ExternalPose, read_poses
+from logvggt_jax.reconstruction.sources.record import SourceRecord
 
 COUNT, SIZE = 10, (84, 112)
 # From the room's metres to the disordered result's world.
@@ -124,6 +125,34 @@ def test_intrinsics_that_come_with_the_poses_are_taken(truth: Reconstruction, tm
         made, notes = fuse(wrong, tmp_path / "kept", poses=poses, overwrite=True, progress=False)
         np.testing.assert_allclose(made.intrinsics, wrong.intrinsics, rtol=1e-9)
         assert any("intrinsics stay the result's" in note for note in notes)
+
+
+def test_intrinsics_of_pictures_that_frames_are_parts_of_are_not_taken(truth: Reconstruction, tmp_path: Path) -> None:
+    poses = with_nerfstudio(truth, tmp_path)
+    document = json.loads(poses.read_text())
+    for frame in document["frames"]:
+        frame.update(w=2 * frame["w"], h=2 * frame["h"], cx=2 * frame["cx"], cy=2 * frame["cy"])
+    poses.write_text(json.dumps(document))
+    cut = dataclasses.replace(truth, source=SourceRecord("photos", {"size_mismatch": "crop"}, COUNT, ""))
+    made, notes = fuse(cut, tmp_path / "fused", poses=poses, progress=False)
+    np.testing.assert_array_equal(made.intrinsics, truth.intrinsics)
+    assert any("intrinsics stay the result's" in note for note in notes)
+    made, _ = fuse(truth, tmp_path / "whole", poses=poses, progress=False)
+    np.testing.assert_allclose(made.intrinsics[:, 0, 0], truth.intrinsics[:, 0, 0] / 2)
+
+
+@pytest.mark.parametrize("lens", [{}, {"k1": 0.1}])
+def test_poses_of_pictures_that_lie_on_their_side_are_refused(
+    truth: Reconstruction, tmp_path: Path, lens: dict[str, float]
+) -> None:
+    poses = with_nerfstudio(truth, tmp_path)
+    document = json.loads(poses.read_text())
+    for frame in document["frames"]:
+        frame.update(w=frame["h"], h=frame["w"], cx=frame["cy"], cy=frame["cx"], **lens)
+    poses.write_text(json.dumps(document))
+    with pytest.raises(InputError, match=r"frame view 0 has 84 x 112 pixels there, and 112 x 84 here, where it was "):
+        fuse(truth, tmp_path / "fused", poses=poses, progress=False)
+    assert not (tmp_path / "fused").exists()
 
 
 def test_frames_without_a_pose_and_poses_without_a_frame_are_said(

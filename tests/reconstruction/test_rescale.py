@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
 from pathlib import Path
@@ -18,6 +19,7 @@ from logvggt_jax.reconstruction.depth_files import write_picture
 from logvggt_jax.reconstruction.exporters import export
 from logvggt_jax.reconstruction.points.cloud_file import count_points
 from logvggt_jax.reconstruction.points.point_filter import PointFilter
+from logvggt_jax.reconstruction.sources.record import SourceRecord
 
 COUNT, SCALE = 4, 0.25
 
@@ -88,6 +90,23 @@ def test_from_a_sensors_depth(truth: Reconstruction, result: Reconstruction, tmp
     made, notes = rescale(result, tmp_path / "a", depth=tmp_path / "depth", progress=False)
     assert_true(made, truth, 2e-3)
     assert "sensor depth of 2 of 4 frames" in notes[0] and "%" in notes[0]
+
+
+def test_depth_that_does_not_show_what_the_frames_show_is_refused(
+    truth: Reconstruction, result: Reconstruction, tmp_path: Path
+) -> None:
+    (tmp_path / "depth").mkdir()
+    millimetres = np.rint(truth.depth(0) * 1000).astype(np.uint16)
+    write_picture(tmp_path / "depth" / "view 0.png", np.rot90(millimetres))
+    told = r"view 0.png has 42 x 56 pixels and does not show what frame view 0 shows, which has 128 x 96: turn or cut"
+    with pytest.raises(InputError, match=told):
+        rescale(result, tmp_path / "a", depth=tmp_path / "depth", progress=False)
+    # Of the whole picture, where the frame may be a part of it.
+    write_picture(tmp_path / "depth" / "view 0.png", millimetres)
+    cut = dataclasses.replace(result, source=SourceRecord("photos", {"size_mismatch": "crop"}, COUNT, ""))
+    with pytest.raises(InputError, match=r"view 0.png has 56 x 42 pixels and does not show"):
+        rescale(cut, tmp_path / "a", depth=tmp_path / "depth", progress=False)
+    assert not (tmp_path / "a").exists()
 
 
 def test_depth_is_found_beside_colour(truth: Reconstruction, result: Reconstruction, tmp_path: Path) -> None:

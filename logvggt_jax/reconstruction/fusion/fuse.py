@@ -16,12 +16,11 @@ from logvggt_jax.reconstruction.fusion.depth_scales import depth_scales
 from logvggt_jax.reconstruction.fusion.derived_result import check_derived, write_derived
 from logvggt_jax.reconstruction.fusion.matching import match_poses
 from logvggt_jax.reconstruction.fusion.pose_files import ExternalPose, read_poses
+from logvggt_jax.reconstruction.fusion.same_view import is_same_view, lies_on_its_side
 from logvggt_jax.reconstruction.result import Reconstruction
 
 # How far the cameras of a result may lie from given ones, as a share of how far these lie from their middle.
 _UNLIKE = 0.2
-# By how much the aspect ratios of two pictures of one frame may differ.
-_ASPECT = 0.01
 
 
 class Fused(NamedTuple):
@@ -143,9 +142,20 @@ def align(result: Reconstruction, matched: dict[int, ExternalPose], path: str | 
 
 
 def match(result: Reconstruction, poses: str | Path, notes: list[str]) -> dict[int, ExternalPose]:
-    """Poses of a file by frame; notes say what belongs to nothing."""
+    """Poses of a file by frame; notes say what belongs to nothing.
+
+    Raises InputError where none does, or one is of a picture that lies on its side.
+    """
     given = read_poses(poses)
     matched = match_poses(result, given, poses)
+    for index, pose in matched.items():
+        if pose.size is not None and lies_on_its_side(result, pose.size):
+            (rows, columns), (height, width) = pose.size, result.image_size
+            raise InputError(
+                f"{poses}: the picture of frame {result.names[index]} has {columns} x {rows} pixels there, and "
+                f"{width} x {height} here, where it was turned upright: find the poses in upright pictures, as "
+                "`logvggt export --format colmap` writes them"
+            )
     if len(matched) < result.num_frames:
         first = next(name for index, name in enumerate(result.names) if index not in matched)
         notes.append(f"{result.num_frames - len(matched)} of {result.num_frames} frames have no pose: {first}, …")
@@ -173,10 +183,7 @@ def _external(result: Reconstruction, path: str | Path, notes: list[str]) -> _Ca
 
 
 def _intrinsics(result: Reconstruction, pose: ExternalPose) -> np.ndarray | None:
-    """A pose's intrinsics in pixels of the original images, if its picture has their aspect ratio."""
-    if pose.intrinsics is None or pose.size is None:
-        return None
-    ratio = (pose.size[1] * result.image_size[0]) / (pose.size[0] * result.image_size[1])
-    if abs(ratio - 1) > _ASPECT:
+    """A pose's intrinsics in pixels of the original images, if its picture shows what they show."""
+    if pose.intrinsics is None or pose.size is None or not is_same_view(result, pose.size):
         return None
     return ResizeTransform(pose.size, result.image_size).intrinsics_from_original(pose.intrinsics)

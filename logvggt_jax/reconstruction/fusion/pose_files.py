@@ -28,7 +28,7 @@ class ExternalPose(NamedTuple):
       extrinsics: [4, 4] float64 world-to-camera, OpenCV axes.
       intrinsics: [3, 3] float64 in pixels of its picture, centres at integers; None where they are unknown or the
         lens is no pinhole.
-      size: (H, W) of the picture that the intrinsics belong to.
+      size: (H, W) of its picture; None where it is unknown.
     """
 
     name: str | None
@@ -111,8 +111,8 @@ def _nerfstudio_frame(document: dict[str, Any], frame: dict[str, Any], path: Pat
     extrinsics = world_to_camera(pose @ OPENGL_AXES, f"{path}, {name!r}", stored="camera_to_world")
     assert extrinsics is not None  # it is finite
     values = {**document, **frame}
-    lens = lens_of(values)
-    if lens is None or not lens.is_pinhole or any(key not in values for key in CAMERA):
+    if any(key not in values for key in CAMERA):
         return ExternalPose(name, None, extrinsics)
-    intrinsics, height, width = camera_of(values)
-    return ExternalPose(name, None, extrinsics, intrinsics, (int(height), int(width)))
+    lens, (intrinsics, height, width) = lens_of(values), camera_of(values)
+    known = intrinsics if lens is not None and lens.is_pinhole else None
+    return ExternalPose(name, None, extrinsics, known, (int(height), int(width)))

@@ -16,6 +16,7 @@ from logvggt_jax.reconstruction.exporters.frame_names import file_stems
 from logvggt_jax.reconstruction.frame_pool import FramePool
 from logvggt_jax.reconstruction.fusion.derived_result import check_derived, write_derived
 from logvggt_jax.reconstruction.fusion.fuse import Fused, align, match
+from logvggt_jax.reconstruction.fusion.same_view import is_same_view
 from logvggt_jax.reconstruction.result import Reconstruction
 
 # Pixels of a frame that its depth and a sensor's must share.
@@ -188,8 +189,17 @@ def _is_deep(path: Path) -> bool:
 
 
 def _ratios(result: Reconstruction, index: int, path: Path, unit: float) -> float | None:
-    """By how much a sensor's depth exceeds the result's, the median over the pixels; None where they share too few."""
+    """By how much a sensor's depth exceeds the result's, the median over the pixels; None where they share too few.
+
+    Raises InputError where the sensor's does not show what the frame shows.
+    """
     depth, sensor = result.depth(index), read_depth_picture(path).astype(np.float32) * unit
+    if not is_same_view(result, sensor.shape):
+        (rows, columns), (height, width) = sensor.shape, result.image_size
+        raise InputError(
+            f"{path} has {columns} x {rows} pixels and does not show what frame {result.names[index]} shows, which has "
+            f"{width} x {height}: turn or cut the sensor's depth as the frames were"
+        )
     sensor = cv2.resize(sensor, depth.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
     with np.errstate(invalid="ignore"):
         valid = (sensor > 0) & (sensor < (2**16 - 1) * unit) & np.isfinite(depth) & (depth > 0)
