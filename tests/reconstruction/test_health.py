@@ -71,6 +71,15 @@ def test_a_cut_is_seen_though_the_predicted_cameras_do_not_tell() -> None:
     assert (found.cause, found.first, found.last) == ("no overlap", 20, 20)
 
 
+@pytest.mark.parametrize("overlap", [0.4, 0.1])
+def test_a_jump_of_the_exposure_is_no_movement_though_depth_suffers_from_it(overlap: float) -> None:
+    measures = measured(rooms.flickering(), rooms.signals(rooms.COUNT, rooms.FAULT))
+    jumps = [rooms.FAULT.start, rooms.FAULT.stop]
+    measures.overlap[jumps], measures.conflicts[jumps] = overlap, 0.3
+    found = stretches(measures)
+    assert {stretch.cause for stretch in found} == {"exposure"} and [stretch.first for stretch in found] == jumps
+
+
 def test_what_depth_alone_tells_is_not_blamed_on_the_footage() -> None:
     """Depth that is wrong looks as what moves does: a model's own result of a room in which nothing moves says so."""
     measures, names = measured(rooms.clean(), rooms.signals(rooms.COUNT, ())), ["x"] * rooms.COUNT

@@ -21,8 +21,9 @@ _FEWEST = 8
 DARK_PIXELS, DARK_SHARE = 0.6, 0.25
 # Bright if so many pixels are nearly white, and so many times as many as in the median frame.
 BRIGHT_PIXELS, BRIGHT_TIMES = 0.3, 2.0
-# A jump of the exposure from one frame to the next, in stops (powers of two).
-EXPOSURE_STOPS = 0.7
+# A jump of the exposure from one frame to the next, in stops (powers of two). Where the picture changes by less than
+# this beside its light, the camera has not moved, whatever depth and cameras that suffer from the jump say.
+EXPOSURE_STOPS, SAME_PICTURE = 0.7, 0.1
 
 # Detail. No texture: gradient energy below this share of the median, or below this number.
 TEXTURE_SHARE, LEAST_TEXTURE = 0.1, 2e-4
@@ -137,11 +138,13 @@ def _causes(m: Measures, signs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     clear = ~(poor | np.concatenate([[False], poor[:-1]]))
     unsure = signs["overlap_change"] | signs["correction"] | signs["disagreement"]
     cut = _over(m.picture_change, PICTURE_CHANGE, PICTURE_TIMES) & clear & unsure
-    moving = _over(m.conflicts, CONFLICTS, CONFLICT_TIMES) & ~signs["conflicts"]
-    fast = (_over(new, NEW_VIEW, NEW_VIEW_TIMES) | (new > MOST_NEW)) & ~(new > ALL_NEW) & ~zoom
-    no_overlap = (new > ALL_NEW) | (cut & ~moving & ~fast)
     stops = np.abs(np.log2(m.brightness / np.concatenate([[np.nan], m.brightness[:-1]])))
-    exposure = (stops > EXPOSURE_STOPS) & clear & ~no_overlap & ~fast & ~moving
+    jump = (stops > EXPOSURE_STOPS) & clear
+    elsewhere = ~(jump & (m.picture_change < SAME_PICTURE))
+    moving = _over(m.conflicts, CONFLICTS, CONFLICT_TIMES) & ~signs["conflicts"] & elsewhere
+    fast = (_over(new, NEW_VIEW, NEW_VIEW_TIMES) | (new > MOST_NEW)) & ~(new > ALL_NEW) & ~zoom & elsewhere
+    no_overlap = ((new > ALL_NEW) & elsewhere) | (cut & ~moving & ~fast)
+    exposure = jump & ~no_overlap & ~fast & ~moving
     found = {
         "no overlap": no_overlap,
         "fast": fast,
