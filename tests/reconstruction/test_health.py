@@ -80,6 +80,14 @@ def test_a_jump_of_the_exposure_is_no_movement_though_depth_suffers_from_it(over
     assert {stretch.cause for stretch in found} == {"exposure"} and [stretch.first for stretch in found] == jumps
 
 
+def test_a_jump_of_the_exposure_is_told_with_the_brightness_before_and_after() -> None:
+    measures = measured(rooms.flickering(), rooms.signals(rooms.COUNT, rooms.FAULT))
+    text = paragraph(stretches(measures), measures, ["x"] * rooms.COUNT)
+    for frame in (rooms.FAULT.start, rooms.FAULT.stop):
+        low, high = sorted(measures.brightness[[frame - 1, frame]])
+        assert f"brightness jumps between {low:.0%} and {high:.0%} of white" in text
+
+
 def test_what_depth_alone_tells_is_not_blamed_on_the_footage() -> None:
     """Depth that is wrong looks as what moves does: a model's own result of a room in which nothing moves says so."""
     measures, names = measured(rooms.clean(), rooms.signals(rooms.COUNT, ())), ["x"] * rooms.COUNT

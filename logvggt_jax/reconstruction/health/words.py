@@ -22,7 +22,7 @@ _EVIDENCE = {
     ),
     "dark": ("brightness", "brightness falls to {low:.0%} of white, {median:.0%} in the median frame"),
     "bright": ("bright", "up to {high:.0%} of the pixels are white"),
-    "exposure": ("brightness", "brightness there is {low:.0%} to {high:.0%} of white"),
+    "exposure": ("brightness", "brightness jumps between {low:.0%} and {high:.0%} of white"),
     "texture": ("texture", "gradient energy falls to {of_median:.2g} times the median"),
     "blur": ("sharpness", "fine detail falls to {of_median:.2g} times the median"),
     "zoom": ("field_of_view", "the field of view goes from {first:.0f} to {last:.0f} degrees"),
@@ -88,7 +88,8 @@ def _sentence(stretch: Stretch, measures: Measures, names: Sequence[str]) -> str
 def _evidence(stretch: Stretch, measures: Measures) -> str:
     measure, text = _EVIDENCE[stretch.cause or ""]
     values = getattr(measures, measure)
-    there, known = values[stretch.first : stretch.last + 1], values[np.isfinite(values)]
+    first = max(stretch.first - 1, 0) if stretch.cause == "exposure" else stretch.first  # from the frame before
+    there, known = values[first : stretch.last + 1], values[np.isfinite(values)]
     there = there[np.isfinite(there)]
     if not len(there):
         return ""
