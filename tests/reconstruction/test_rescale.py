@@ -66,8 +66,12 @@ def test_from_the_distance_of_two_pixels(truth: Reconstruction, result: Reconstr
     pixels = [
         f"view 1,{(u + 0.5) * width / columns - 0.5},{(v + 0.5) * height / rows - 0.5}" for v, u in ((5, 8), (30, 50))
     ]
-    made, _ = rescale(result, tmp_path / "a", pixels=(pixels[0], pixels[1]), distance=distance, progress=False)
+    made, notes = rescale(result, tmp_path / "a", pixels=(pixels[0], pixels[1]), distance=distance, progress=False)
     assert_true(made, truth)
+    assert len(notes) == 2
+    cut = dataclasses.replace(result, source=SourceRecord("photos", {"size_mismatch": "crop"}, COUNT, ""))
+    _, notes = rescale(cut, tmp_path / "b", pixels=(pixels[0], pixels[1]), distance=distance, progress=False)
+    assert notes[1] == "pixels are counted in the frames as they were cut, 128 x 96 from the centre"
 
 
 def test_a_pixels_point_is_on_its_own_ray(truth: Reconstruction, result: Reconstruction, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from logvggt_jax.reconstruction.exporters.frame_names import file_stems
 from logvggt_jax.reconstruction.frame_pool import FramePool
 from logvggt_jax.reconstruction.fusion.derived_result import check_derived, write_derived
 from logvggt_jax.reconstruction.fusion.fuse import Fused, align, match
-from logvggt_jax.reconstruction.fusion.same_view import is_same_view
+from logvggt_jax.reconstruction.fusion.same_view import is_same_view, may_be_cut
 from logvggt_jax.reconstruction.result import Reconstruction
 
 # Pixels of a frame that its depth and a sensor's must share.
@@ -76,6 +76,9 @@ def rescale(
         assert pixels is not None
         points = np.stack([_point(result, text) for text in pixels])
         factor = _from_distance(points, distance, f"{pixels[0]} and {pixels[1]}", notes)
+        if may_be_cut(result):
+            height, width = result.image_size
+            notes.append(f"pixels are counted in the frames as they were cut, {width} x {height} from the centre")
     extrinsics = result.extrinsics.copy()
     extrinsics[:, :, 3] *= factor
     made = write_derived(

@@ -8,15 +8,17 @@ from logvggt_jax.reconstruction.result import Reconstruction
 _ASPECT = 0.01
 
 
+def may_be_cut(result: Reconstruction) -> bool:
+    """Whether frames may be parts of larger pictures (`--size-mismatch crop`)."""
+    return result.source is not None and result.source.options.get("size_mismatch") == "crop"
+
+
 def is_same_view(result: Reconstruction, size: tuple[int, int]) -> bool:
     """Whether what has `size` (H, W) is a frame enlarged or reduced.
 
-    Frames that may have been cut (`--size-mismatch crop`) have to have this very size: what is larger may be the
-    picture that they are parts of.
+    Where frames may be cut it has to have their size: what is larger may be the picture that one is a part of.
     """
-    if result.source is not None and result.source.options.get("size_mismatch") == "crop":
-        return size == result.image_size
-    return _alike(size, result.image_size)
+    return size == result.image_size if may_be_cut(result) else _alike(size, result.image_size)
 
 
 def lies_on_its_side(result: Reconstruction, size: tuple[int, int]) -> bool:
