@@ -265,7 +265,7 @@ def test_a_page_that_cannot_be_served_is_refused_before_the_model(
     pytest.importorskip("viser", reason="extra `viewer` is not installed")
     absent = str(tmp_path / "no-model")
     arguments = ["reconstruct", str(room), "--checkpoint", absent, "--output", str(tmp_path / "out"), "--dry-run"]
-    assert_fails(capsys, [*arguments, "--port", "70000"], "no-model")
+    assert_fails(capsys, [*arguments, "--port", "7000"], "where the viewer's page is served: give --view, too")
     assert_fails(capsys, [*arguments, "--view"], "no-model")
     assert_fails(capsys, [*arguments, "--view", "--port", "70000"], "port must be 1 to 65535, got 70000")
     assert_fails(capsys, [*arguments, "--view", "--host", "203.0.113.7"], "cannot be served at '203.0.113.7'")
@@ -461,6 +461,8 @@ def test_view_saves_a_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert "10 of 10 points" in capsys.readouterr().out and Path(page).stat().st_size < 25_000_000
     assert main(["view", str(tmp_path / "result"), "--save", page]) == 2
     assert "page.html exists: choose another name or pass --overwrite" in capsys.readouterr().err
+    assert main(["view", str(tmp_path / "result"), "--save", page, "--overwrite", "--host", "0.0.0.0"]) == 2
+    assert "with --save it is a file, leave them out" in capsys.readouterr().err
     assert main(["view", str(tmp_path / "result"), "--save", page, "--overwrite"]) == 0
 
 

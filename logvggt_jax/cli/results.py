@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from logvggt_jax.cli.choices import FORMATS
 from logvggt_jax.cli.command import add_command, given_path, output_option, overwrite_option
-from logvggt_jax.cli.viewing import address, address_options, say_access
+from logvggt_jax.cli.viewing import address, address_options, check_unserved, say_access
 from logvggt_jax.errors import printable
 
 if TYPE_CHECKING:
@@ -68,6 +68,7 @@ def _view(options: argparse.Namespace) -> None:
     from logvggt_jax.reconstruction.viewer import open_viewer, save_page, serve_until_interrupt, stop_server
 
     if options.save is not None:
+        check_unserved(options, "with --save it is a file, leave them out")
         shown, stored = save_page(options.folder, options.save, overwrite=options.overwrite)
         size = options.save.expanduser().stat().st_size / 1e6
         print(f"{printable(str(options.save))}: {shown:,} of {stored:,} points, {size:.1f} MB; open it in a browser")

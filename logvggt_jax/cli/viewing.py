@@ -8,15 +8,26 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+from logvggt_jax.errors import InputError
+
 if TYPE_CHECKING:
     from logvggt_jax.reconstruction.result import Reconstruction
     from logvggt_jax.reconstruction.viewer import RunWindow
 
 
+_HOST, _PORT = "127.0.0.1", 8080
+
+
 def address_options(parser: argparse._ActionsContainer) -> None:
     """Adds where the viewer's page is served."""
-    parser.add_argument("--port", type=int, default=8080, help="of the web page; the next free one if in use")
-    parser.add_argument("--host", default="127.0.0.1", help="serve at this address, to the network that it belongs to")
+    parser.add_argument("--port", type=int, default=_PORT, help="of the web page; the next free one if in use")
+    parser.add_argument("--host", default=_HOST, help="serve at this address, to the network that it belongs to")
+
+
+def check_unserved(options: argparse.Namespace, mend: str) -> None:
+    """InputError, with what to do, where an address is given for a page that is not served."""
+    if (options.host, options.port) != (_HOST, _PORT):
+        raise InputError(f"--host and --port are where the viewer's page is served: {mend}")
 
 
 def watch_options(parser: argparse.ArgumentParser) -> None:
@@ -45,8 +56,10 @@ def say_access(server: Any, host: str) -> None:
 
 
 def check_watch(options: argparse.Namespace) -> None:
-    """InputError where the command is to be watched and its page cannot be served."""
-    if options.view:
+    """InputError where the command is to be watched and its page cannot be served, or has an address and is not."""
+    if not options.view:
+        check_unserved(options, "give --view, too")
+    else:
         from logvggt_jax.reconstruction.viewer import check_viewer
 
         check_viewer(options.host, options.port)
