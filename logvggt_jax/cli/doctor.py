@@ -20,7 +20,8 @@ def _doctor(options: argparse.Namespace) -> int:
     known = (*SHARES, *ON_REQUEST, *METHOD_NAMES)
     if unknown := sorted(set(options.part or ()) - set(known)):
         raise InputError(f"doctor has no part {unknown[0]!r}; it has {', '.join(known)}")
-    parts = options.part or (METHOD_NAMES if options.methods else QUICK if options.quick else tuple(SHARES))
+    usual = METHOD_NAMES if options.methods else QUICK if options.quick else tuple(SHARES)
+    parts = tuple(dict.fromkeys(options.part or usual))
     marks = {True: "ok", False: "WRONG", None: ""}
 
     with contextlib.ExitStack() as stack:

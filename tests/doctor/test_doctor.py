@@ -149,7 +149,7 @@ def test_a_machine_that_computes_otherwise_is_found(monkeypatch: pytest.MonkeyPa
 
 
 def test_the_command_runs_parts_in_processes_of_their_own(capfd: pytest.CaptureFixture[str]) -> None:
-    code = main(["doctor", "--part", "environment", "--json"])
+    code = main(["doctor", "--part", "environment", "--part", "environment", "--json"])
     findings = [Finding(**json.loads(line)) for line in capfd.readouterr().out.splitlines()]
     assert [finding.what for finding in findings if finding.what in ("Python", "jax", "devices", "time")] == [
         "Python", "jax", "devices", "time",
