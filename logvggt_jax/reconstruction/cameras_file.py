@@ -39,6 +39,7 @@ def write_cameras(
     noted_focal_length: float | None = None,
     source: SourceRecord | None = None,
     metric: bool = False,
+    world_is_given: bool = False,
     depth_scale: np.ndarray | None = None,
     loops: np.ndarray | None = None,
     masked: Sequence[float] | None = None,
@@ -62,6 +63,7 @@ def write_cameras(
         known.
       source: where the frames came from; None where they cannot be read again.
       metric: whether lengths are metres.
+      world_is_given: whether the world is that of poses from elsewhere, and not the first camera's frame.
       depth_scale: [N], by which the depth files' depth has to be multiplied to fit the cameras; None where it fits.
       loops: int [L, 2], the frames at which the sequence came back to a place; None where nobody looked for them.
       masked: [N], the share of the depth maps' pixels that a mask drops; None where there were no masks.
@@ -90,6 +92,7 @@ def write_cameras(
         "image_size": list(image_size),
         "depth_size": list(model_size),
         "metric": metric,
+        **({"world_is_given": True} if world_is_given else {}),
         **({} if timed is None else {"timed": timed}),
         "complete": complete,
         "noted_focal_length": noted_focal_length,
@@ -163,8 +166,13 @@ def _checked(document: Any) -> dict[str, Any]:
     document["source"] = _source(document.get("source"))
     document["points"] = _point_filter(document.get("points", {}))
     _require(noted is None or bool(_numbers(noted, (), "noted_focal_length") > 0), "noted_focal_length must be above 0")
-    timed = document.setdefault("timed", None)
-    for key, value in (("complete", complete), ("metric", metric), ("timed", timed or False)):
+    timed, given = document.setdefault("timed", None), document.setdefault("world_is_given", False)
+    for key, value in (
+        ("complete", complete),
+        ("metric", metric),
+        ("timed", timed or False),
+        ("world_is_given", given),
+    ):
         _require(type(value) is bool, f"{key} must be true or false, got {shown(value)}")
     _require(
         isinstance(skipped, list)

@@ -45,6 +45,7 @@ class Reconstruction:
       image_size: (H, W) of the original images.
       depth_size: (h, w) of depth, confidence and image.
       metric: whether lengths are metres; else they are up to one common scale.
+      world_is_given: whether the world is that of poses that were fused in, whose axes may be any.
       complete: False if the run was ended before the end of its source.
       skipped: names of frames that could not be read and are left out.
       noted_focal_length: pixels of the original images, the median of what the camera noted in EXIF; None where it did
@@ -70,6 +71,7 @@ class Reconstruction:
     depth_size: tuple[int, int]
     depth_scale: np.ndarray
     metric: bool = False
+    world_is_given: bool = False
     loops: tuple[tuple[int, int], ...] | None = None
     complete: bool = True
     skipped: tuple[str, ...] = ()
@@ -120,6 +122,7 @@ class Reconstruction:
             image_size=tuple(document["image_size"]),
             depth_size=tuple(document["depth_size"]),
             metric=document["metric"],
+            world_is_given=document["world_is_given"],
             depth_scale=np.array([frame["depth_scale"] for frame in frames], np.float64),
             loops=None if document["loops"] is None else tuple((a, b) for a, b in document["loops"]),
             complete=document["complete"],

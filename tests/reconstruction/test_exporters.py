@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import importlib.util
 import json
@@ -384,6 +385,22 @@ def test_rosbags_reads_pictures_depth_cameras_and_poses(result: Reconstruction, 
     right, _, forward = result.extrinsics[index, :, :3]
     np.testing.assert_allclose(axes[:, 2], [forward[2], -forward[0], -forward[1]], atol=1e-6)
     np.testing.assert_allclose(axes[:, 0], [right[2], -right[0], -right[1]], atol=1e-6)
+
+
+def test_the_map_of_ros_is_the_world_of_poses_that_were_fused_in(result: Reconstruction, tmp_path: Path) -> None:
+    """A robot's odometry has z up already."""
+    pytest.importorskip("rosbags", reason="extra `formats` is not installed")
+    from rosbags.highlevel import AnyReader
+
+    given = dataclasses.replace(result, folder=shutil.copytree(result.folder, tmp_path / "fused"), world_is_given=True)
+    (folder,) = export(given, ["rosbag2"], tmp_path / "exports", progress=False)
+    with AnyReader([folder]) as reader:
+        wanted = [connection for connection in reader.connections if connection.topic == "/camera/pose"]
+        found = [
+            reader.deserialize(content, connection.msgtype).pose for connection, _, content in reader.messages(wanted)
+        ]
+    places = [[pose.position.x, pose.position.y, pose.position.z] for pose in found]
+    np.testing.assert_allclose(places, camera_centres(result.extrinsics), atol=1e-9)
 
 
 def test_no_depth_is_nan_for_ros(tmp_path: Path) -> None:

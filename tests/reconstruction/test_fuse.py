@@ -24,6 +24,7 @@ from logvggt_jax.reconstruction import PointFilter, Reconstruction, export, fuse
 from logvggt_jax.reconstruction.fusion.bundle_adjustment import _largest_steps
 from logvggt_jax.reconstruction.fusion.matching import match_poses
 from logvggt_jax.reconstruction.fusion.pose_files import ExternalPose, read_poses
+from logvggt_jax.reconstruction.fusion.rescale import rescale
 from logvggt_jax.reconstruction.sources.record import SourceRecord
 
 COUNT, SIZE = 10, (84, 112)
@@ -101,6 +102,9 @@ def test_with_true_poses_depth_and_points_come_out_true(
     poses = with_tum(truth, tmp_path / "poses")
     made, notes = fuse(disordered, tmp_path / "fused", poses=poses, metric=True, progress=False)
     assert made.metric and made.names == truth.names
+    assert made.world_is_given and not disordered.world_is_given
+    scaled, _ = rescale(made, tmp_path / "scaled", frames=("0", "1"), distance=1.0, progress=False)
+    assert scaled.world_is_given
     np.testing.assert_allclose(made.extrinsics, truth.extrinsics, atol=1e-6)
     ratios = [np.median(made.depth(index) / truth.depth(index)) for index in range(COUNT)]
     assert np.mean(ratios) == pytest.approx(1, abs=0.02)

@@ -19,7 +19,7 @@ from logvggt_jax.reconstruction.points.point_filter import PointFilter
 from logvggt_jax.reconstruction.result import Reconstruction
 
 MAP_FROM_WORLD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-"""Turns the world's x right, y down, z forward into x forward, y left, z up, as ROS has its frame `map`."""
+"""Turns a first camera's x right, y down, z forward into x forward, y left, z up, as ROS has its frame `map`."""
 _MAP, _CAMERA = "map", "camera_optical_frame"
 _BAG = "rosbag2"
 _TOPICS = {
@@ -40,8 +40,9 @@ def export_rosbag(
 
     Topics: pictures as JPEG, depth as 32FC1 at the size of the original images (NaN
     where there is none, as REP 118 has it), a camera_info of each with
-    pixel centres at integers, and the pose of `camera_optical_frame` in `map` (x forward, y left, z up) as PoseStamped,
-    Odometry and TF. Stamps are the frames' own.
+    pixel centres at integers, and the pose of `camera_optical_frame` in `map` as PoseStamped, Odometry and TF. `map` is
+    the first camera's frame, turned to x forward, y left, z up; or as it is the world of the poses that were fused in.
+    Stamps are the frames' own.
 
     Raises MissingPackage without rosbags.
     """
@@ -95,7 +96,9 @@ def _messages(types: Any, result: Reconstruction, pictures: Pictures, index: int
     depth = original_depth(result, index)
     depth = np.where(depth > 0, depth, np.float32(np.nan))
     height, width = depth.shape
-    pose = MAP_FROM_WORLD @ np.asarray(invert(result.extrinsics[index]))
+    pose = np.asarray(invert(result.extrinsics[index]))
+    if not result.world_is_given:
+        pose = MAP_FROM_WORLD @ pose
     position, quaternion = pose[:3, 3].tolist(), matrix_to_quaternion(pose[:3, :3]).tolist()
     rotation = types["geometry_msgs/msg/Quaternion"](*quaternion)
     placed = types["geometry_msgs/msg/Pose"](position=types["geometry_msgs/msg/Point"](*position), orientation=rotation)

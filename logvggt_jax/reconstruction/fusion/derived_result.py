@@ -60,6 +60,7 @@ def write_derived(
     depth_scales: np.ndarray,
     intrinsics: np.ndarray,
     metric: bool,
+    world_is_given: bool,
     keeps_health: bool = False,
     overwrite: bool = False,
     progress: bool = True,
@@ -74,6 +75,7 @@ def write_derived(
       depth_scales: [n], by which the depth is multiplied.
       intrinsics: [n, 3, 3] in pixels of the original images.
       metric: whether lengths are metres.
+      world_is_given: whether the cameras are those of poses from elsewhere.
       keeps_health: whether its report on the result's health, of which no measure has a unit, holds as it is; else one
         is made of the new cameras and depth, and of what the earlier one knows of the stream.
       overwrite: replace an earlier result.
@@ -120,6 +122,7 @@ def write_derived(
             skipped=[(name, "left out of the result that this one is made from") for name in result.skipped],
             source=result.source,
             metric=metric,
+            world_is_given=world_is_given,
             loops=_kept_loops(result, frames),
             masked=result.masked[list(frames)].tolist() if result.masked.any() else None,
             timed=result.timed,

@@ -97,6 +97,7 @@ def fuse(
         depth_scales=scales,
         intrinsics=cameras.intrinsics,
         metric=metric or (poses is None and result.metric),
+        world_is_given=poses is not None or result.world_is_given,
         overwrite=overwrite,
         progress=progress,
     )

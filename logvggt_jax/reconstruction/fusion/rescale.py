@@ -89,6 +89,7 @@ def rescale(
         depth_scales=np.full(result.num_frames, factor),
         intrinsics=result.intrinsics,
         metric=True,
+        world_is_given=result.world_is_given,
         keeps_health=True,
         overwrite=overwrite,
         progress=progress,
