@@ -473,6 +473,7 @@ def test_view_saves_a_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
         (["export", "", "--format", "ply"], "argument result: the path is empty"),
         (["info", "rooms", "n" * 300], "unrecognized arguments: nnn"),
         (["reconstruct", "1.jpg", "2.jpg", "--output", "o", "--checkpoint", "rooms"], r"put a pattern in quotes"),
+        (["view", "1.jpg", "2.jpg"], "unrecognized arguments: 2.jpg; `logvggt --help`"),
         (
             ["reconstruct", "1.jpg", "3.jpg", "--output", "o", "--checkpoint", "rooms"],
             "unrecognized arguments: 3.jpg; `logvggt --help`",

@@ -37,7 +37,7 @@ def _run(arguments: Sequence[str]) -> int:
     parser = command_parser()
     options, unknown = parser.parse_known_args(with_dashes(arguments))
     if unknown:
-        parser.error(f"unrecognized arguments: {' '.join(unknown)}{_unquoted(unknown)}")
+        parser.error(f"unrecognized arguments: {' '.join(unknown)}{_unquoted(options, unknown)}")
     try:
         with plain_warnings("logvggt"):
             return options.run(options) or 0
@@ -76,9 +76,11 @@ class _Parser(argparse.ArgumentParser):
         self.exit(BAD_INPUT, f"{self.prog}: error: {message}; `{self.prog} --help` tells how it is used\n")
 
 
-def _unquoted(unknown: Sequence[str]) -> str:
-    """A remark where a shell has made files of a pattern."""
-    if any(argument.startswith("-") or not _exists(argument) for argument in unknown):
+def _unquoted(options: argparse.Namespace, unknown: Sequence[str]) -> str:
+    """A remark where a shell has made files of a pattern, for a command that takes one."""
+    if not hasattr(options, "pattern") or any(
+        argument.startswith("-") or not _exists(argument) for argument in unknown
+    ):
         return ""
     return "; one source is taken: put a pattern in quotes ('walk/*.jpg'), or give the folder"
 

@@ -74,8 +74,8 @@ def _viser() -> Any:
         import viser
     except ImportError as error:
         raise MissingPackage(
-            f"the viewer needs viser ({one_line(error)}): {install_line('viewer')}; a page that needs nothing is "
-            "written with --save"
+            f"the viewer needs viser ({one_line(error)}): {install_line('viewer')}; `logvggt "
+            "view RESULT --save page.html` writes a page that needs nothing"
         ) from error
     return viser
 
