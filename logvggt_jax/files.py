@@ -19,6 +19,7 @@ from logvggt_jax.errors import DiskError, InputError, OutputExists, disk_errors,
 
 EMPTY_PATH = "the path is empty (a variable without a value?)"
 _LONGEST_NAME, _LONGEST_SUFFIX = 255, 32  # bytes
+_LOCK, _OWNER = ".lock", ".owner"
 # A name beside the one that a file is to have: see `_temporary_name`.
 _TEMPORARY = re.compile(r"\..*\.\d+-[0-9a-f]{8}(\.[^.]*)?", re.DOTALL)
 
@@ -122,14 +123,14 @@ def check_output(output: str | Path, *, overwrite: bool, marker: str, in_place: 
 
     An empty folder that was made beforehand is as good as none. With `overwrite` an existing folder may be replaced
     that holds `marker`, a file that every finished folder of this kind has, so that a slip of the keyboard deletes no
-    other folder. Unless what is written goes `in_place`, into the folder itself, a new folder takes its place at the
-    end, which the top of a volume gives up for nobody.
+    other folder. Unless what is written goes `in_place`, into the folder itself, which then may hold what a lock left,
+    a new folder takes its place at the end, which the top of a volume gives up for nobody.
     """
     output = user_path(output, resolved=True)
     with disk_errors(output):
         if output.is_mount() and not in_place:
             raise OutputExists(f"{output} is the top of a volume, which nothing can replace: choose a folder in it")
-        if _is_free(output):
+        if _is_free(output) or (in_place and holds_nothing(output)):
             return output
         if not overwrite:
             raise _exists(output)
@@ -180,11 +181,16 @@ def existing_parent(path: Path) -> Path:
     return next(parent for parent in path.parents if parent.exists())
 
 
+def holds_nothing(folder: Path) -> bool:
+    """Whether a folder is empty, but for what the lock of a run leaves that ended before it wrote anything."""
+    return folder.is_dir() and {path.name for path in folder.iterdir()} <= {_LOCK, _OWNER}
+
+
 class FolderLock:
     """The exclusive use of a folder, which ends with the process that has it, however that ends.
 
     Args:
-      folder: made where it is not there; its `.lock` and `.owner` belong to the lock.
+      folder: made where it is not there; its `.lock` and `.owner` belong to the lock, see `holds_nothing`.
       mend: what else a user can do, for the end of an error.
 
     Raises:
@@ -193,10 +199,10 @@ class FolderLock:
     """
 
     def __init__(self, folder: Path, mend: str) -> None:
-        owner = folder / ".owner"
+        owner = folder / _OWNER
         with disk_errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
-            self._lock = FileLock(folder / ".lock")
+            self._lock = FileLock(folder / _LOCK)
             try:
                 self._lock.acquire(timeout=0)
             except Timeout:

@@ -17,7 +17,7 @@ from logvggt_jax.evaluation.records import RECORDS_FILE
 from logvggt_jax.evaluation.report.report import write_report
 from logvggt_jax.evaluation.runner import evaluate
 from logvggt_jax.evaluation.settings import ClipRun, PaperRun, read_run
-from logvggt_jax.files import check_output
+from logvggt_jax.files import FolderLock, check_output
 from logvggt_jax.streaming import METHODS, expectation
 from logvggt_jax.weights.address import resolve
 from logvggt_jax.weights.checkpoints import read_config, read_provenance
@@ -51,7 +51,7 @@ def run_evaluation(
 
     Raises:
       OutputExists: `output` holds something else than an evaluation.
-      InputError: a setting, the data or the checkpoint cannot be used.
+      InputError: a setting, the data or the checkpoint cannot be used, or another run is at work on `output`.
     """
     run = read_run(configuration)
     output = check_output(output, overwrite=True, marker=RECORDS_FILE, in_place=True)
@@ -82,20 +82,24 @@ def run_evaluation(
                 dtype=loaded.model.config.dtype,
                 fresh=fresh,
             )
-    results = evaluate(
-        benchmarks,
-        [*rows.values(), *variant_methods(loaded, run.variants), *baselines(loaded.model)],
-        output,
-        title=run.title,
-        command=command,
-        configuration=dataclasses.asdict(run),
-        checkpoint=loaded.digest,
-        max_sequences=run.max_sequences,
-        figures=run.figures,
-        fresh=fresh,
-        timings=timings,
-    )
-    write_report(results, output)
+    lock = FolderLock(output, "choose another output")
+    try:
+        results = evaluate(
+            benchmarks,
+            [*rows.values(), *variant_methods(loaded, run.variants), *baselines(loaded.model)],
+            output,
+            title=run.title,
+            command=command,
+            configuration=dataclasses.asdict(run),
+            checkpoint=loaded.digest,
+            max_sequences=run.max_sequences,
+            figures=run.figures,
+            fresh=fresh,
+            timings=timings,
+        )
+        write_report(results, output)
+    finally:
+        lock.release()
     return results
 
 

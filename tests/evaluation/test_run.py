@@ -19,6 +19,7 @@ from logvggt_jax.evaluation import run as run_module
 from logvggt_jax.evaluation.methods.method import Checkpoint
 from logvggt_jax.evaluation.report.report import print_report
 from logvggt_jax.evaluation.run import run_evaluation
+from logvggt_jax.files import FolderLock
 from logvggt_jax.weights import Provenance, save_model
 
 ROOT = Path(__file__).parents[2]
@@ -124,6 +125,20 @@ def test_the_model_and_all_baselines_make_a_table(
     rows = list(csv.reader((output / "tables" / "01-depth-clips-of-4-frames.csv").read_text().splitlines()))
     assert rows[0][:2] == ["method", "Abs Rel (scale) ↓"]
     assert rows[1][:2] == ["LoG-VGGT", shown]
+
+
+def test_two_runs_do_not_share_a_folder(
+    small_config: ModelConfig, small_variables: dict[str, Any], tmp_path: Path
+) -> None:
+    save_model(tmp_path / "model", small_config, small_variables["params"], Provenance("windows", 42))
+    values, output = configuration("rooms", {"methods": ("windows",)}), tmp_path / "out"
+    lock = FolderLock(output, "")
+    with pytest.raises(InputError, match=r"out: another run is using this folder .*choose another output"):
+        run_evaluation(values, tmp_path / "model", output, command="command")
+    lock.release()
+    # What a run leaves that ended before it wrote anything is no hindrance.
+    with pytest.raises(InputError, match="no-model"):
+        run_evaluation(values, tmp_path / "no-model", output, command="command")
 
 
 def test_weights_in_methods_that_are_not_theirs_are_warned_of_once(

@@ -32,7 +32,7 @@ from logvggt_jax.data.packed.index import (
 from logvggt_jax.data.packed.records import broken_record, frame_record
 from logvggt_jax.data.registry import READERS, open_dataset
 from logvggt_jax.errors import DiskError, InputError, MissingPackage, OutputExists, disk_errors, install_line, one_line
-from logvggt_jax.files import FolderLock, atomic_file, check_writable, to_disk, user_path, write_text
+from logvggt_jax.files import FolderLock, atomic_file, check_writable, holds_nothing, to_disk, user_path, write_text
 
 FRAMES_PER_SHARD = 2000
 # One record in a group: a frame is read without its neighbours. Stronger compression takes twice the time for 3 %.
@@ -93,7 +93,7 @@ def pack(
     check_writable(output)
     reader = open_dataset(name, root, split, **options)
     with disk_errors(output):
-        if output.exists() and any(output.iterdir()) and not (output / PLAN).exists():
+        if output.exists() and not holds_nothing(output) and not (output / PLAN).exists():
             raise OutputExists(f"{output} is not empty, and nothing was packed there: choose another output")
     lock = FolderLock(output, "choose another output")
     try:

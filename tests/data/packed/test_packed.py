@@ -158,6 +158,18 @@ def test_a_damaged_shard_is_named_and_written_anew(scenes: Path, packed: Path, t
     assert shard.read_bytes() == (packed / shard.name).read_bytes()
 
 
+def test_a_run_that_ended_while_it_listed_goes_on(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stopped(*_: Any) -> Any:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(module, "_placed", stopped)
+        pack(NAME, scenes, tmp_path / "here")
+    assert pack(NAME, scenes, tmp_path / "here").written == 1
+
+
 def test_what_was_corrected_since_is_written_anew_and_nothing_else(tmp_path: Path) -> None:
     scenes = write_scenes(tmp_path / "scenes")
     output = tmp_path / "packed"
