@@ -25,9 +25,9 @@ from logvggt_jax.data.formats.ordering import natural_order
 from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame, read_depth_of
 from logvggt_jax.data.readers.own_recordings import (
-    PICTURE_SUFFIXES,
     file_below,
     find_recordings,
+    is_picture,
     names_beside,
     without_distortion,
 )
@@ -75,7 +75,7 @@ class Colmap(FolderDataset):
         used = {image.camera for image in images}
         known = {number: _camera(cameras, number, camera_file, image_file) for number in used}
         there = {each / name for each, held in names.items() for name in held}
-        yield from (Dropped("no pose") for path in there - set(paths) if path.suffix.lower() in PICTURE_SUFFIXES)
+        yield from (Dropped("no pose") for path in there - set(paths) if is_picture(path))
         depths = _depth_files(files, folder, [image.name for image in images])
         for image, path in zip(images, paths, strict=True):
             depth = depths.get(image.name) if depths else path  # a picture in depth's place stands for no depth

@@ -16,7 +16,7 @@ from logvggt_jax.data.formats.image import read_rgb
 from logvggt_jax.data.formats.ordering import natural_order
 from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.data.readers.folder_dataset import NO_POSES, Dropped, FolderDataset, FrameRecord, frame
-from logvggt_jax.data.readers.own_recordings import PICTURE_SUFFIXES, find_recordings
+from logvggt_jax.data.readers.own_recordings import find_recordings, is_picture
 
 
 class Images(FolderDataset):
@@ -56,4 +56,4 @@ class Images(FolderDataset):
 
 
 def _pictures(folder: Path, files: SourceFiles) -> list[str]:
-    return [name for name in files.names(folder, "pictures") if Path(name).suffix.lower() in PICTURE_SUFFIXES]
+    return [name for name in files.names(folder, "pictures") if is_picture(Path(name))]

@@ -15,17 +15,24 @@ from logvggt_jax.errors import InputError
 
 # OpenCV's limit for a side of what it maps.
 _MOST_PIXELS = 2**15 - 1
-PICTURE_SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
+_PICTURE_SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
+
+
+def is_picture(path: Path) -> bool:
+    """Whether a file has a picture's name; hidden ones hold what macOS knows of a picture."""
+    return path.suffix.lower() in _PICTURE_SUFFIXES and not path.name.startswith(".")
 
 
 def find_recordings(
     root: Path, files: SourceFiles, expects: str, is_recording: Callable[[Path], object]
 ) -> Mapping[str, Path]:
-    """The root, where it is a recording itself, else the folders in it that are; named as their folders."""
+    """The root, where it is a recording itself, else the folders in it that are; named as their folders. Hidden ones,
+    such as those of thumbnails, are none."""
     if is_recording(root):
         # A root such as "." has no name of its own.
         return {root.resolve().name: root}
-    return {name: folder for name, folder in files.folders(root, expects).items() if is_recording(folder)}
+    folders = {name: each for name, each in files.folders(root, expects).items() if not name.startswith(".")}
+    return {name: folder for name, folder in folders.items() if is_recording(folder)}
 
 
 def file_below(folder: Path, name: str, named_by: Path) -> Path:

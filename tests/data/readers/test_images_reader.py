@@ -33,6 +33,13 @@ def test_pictures_come_in_natural_order_without_depth_or_poses(tmp_path: Path):
         check_frames(frames, "walk")
 
 
+def test_what_is_hidden_is_no_picture(tmp_path: Path):
+    write_video(tmp_path / ".thumbnails")
+    (write_video(tmp_path / "walk") / "._img1.png").write_bytes(b"\0\5\x16\7 what macOS knows of it")
+    dataset = open_dataset("images", tmp_path)
+    assert dataset.sequences == ("walk",) and dataset.frame_names("walk") == ["img1.png", "img2.png", "img10.png"]
+
+
 def test_the_root_itself_may_hold_the_pictures(tmp_path: Path):
     assert open_dataset("images", write_video(tmp_path / "walk")).sequences == ("walk",)
 
