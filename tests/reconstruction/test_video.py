@@ -825,6 +825,21 @@ def test_too_much_damage_is_an_error(tmp_path: Path, library: str) -> None:
     assert len(source.skipped) == 3
 
 
+@pytest.mark.parametrize("codec", ["libvpx", "libvpx-vp9"])
+def test_an_end_that_cannot_be_decoded_is_no_early_end(tmp_path: Path, library: str, codec: str) -> None:
+    path = write(tmp_path / "walk.webm", [busy(i) for i in range(24)], codec=codec, options={"g": "12"})
+    content = path.read_bytes()
+    with av.open(str(path)) as container:
+        stored = [bytes(packet) for packet in container.demux(video=0) if packet.size]
+    source = open_source(path)
+    assert len(list(source)) == 24 and not source.skipped
+    for packet in stored[12:]:
+        content = content.replace(packet, np.random.default_rng(0).bytes(len(packet)))
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"walk\.webm: 3 of 24 frames cannot be decoded"):
+        list(open_source(path))
+
+
 def test_nothing_that_can_be_decoded(tmp_path: Path, library: str) -> None:
     path, _ = damaged(tmp_path / "noise.mp4", range(24))
     with pytest.raises(InputError, match=r"noise\.mp4 holds no frame that"):

@@ -44,6 +44,8 @@ _FRAME_A_PACKET = (
     *(b"h264", b"avc1", b"hevc", b"hvc1", b"hev1", b"mjpg", b"fmp4", b"mp4v", b"xvid", b"divx", b"dx50"),
     *(b"mpg1", b"mpg2"),
 )
+# Codecs that are stored in the order in which they are shown; a packet need not show a frame.
+_AS_SHOWN = (b"vp80", b"vp90", b"av01")
 _EMPTY_PACKET = 8
 # What files begin with that may lack presentation times: AVI and MXF.
 _LACK_TIMES = (b"RIFF", b"\x06\x0e\x2b\x34")
@@ -72,6 +74,7 @@ class PacketReader:
 
     Attributes:
       frame_each: each is known to show one frame. AVI states no presentation times, nor does MXF without its index.
+      as_shown: they are stored in the order in which frames are shown.
 
     Args:
       source: the file's absolute path.
@@ -81,6 +84,7 @@ class PacketReader:
         self._capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
         self._codec = (int(self._capture.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF).to_bytes(4, "little").lower()
         with Path(source).open("rb") as file:
+            self.as_shown = self._codec in _AS_SHOWN
             self.frame_each = self._codec in _FRAME_A_PACKET and file.read(4) not in _LACK_TIMES
 
     def __iter__(self) -> Iterator[Packet | None]:

@@ -141,7 +141,8 @@ class PacketFollower:
             self._take(first)
 
     def _all_missing(self) -> Iterator[Damage]:
-        if self._since() is not None:
+        # Of what is stored as it is shown, no more waits than what follows the last picture.
+        if self._since() is not None or (self._trusted and self._reader.as_shown):
             self._missing.fail_all("gives no picture")
         yield from self._count(self._missing.failures())
         while self._missing.take_next() is not None:
