@@ -30,7 +30,8 @@ class ProfiledSteps(NamedTuple):
 
 
 class Profiler:
-    """Writes the trace of this process's `steps` to `folder`; a context manager that ends a trace with its run."""
+    """Writes the trace of this process's `steps` to `folder`; a context manager that ends a trace with its run, and
+    warns where the run ended without one of them."""
 
     def __init__(self, steps: ProfiledSteps | None, folder: Path) -> None:
         self._steps, self._folder, self._running = steps, folder, False
@@ -38,9 +39,13 @@ class Profiler:
     def __enter__(self) -> Profiler:
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: object, *_: object) -> None:
         if self._running:
             self.stop()
+        elif self._steps is not None and kind is None:
+            logging.warning(
+                "no trace in %s: none of the steps %d to %d was made in this start", self._folder, *self._steps
+            )
 
     def before(self, step: int) -> None:
         """Begins the trace with its first step, or with the first that is left where a run goes on among them."""
