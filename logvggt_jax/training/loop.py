@@ -165,6 +165,7 @@ class _Run:
             return 0, None
         like = self.program.abstract_state
         self.state, position = self.checkpoints.restore(like, step=resume_step)
+        self.checkpoints.write_missing_model(self.state)
         return int(self.state.step), position
 
     def train(

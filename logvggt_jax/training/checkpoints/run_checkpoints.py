@@ -54,7 +54,9 @@ class RunCheckpoints:
         self._saved: int | None = None
         self._best: int | None = None
         # A model without checkpoints is this run's if it was killed before its first one was complete.
-        if not self.steps:
+        if self.steps:
+            self.models.check_replaceable()
+        else:
             self.models.check_own()
 
     def __enter__(self) -> RunCheckpoints:
@@ -64,6 +66,7 @@ class RunCheckpoints:
             try:
                 self._lock = FolderLock(self.folder.parent, _ELSEWHERE)
                 remove_scratch(self.folder.parent)
+                self._set_damaged_models_aside()
             except InputError as error:
                 failure = error
         if any_process(failure is not None):
@@ -125,7 +128,13 @@ class RunCheckpoints:
             self._begin(self._newest_is_best, step)
         else:
             self.wait()  # the host holds one save at a time
-            self._begin(self._write_best, self._copied(state.averaged), step)
+            self._begin(self._write_model, self.models.best, self._copied(state.averaged), step)
+
+    def write_missing_model(self, state: TrainState) -> None:
+        """Begins to write the model folder of a restored state where there is none, and returns; all processes have to
+        call this at the same point."""
+        if any_process(jax.process_index() == 0 and self.models.newest_step is None):
+            self._begin(self._write_model, self.models.newest, self._copied(state.averaged), int(state.step))
 
     def check(self) -> None:
         """Raises on process 0 what kept a save from being written, as soon as that is known; waits for nothing."""
@@ -294,9 +303,15 @@ class RunCheckpoints:
         if self.models.newest_step == step:
             self.models.keep_newest_as_best()
 
-    def _write_best(self, params: Any, step: int) -> None:
-        _check_room(self.models.best, params)
-        self.models.write(self.models.best, params, step)
+    def _write_model(self, folder: Path, params: Any, step: int) -> None:
+        _check_room(folder, params)
+        self.models.write(folder, params, step)
+
+    def _set_damaged_models_aside(self) -> None:
+        # Without a checkpoint it may be another's.
+        for folder, problem in self.models.damaged if self.steps else ():
+            with disk_errors(folder):
+                logging.error("%s is damaged (%s); moved to %s", folder, one_line(problem), _set_aside(folder))
 
     def _went_back_to(self) -> int | None:
         """The step that an earlier start of this run was told to go back to, and did."""

@@ -17,7 +17,7 @@ from logvggt_jax.files import atomic_folder
 from logvggt_jax.model.parameters import unstack_layers
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.weights.checkpoints import check_destination, read_licence, read_provenance, save_model
-from logvggt_jax.weights.folder import is_model_folder
+from logvggt_jax.weights.folder import is_model_folder, read_description
 from logvggt_jax.weights.provenance import Provenance, TrainingRecord
 
 
@@ -29,12 +29,8 @@ class RunModels:
     """
 
     def __init__(self, workdir: Path, config: TrainConfig) -> None:
-        """Raises OutputExists where one of the folders is something else than a model."""
         self.newest, self.best = workdir / "model", workdir / "best"
         self._workdir, self._config = workdir, config
-        # Now rather than after the steps before the first save.
-        for folder in (self.newest, self.best):
-            check_destination(folder)
 
     @property
     def best_step(self) -> int | None:
@@ -46,8 +42,30 @@ class RunModels:
         """The step of the model in `model`; None without one."""
         return _step_of(self.newest)
 
+    @property
+    def damaged(self) -> list[tuple[Path, InputError]]:
+        """Those of the folders that are models whose description cannot be read, each with what is wrong."""
+        found: list[tuple[Path, InputError]] = []
+        for folder in filter(is_model_folder, (self.newest, self.best)):
+            try:
+                read_description(folder)
+            except InputError as error:
+                found.append((folder, error))
+        return found
+
+    def check_replaceable(self) -> None:
+        """Raises OutputExists where one of the folders is something else than a model, whole or `damaged`; now rather
+        than after the steps before the first save."""
+        damaged = [folder for folder, _ in self.damaged]
+        for folder in (self.newest, self.best):
+            if folder not in damaged:
+                check_destination(folder)
+
     def check_own(self) -> None:
-        """Raises OutputExists for a model that another run or a conversion wrote, by its provenance."""
+        """Raises OutputExists for something else than a whole model, and for a model that another run or a conversion
+        wrote, by its provenance."""
+        for folder in (self.newest, self.best):
+            check_destination(folder)
         for folder in filter(is_model_folder, (self.newest, self.best)):
             source = read_provenance(folder).source or "source not recorded"
             if not source.endswith(self._here):

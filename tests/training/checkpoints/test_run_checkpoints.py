@@ -291,6 +291,36 @@ def test_a_damaged_newest_checkpoint_is_named_and_the_one_before_is_taken(
         assert checkpoints.steps == [3]
 
 
+@pytest.mark.parametrize("damage", [lambda file: file.write_bytes(b""), Path.unlink])
+def test_a_damaged_model_keeps_no_run_from_going_on(
+    run_config: TrainConfig,
+    state: TrainState,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    damage: Callable[[Path], None],
+) -> None:
+    monkeypatch.setattr(module, "unstack_layers", lambda tree, *_: tree)
+    with RunCheckpoints(tmp_path, run_config) as checkpoints:
+        checkpoints.save(_at(state, 3), POSITION)
+        checkpoints.save_best(_at(state, 3))
+        checkpoints.wait()
+    for name in ("model", "best"):
+        damage(tmp_path / name / "config.json")
+    with RunCheckpoints(tmp_path, run_config) as checkpoints:
+        found, _ = checkpoints.restore(state)
+        checkpoints.write_missing_model(found)
+        checkpoints.wait()
+        assert (checkpoints.models.newest_step, checkpoints.models.best_step) == (3, None)
+    for name in ("model", "best"):
+        assert f"moved to {tmp_path / name}.aside" in caplog.text and (tmp_path / f"{name}.aside").is_dir()
+    # What is no model is nobody's to move.
+    (tmp_path / "best").mkdir()
+    (tmp_path / "best" / "notes.txt").touch()
+    with pytest.raises(OutputExists, match="best: exists and is not a model folder"):
+        RunCheckpoints(tmp_path, run_config)
+
+
 @pytest.mark.usefixtures("abandoned_reads")
 def test_only_damaged_checkpoints_are_an_error_and_stay(
     run_config: TrainConfig, state: TrainState, saved: Path
@@ -462,14 +492,12 @@ def test_a_failed_save_is_told_by_the_next_step(
             checkpoints.check()
 
 
-def test_what_killed_saves_left_goes_when_the_run_comes_back(
-    run_config: TrainConfig, saved: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(module, "check_destination", lambda _: None)
+def test_what_killed_saves_left_goes_when_the_run_comes_back(run_config: TrainConfig, saved: Path) -> None:
     left = ["model.7-ab.partial", ".model.7-ab.old", "checkpoints/3.7-ab.partial", "checkpoints/.0.old"]
     for name in left:
         (saved / name / "params").mkdir(parents=True)
     (saved / "model" / "params").mkdir(parents=True)
+    write_description(saved / "model", {"config": {}, "digests": {}})
     (saved / "notes").mkdir()
     # Of a preflight that is at work nothing is taken away.
     lock = FolderLock(saved / PREFLIGHT, "wait")
