@@ -66,7 +66,10 @@ _NUM_PROCESSES = flags.DEFINE_integer("num_processes", None, "Processes of the r
 _PROCESS_ID = flags.DEFINE_integer("process_id", None, "Of this process, from 0, where the cluster does not say.")
 _JOIN_SECONDS = flags.DEFINE_float("join_seconds", JOIN_SECONDS, "How long to wait for the others at the start.")
 _WATCHDOG = flags.DEFINE_float(
-    "watchdog", 30.0, "End the process, with all stacks, when no step ended in so many median steps; 0: never."
+    "watchdog",
+    30.0,
+    "End the process, with all stacks, when no step ended in so many median steps; 0: never.",
+    lower_bound=0.0,
 )
 _PROFILE = flags.DEFINE_string("profile", None, "Steps to write a trace of to WORKDIR/profile, such as 20:25.")
 _WANDB = flags.DEFINE_string(

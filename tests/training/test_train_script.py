@@ -172,6 +172,7 @@ def test_an_argument_that_is_no_flag_is_one_line(run_train: Callable, tmp_path: 
         (["--join_seconds=600"], "--join_seconds is of runs of several processes: add --distributed"),
         (["--num_processes=2", "--process_id=0"], "--num_processes is of runs of several processes: add --distributed"),
         (["--workdir="], "--workdir is empty: name a folder"),
+        (["--watchdog=-1"], "flag --watchdog=-1: -1.0 is not a non-negative number"),
         (["--preflight", "--dry_run"], "--preflight tries what --dry_run only compiles: give one of them"),
         (["--source=seven_scene=/data"], "unknown data set 'seven_scene': choose one of "),
         (["--compilation_cache=/dev/null"], "/dev/null is no folder: give another --compilation_cache"),
