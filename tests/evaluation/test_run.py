@@ -5,6 +5,7 @@ import csv
 import importlib
 import io
 import json
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from rich.console import Console
 
 from logvggt_jax import LogVGGT
 from logvggt_jax.config import ModelConfig
-from logvggt_jax.errors import InputError, OutputExists
+from logvggt_jax.errors import DiskError, InputError, OutputExists
 from logvggt_jax.evaluation import run as run_module
 from logvggt_jax.evaluation.methods.method import Checkpoint
 from logvggt_jax.evaluation.report.report import print_report
@@ -157,6 +158,15 @@ def test_weights_in_methods_that_are_not_theirs_are_warned_of_once(
     run_module._warn_of_unsuited(None, ("causal",))
     assert "as they have never seen it" in run_module._row("causal", checkpoint, None, "windows").knows
     assert run_module._row("causal", checkpoint, None, "causal").knows.startswith("its training; each frame sees")
+
+
+def test_a_folder_that_cannot_be_written_to_is_told_before_the_checkpoint_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "out").mkdir()
+    monkeypatch.setattr(os, "access", lambda path, _: Path(path) != tmp_path / "out")
+    with pytest.raises(DiskError, match=r"out/clips\.jsonl: no permission to write in .*out; choose another output"):
+        run_evaluation(configuration("rooms", {}), tmp_path / "no-model", tmp_path / "out", command="command")
 
 
 def test_only_a_new_folder_or_an_evaluations_is_written_to(tmp_path: Path) -> None:
