@@ -105,11 +105,11 @@ class Method(NamedTuple):
       summary: what the method does, in a few words.
       program: model, (H, W) of the images, settings and number of frames (None: not known) to the program in which the
         method spends its time.
-      check: configuration of a model, (H, W) of the images and settings; raises InputError where what the method keeps
-        cannot hold one such frame.
       takes_masks: whether `push` takes masks of pixels that are not to be seen.
       in_batches: whether many frames are predicted together, when all are there or a chunk is, so that the time of a
         single `push` tells nothing.
+      check: configuration of a model, (H, W) of the images and settings; raises InputError where what the method keeps
+        cannot hold one such frame.
     """
 
     title: str
@@ -118,9 +118,9 @@ class Method(NamedTuple):
     trained_for: str
     summary: str
     program: Callable[[LogVGGT, tuple[int, int], Any, int | None], Program]
-    check: Callable[[ModelConfig, tuple[int, int], Any], None] = lambda config, image_size, settings: None
     takes_masks: bool = False
     in_batches: bool = False
+    check: Callable[[ModelConfig, tuple[int, int], Any], None] = lambda config, image_size, settings: None
 
 
 def _frame_by_frame(title: str, settings: type, keeping: Callable[[Any, int], Keeping], summary: str) -> Method:
@@ -143,7 +143,7 @@ def _frame_by_frame(title: str, settings: type, keeping: Callable[[Any, int], Ke
         "causal",
         summary,
         lambda model, size, chosen, num_frames: frame_program(model, size, kept(model.config, chosen), num_frames),
-        check,
+        check=check,
     )
 
 
