@@ -250,8 +250,11 @@ def test_a_step_of_the_real_model_moves_what_is_trained_and_nothing_else(
     run_config: TrainConfig, real_step: Outcome
 ) -> None:
     assert np.isfinite(real_step.losses).all()
-    before = _real_parameters(run_config.model)
-    still = jax.tree.map(lambda old, new: bool((old == new).all()), before, real_step.params)
+    _moves_what_is_trained(real_step, _real_parameters(run_config.model))
+
+
+def _moves_what_is_trained(found: Outcome, before: Any) -> None:
+    still = jax.tree.map(lambda old, new: bool((old == new).all()), before, found.params)
     assert still == frozen_leaves(before, (ENCODER, *FROZEN))
 
 
@@ -269,6 +272,7 @@ def test_a_step_of_the_real_model_in_parts_is_that_of_one_device(
     assert (32, 128) in gathered and (32, 64) in scattered, "a stack's first product, and one of GCCR"
     # Adam's first update, by its own gradient: beside one device's, one near zero may have the other sign.
     before, rate = _real_parameters(run_config.model), run_config.optimizer.learning_rate
+    _moves_what_is_trained(in_parts, before)
     for path, gradient in jax.tree_util.tree_leaves_with_path(in_parts.gradient):
         old, new = (functools.reduce(lambda tree, at: tree[at.key], path, tree) for tree in (before, in_parts.params))
         np.testing.assert_allclose(new, old - rate * gradient / (np.abs(gradient) + 1e-8), rtol=1e-4, atol=2e-5)
