@@ -125,6 +125,11 @@ class StageConfig:
         for size in self.sizes:
             check_size(size, "StageConfig.sizes")
 
+    @property
+    def clip_shapes(self) -> frozenset[tuple[int, ...]]:
+        """Shapes of its batches' images, (B, T, H, W, 3): each is a program of its own."""
+        return frozenset((self.batch_size, self.clip_length, *size, 3) for size in self.sizes)
+
 
 @dataclasses.dataclass(frozen=True)
 class SourceConfig:

@@ -44,8 +44,7 @@ def report_interval(
     values = {**values, "broken_clips": float(broken.sum())}
     log.write(step, values)
     stage_seconds = times.remaining_seconds(step, end)
-    later = len(config.stages) - 1 - config.stages.index(stage)
-    run_seconds = times.remaining_seconds(step, compilations=later)
+    run_seconds = times.remaining_seconds(step)
     log.write_times(
         step,
         {

@@ -33,7 +33,7 @@ class MetricsLog:
     """Appends to `metrics.jsonl`, `times.jsonl` and `tensorboard/` of a work folder; a context manager.
 
     Attributes:
-      productive_seconds: what earlier sessions spent on the steps that are left of them.
+      productive_seconds: what earlier starts spent on the steps that are left of them.
       costs: seconds that one validation, save, … took in the last of them.
 
     On a run that resumes at `first_step`, lines of later steps (of the run that was interrupted) are dropped, so
@@ -106,7 +106,7 @@ class MetricsLog:
             self._draw(step, values)
 
     def write_times(self, step: int, values: dict[str, float]) -> None:
-        """The same for what differs from one machine and session to the next, in a file of its own, with `time`
+        """The same for what differs from one machine and start to the next, in a file of its own, with `time`
         (seconds since 1970), and where the clock was set since this start by how many seconds."""
         if not self.silent:
             jump = self._clock_jump()
@@ -115,7 +115,7 @@ class MetricsLog:
             self._draw(step, {f"times/{name}": value for name, value in values.items()})
 
     def seconds_since_start(self) -> float | None:
-        """Since the run began for the first time, by the clock of the day; None where that was set in a session."""
+        """Since the run began for the first time, by the clock of the day; None where that was set within a start."""
         if self._was_set or abs(self._clock_jump()) > _SET_SECONDS:
             return None
         return time.time() - self._started

@@ -68,7 +68,7 @@ def goodput(productive: float, wall: float | None) -> str:
 
     Args:
       productive: seconds of the steps that made the present state.
-      wall: seconds since the first start, by a clock that may have been set between two sessions; None where it was
+      wall: seconds since the first start, by a clock that may have been set between two starts; None where it was
         set within one.
     """
     done = f"{duration(productive)} of training"

@@ -24,13 +24,13 @@ class Speed(NamedTuple):
 
 
 class RunTimes:
-    """Measures what a session of a run spends its time on.
+    """Measures what one start of a run spends its time on.
 
     The loop calls `count` after each step and `read` when it logs and the last step has finished; it enters `waiting`
     to get a batch, and `other` for what is no step.
 
     Attributes:
-      productive: seconds of the steps that made the present state, those of earlier sessions too.
+      productive: seconds of the steps that made the present state, those of earlier starts too.
     """
 
     def __init__(
@@ -95,20 +95,23 @@ class RunTimes:
         """Seconds that one of each kind of `other` takes: the mean since the start, else that of the start before."""
         return self._earlier | {kind: sum(seconds) / len(seconds) for kind, seconds in self._others.items()}
 
-    def remaining_seconds(self, step: int, end: int | None = None, *, compilations: int = 0) -> float:
+    def remaining_seconds(self, step: int, end: int | None = None) -> float:
         """Seconds until step `end` (None: the last of all), if frames, validations and saves take as long as so far.
 
-        The steps of `compilations` more stages are still to be compiled.
+        A stage that is still to begin is compiled first where its clips have a shape of their own.
         """
         config = self._config
         end = config.total_steps if end is None else end
-        frames, begin = 0, 0
+        frames, begin, compilations = 0, 0, 0
+        compiled: set[tuple[int, ...]] = set()
         saves = end // config.save_every - step // config.save_every
         for stage in config.stages:
             first, begin = begin, begin + stage.steps
             frames += _frames(stage) * max(min(begin, end) - max(first, step), 0)
             # The last step of a stage is saved whatever its number.
             saves += step < begin <= end and begin % config.save_every > 0
+            compilations += step <= first < end and not stage.clip_shapes <= compiled
+            compiled |= stage.clip_shapes
         validations = 0
         if config.validation is not None:
             every = config.validation.every

@@ -56,14 +56,27 @@ def test_the_time_left_counts_validations_saves_and_compilations(config: TrainCo
     speed = times.read(config.stages[0])
     assert speed == Speed(frames_per_second=1.0, data_share=0.25, utilisation=None)
     assert times.productive == 60.0
-    # 80 steps; saves at 30, 60, 90 and 100; one validation at 70; another size to compile.
-    assert times.remaining_seconds(20, 100, compilations=1) == 80 * 4 + 4 * 7 + 20 + 50
-    # Besides 60 steps of six frames; saves at 120, 150 and 160; validations at 140 and 160.
-    assert times.remaining_seconds(20) == 80 * 4 + 60 * 6 + (4 + 3) * 7 + 3 * 20
+    # 80 steps; saves at 30, 60, 90 and 100; one validation at 70.
+    assert times.remaining_seconds(20, 100) == 80 * 4 + 4 * 7 + 20
+    # Besides 60 steps of six frames, whose program is still to be compiled; saves at 120, 150 and 160; validations at
+    # 140 and 160.
+    assert times.remaining_seconds(20) == 80 * 4 + 60 * 6 + (4 + 3) * 7 + 3 * 20 + 50
+    assert times.remaining_seconds(100) == 60 * 6 + 3 * 7 + 2 * 20 + 50
+    assert times.remaining_seconds(101) == 59 * 6 + 3 * 7 + 2 * 20
     assert times.remaining_seconds(160) == 0
 
 
-def test_a_session_that_goes_on_counts_what_the_one_before_found(config: TrainConfig, clock: Clock) -> None:
+def test_a_stage_of_shapes_that_are_there_is_not_compiled_again(config: TrainConfig, clock: Clock) -> None:
+    first = config.stages[0]
+    again = dataclasses.replace(first, name="again", steps=60)
+    times = RunTimes(dataclasses.replace(config, stages=(first, again)), costs={"compilation": 50.0})
+    assert times.remaining_seconds(20) == 0.0
+    larger = dataclasses.replace(again, sizes=((28, 28), *first.sizes))
+    times = RunTimes(dataclasses.replace(config, stages=(first, larger)), costs={"compilation": 50.0})
+    assert times.remaining_seconds(20) == 50.0
+
+
+def test_a_start_that_goes_on_counts_what_the_one_before_found(config: TrainConfig, clock: Clock) -> None:
     times = RunTimes(config, costs={"save": 7.0, "validation": 20.0})
     assert times.remaining_seconds(90, 100) == 7.0
     with times.other("save"):
