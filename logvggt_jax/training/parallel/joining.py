@@ -11,6 +11,7 @@ from absl import logging
 
 from logvggt_jax.errors import InputError, one_line
 from logvggt_jax.training.parallel import lifeline
+from logvggt_jax.training.parallel.held_connections import HeldConnections
 from logvggt_jax.training.parallel.lifeline import Lifeline
 
 JOIN_SECONDS = 120.0
@@ -82,6 +83,8 @@ def _lifeline() -> Lifeline | None:
     if count == 1:
         return None
     assert global_state.client is not None and global_state.coordinator_address is not None
+    host, coordinator_port = global_state.coordinator_address.rsplit(":", 1)
+    held = HeldConnections(int(coordinator_port)) if process == 0 else None
     try:
         if process == 0:
             secret = secrets.token_hex(16)
@@ -98,8 +101,7 @@ def _lifeline() -> Lifeline | None:
         else:
             milliseconds = 1000 * lifeline.CONNECT_SECONDS
             port, secret = global_state.client.blocking_key_value_get(_LIFELINE_KEY, milliseconds).split()
-            host = global_state.coordinator_address.rsplit(":", 1)[0].strip("[]")
-            peers = lifeline.connect(host, int(port), secret, process)
+            peers = lifeline.connect(host.strip("[]"), int(port), secret, process)
     except (OSError, jax.errors.JaxRuntimeError) as error:
         logging.warning(
             "processes cannot watch one another (%s): the loss of one is noticed after %d s",
@@ -107,7 +109,7 @@ def _lifeline() -> Lifeline | None:
             HEARTBEAT_SECONDS,
         )
         return None
-    return Lifeline(peers, process=process, on_loss=end_process)
+    return Lifeline(peers, process=process, on_loss=end_process, held=held)
 
 
 def end_process(message: str) -> None:

@@ -1,7 +1,6 @@
 """A connection between process 0 and each of the others, whose end tells at once that a process is gone.
 
-JAX's own heartbeats notice it after their time-out, and end the survivors with a trace of C++ that names no host. Only
-where process 0 is killed may that trace still come beside the line: JAX watches its connection to it in the same way.
+JAX's own heartbeats notice it after their time-out, and end the survivors with a trace of C++ that names no host.
 """
 
 from __future__ import annotations
@@ -16,6 +15,8 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from typing import Any
+
+from logvggt_jax.training.parallel.held_connections import HeldConnections
 
 # A machine that lost its power closes no connection, nor does a process that was stopped: who says nothing for so many
 # seconds is lost. JAX's own heartbeats would end the others ten seconds later.
@@ -36,10 +37,18 @@ class Lifeline:
       peers: open connections, by the number of the process at their other end.
       process: number of this one.
       on_loss: called at most once, on the thread; a training run ends there.
+      held: connections of process 0 that are to outlast it, so that JAX does not end the others before they are told.
     """
 
-    def __init__(self, peers: Mapping[int, socket.socket], *, process: int, on_loss: Callable[[str], None]) -> None:
-        self._peers, self._process, self._on_loss = dict(peers), process, on_loss
+    def __init__(
+        self,
+        peers: Mapping[int, socket.socket],
+        *,
+        process: int,
+        on_loss: Callable[[str], None],
+        held: HeldConnections | None = None,
+    ) -> None:
+        self._peers, self._process, self._on_loss, self._held = dict(peers), process, on_loss, held
         self._closed = False
         self._ended = threading.Event()
         self._sending = threading.Lock()
@@ -73,6 +82,8 @@ class Lifeline:
         self._thread.join(1)
         for connection in self._peers.values():
             connection.close()
+        if self._held is not None:
+            self._held.release()
 
     def _send(self, message: Mapping[str, Any]) -> None:
         line = json.dumps(message).encode() + b"\n"
