@@ -71,6 +71,33 @@ def test_a_cut_is_seen_though_the_predicted_cameras_do_not_tell() -> None:
     assert (found.cause, found.first, found.last) == ("no overlap", 20, 20)
 
 
+@pytest.mark.parametrize("other_room", [False, True])
+def test_where_cameras_say_fast_the_pictures_tell_whether_it_may_be_a_cut(other_room: bool) -> None:
+    """One step is long. Predicted cameras say so of a cut as well, but then what both frames would see is not alike."""
+    frames = rooms.walk([*range(20), *range(35, 55)], number=1)
+    after = rooms.walk(range(20), number=6).images if other_room else frames.images[20:]
+    images = np.concatenate([frames.images[:20], after])
+    measures = measured(frames._replace(images=images), rooms.signals(rooms.COUNT, ()))
+    assert np.nanmin(np.delete(measures.likeness, 20)) > 0.9 and (measures.likeness[20] < 0.75) == other_room
+    (found,) = stretches(measures)
+    assert (found.cause, found.first, found.last) == ("fast or cut" if other_room else "fast", 20, 20)
+    assert ("or the footage is cut" in paragraph((found,), measures, ["x"] * rooms.COUNT)) == other_room
+
+
+def test_what_moves_is_not_looked_for_across_a_jump() -> None:
+    measures = measured(rooms.jump(), rooms.signals(rooms.COUNT, ()))
+    measures.conflicts[rooms.FAULT.start : rooms.FAULT.start + 4] = 0.5
+    assert [stretch.cause for stretch in stretches(measures)] == ["no overlap"]
+
+
+@pytest.mark.parametrize("make", [rooms.dark, rooms.overexposed])
+def test_cameras_of_pictures_that_show_nothing_are_not_believed(make: Callable[[], Frames]) -> None:
+    measures = measured(make(), rooms.signals(rooms.COUNT, rooms.FAULT))
+    measures.overlap[[rooms.FAULT.start, rooms.FAULT.start + 2, rooms.FAULT.stop]] = 0.1, 0.4, 0.1
+    (found,) = stretches(measures)
+    assert (found.cause, found.first, found.last) == ("dark" if make is rooms.dark else "bright", 16, 23)
+
+
 @pytest.mark.parametrize("overlap", [0.4, 0.1])
 def test_a_jump_of_the_exposure_is_no_movement_though_depth_suffers_from_it(overlap: float) -> None:
     measures = measured(rooms.flickering(), rooms.signals(rooms.COUNT, rooms.FAULT))
@@ -201,7 +228,7 @@ def test_every_result_says_how_it_is(tmp_path: Path, reconstruct_dark: Reconstru
     assert "health: 8 of 40 frames doubtful: dark (16 to 23)" in summary
     assert f"{result.folder}/health.html: " in summary
     page = Words((result.folder / "health.html").read_text())
-    assert health.text in page.text and "it is too dark" in page.text and page.plots == 15
+    assert health.text in page.text and "it is too dark" in page.text and page.plots == 16
 
 
 def test_a_run_that_died_says_the_same_in_the_end(tmp_path: Path, reconstruct_dark: Reconstruct) -> None:
@@ -240,6 +267,9 @@ def test_results_without_a_report_open_and_a_damaged_one_is_named(tmp_path: Path
     report.write_health(tmp_path, report.examine(unknown, result.names), result.names)
     assert result.health is not None and not result.health.doubtful.any()
     sound = json.loads((tmp_path / "health.json").read_text())
+    del sound["measures"]["likeness"]  # as the first reports are
+    (tmp_path / "health.json").write_text(json.dumps(sound))
+    assert result.health is not None and np.isnan(result.health.measures.likeness).all()
     for change in (
         {"format": "other"},
         {"measures": {}},

@@ -8,6 +8,9 @@ from typing import Any
 
 import numpy as np
 
+# Frames between the two whose points are searched for conflicts: what moves has then moved by more than a cell.
+CONFLICTS_APART = 4
+
 
 def _measure(title: str, unit: str) -> Any:
     return dataclasses.field(metadata={"title": title, "unit": unit})
@@ -31,6 +34,7 @@ class Measures:
       overlap: share of a coarse grid of points that this frame and the one before both see.
       disagreement: median relative difference between this frame's depth and that of the one before, where both see.
       conflicts: share of points that should be seen from the camera four frames away and are not, see `neighbours`.
+      likeness: correlation of the pictures of this frame and the one before, at the points that both see.
       overlap_change: how far apart the two copies of the frame are that two windows predict, see `FrameResult`.
       correction: how far GCCR moved the frame's camera token, see `Signals`.
       chunk_scale: see `Signals`.
@@ -50,6 +54,7 @@ class Measures:
     overlap: np.ndarray = _measure("Overlap with the frame before", "share")
     disagreement: np.ndarray = _measure("Depth against the frame before", "relative difference")
     conflicts: np.ndarray = _measure("Points that should be seen", "share")
+    likeness: np.ndarray = _measure("Pictures of what both see", "correlation")
     overlap_change: np.ndarray = _measure("Two windows on the same frame", "relative difference")
     correction: np.ndarray = _measure("Correction by GCCR", "of the token")
     chunk_scale: np.ndarray = _measure("Scale of the chunks", "of the first")

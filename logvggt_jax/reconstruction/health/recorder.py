@@ -9,12 +9,10 @@ import numpy as np
 
 from logvggt_jax.geometry import camera_centres, rotation_angle
 from logvggt_jax.reconstruction.health.looks import NUMBERS, Look, look, places
-from logvggt_jax.reconstruction.health.measures import Measures
+from logvggt_jax.reconstruction.health.measures import CONFLICTS_APART, Measures
 from logvggt_jax.reconstruction.health.neighbours import Views, picture_changes
 from logvggt_jax.streaming import Signals
 
-# Frames between the two whose points are searched for conflicts: what moves has then moved by more than a cell.
-_APART = 4
 # Relative differences of depth that are no conflict: at least, and as a multiple of those between neighbours.
 _TOLERANCE, _TIMES = 0.1, 4.0
 
@@ -76,15 +74,15 @@ class HealthRecorder:
             grey[frame] = found.grey
         arrays = dict(zip(NUMBERS, numbers.T, strict=True))
         median_depth = arrays.pop("median_depth") * depth_scale
-        views = Views(depth, where, size, np.asarray(extrinsics, np.float64), np.asarray(intrinsics, np.float64))
+        views = Views(depth, grey, where, size, np.asarray(extrinsics, np.float64), np.asarray(intrinsics, np.float64))
         later = np.arange(1, count)
-        beside = np.full((count, 3), np.nan)
+        beside = np.full((count, 4), np.nan)
         conflicts, step, turn = np.full(count, np.nan), np.full(count, np.nan), np.full(count, np.nan)
         if count > 1:
             beside[1:] = views.compare(later - 1, later, tolerance=_TOLERANCE)
             known = beside[np.isfinite(beside[:, 1]), 1]
             tolerance = max(_TOLERANCE, min(0.5, _TIMES * float(np.median(known)))) if len(known) else _TOLERANCE
-            conflicts[1:] = views.compare(np.maximum(later - _APART, 0), later, tolerance=tolerance)[:, 2]
+            conflicts[1:] = views.compare(np.maximum(later - CONFLICTS_APART, 0), later, tolerance=tolerance)[:, 2]
             step[1:] = np.linalg.norm(np.diff(camera_centres(extrinsics), axis=0), axis=1) / median_depth[:-1]
             turn[1:] = np.degrees(rotation_angle(extrinsics[:-1, :3, :3], extrinsics[1:, :3, :3]))
         return Measures.of(
@@ -97,6 +95,7 @@ class HealthRecorder:
                 "overlap": beside[:, 0],
                 "disagreement": beside[:, 1],
                 "conflicts": conflicts,
+                "likeness": beside[:, 3],
                 **signals._asdict(),
             },
             count,

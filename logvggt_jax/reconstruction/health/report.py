@@ -22,6 +22,8 @@ from logvggt_jax.reconstruction.health.words import in_short, paragraph, reasons
 
 HEALTH_FILE, HEALTH_PAGE = "health.json", "health.html"
 _FORMAT = "logvggt-health-1"
+# Measures that the first reports of this format do not have.
+_LATER = ("likeness",)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -103,8 +105,9 @@ def without_harm() -> Iterator[None]:
 def _parsed(document: dict[str, Any]) -> Health:
     if document["format"] != _FORMAT:
         raise ValueError(f"format {document['format']!r:.40}, expected {_FORMAT!r}")
-    arrays = {name: np.array(document["measures"][name], np.float64) for name in NAMES}
-    count = len(document["names"])
+    stored, count = document["measures"], len(document["names"])
+    stored |= {name: [None] * count for name in _LATER if name not in stored}
+    arrays = {name: np.array(stored[name], np.float64) for name in NAMES}
     if any(array.shape != (count,) for array in arrays.values()):
         raise ValueError(f"measures must have one number for each of the {count} frames")
     found = tuple(

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from logvggt_jax.reconstruction.health.measures import Measures
+from logvggt_jax.reconstruction.health.measures import CONFLICTS_APART, Measures
 
 # Medians of fewer frames say nothing: rules that need them are then left out.
 _FEWEST = 8
@@ -38,6 +38,9 @@ NEW_VIEW, NEW_VIEW_TIMES, MOST_NEW = 0.3, 2.5, 0.5
 # No overlap: nearly all of the view is new; or the picture changes as much and so many times as much as usual, while
 # the method's own signals rise.
 ALL_NEW, PICTURE_CHANGE, PICTURE_TIMES = 0.8, 0.6, 4.0
+# What looks fast may be a cut, which predicted cameras do not tell: the picture changes so much this once, and what
+# both frames would see by depth and cameras is less alike in their pictures than this.
+OTHER_PICTURE, ALIKE = 0.4, 0.75
 # Zoom: the focal length changes by this much over so many frames, and so many times as much as usual.
 ZOOM, ZOOM_FRAMES, ZOOM_TIMES = 0.1, 8, 6.0
 # Something moves: this share of the points that should be seen from four frames away is not, and so many times as many.
@@ -60,6 +63,7 @@ _GAP, _NEAR = 2, 4
 CAUSES = {
     "no overlap": "the view jumps, so that neighbouring frames share little or nothing",
     "fast": "the camera moves too fast for the rate of frames",
+    "fast or cut": "the camera moves too fast for the rate of frames, or the footage is cut",
     "dark": "it is too dark",
     "bright": "it is overexposed",
     "exposure": "the exposure jumps",
@@ -140,14 +144,18 @@ def _causes(m: Measures, signs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     cut = _over(m.picture_change, PICTURE_CHANGE, PICTURE_TIMES) & clear & unsure
     stops = np.abs(np.log2(m.brightness / np.concatenate([[np.nan], m.brightness[:-1]])))
     jump = (stops > EXPOSURE_STOPS) & clear
-    elsewhere = ~(jump & (m.picture_change < SAME_PICTURE))
+    # Nor is what a model makes of such pictures a movement.
+    elsewhere = clear & ~(jump & (m.picture_change < SAME_PICTURE))
     moving = _over(m.conflicts, CONFLICTS, CONFLICT_TIMES) & ~signs["conflicts"] & elsewhere
     fast = (_over(new, NEW_VIEW, NEW_VIEW_TIMES) | (new > MOST_NEW)) & ~(new > ALL_NEW) & ~zoom & elsewhere
     no_overlap = ((new > ALL_NEW) & elsewhere) | (cut & ~moving & ~fast)
+    fast_or_cut = fast & (m.likeness < ALIKE) & _alone(m.picture_change > OTHER_PICTURE)
+    moving &= ~_across(no_overlap | fast_or_cut)
     exposure = jump & ~no_overlap & ~fast & ~moving
     found = {
         "no overlap": no_overlap,
-        "fast": fast,
+        "fast": fast & ~fast_or_cut,
+        "fast or cut": fast_or_cut,
         "dark": dark,
         "bright": bright,
         "exposure": exposure,
@@ -191,6 +199,19 @@ def _zoom(field_of_view: np.ndarray) -> np.ndarray:
     half, last = ZOOM_FRAMES // 2, len(focal) - 1
     frames = np.arange(len(focal))
     return np.abs(focal[np.minimum(frames + half, last)] - focal[np.maximum(frames - half, 0)])
+
+
+def _alone(frames: np.ndarray) -> np.ndarray:
+    """Those that are a run of their own."""
+    alone = np.zeros(len(frames), bool)
+    alone[[first for first, last in _runs(frames) if first == last]] = True
+    return alone
+
+
+def _across(jumps: np.ndarray) -> np.ndarray:
+    """Frames whose conflicts are searched for in a frame before a jump: the two cannot be compared."""
+    across: np.ndarray = np.convolve(jumps, np.ones(CONFLICTS_APART))[: len(jumps)] > 0
+    return across
 
 
 def _around(frames: np.ndarray, first: int, last: int) -> np.ndarray:

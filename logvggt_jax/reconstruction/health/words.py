@@ -20,6 +20,10 @@ _EVIDENCE = {
         "overlap",
         "neighbouring frames share as little as {low:.0%} of the view, {median:.0%} in the median frame",
     ),
+    "fast or cut": (
+        "likeness",
+        "pictures of what both frames should show correlate by {low:.2f}, {median:.2f} in the median frame",
+    ),
     "dark": ("brightness", "brightness falls to {low:.0%} of white, {median:.0%} in the median frame"),
     "bright": ("bright", "up to {high:.0%} of the pixels are white"),
     "exposure": ("brightness", "brightness jumps between {low:.0%} and {high:.0%} of white"),
