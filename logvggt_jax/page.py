@@ -18,6 +18,7 @@ td:first-child, th:first-child { position: sticky; left: 0; background: #fff; }
 tr.own, tr.own td:first-child { background: #e3eefb; } tr.own td:first-child { font-weight: 600; }
 p.note, li { color: #555; font-size: 0.9rem; }
 pre { background: #f5f5f5; padding: 0.6rem 0.8rem; overflow-x: auto; }
+h1, h2, p, li, figcaption { overflow-wrap: anywhere; }
 figure { margin: 1.5rem 0; } img { max-width: 100%; } figcaption { color: #555; font-size: 0.85rem; }
 """
 
@@ -26,7 +27,9 @@ def document(title: str, parts: Sequence[str]) -> str:
     """A whole page; its parts are HTML, as the functions below make it of plain text."""
     head = (
         "<!doctype html>",
-        f'<html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title>',
+        '<html lang="en"><head><meta charset="utf-8">',
+        '<meta name="viewport" content="width=device-width, initial-scale=1">',
+        f"<title>{html.escape(title)}</title>",
         f"<style>{_STYLE}</style></head><body>",
         f"<h1>{html.escape(title)}</h1>",
     )

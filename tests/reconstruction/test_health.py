@@ -227,6 +227,7 @@ def test_every_result_says_how_it_is(tmp_path: Path, reconstruct_dark: Reconstru
     summary = result.summary()
     assert "health: 8 of 40 frames doubtful: dark (16 to 23)" in summary
     assert f"{result.folder}/health.html: " in summary
+    assert '<meta name="viewport"' in (result.folder / "health.html").read_text()  # else it is tiny on a phone
     page = Words((result.folder / "health.html").read_text())
     assert health.text in page.text and "it is too dark" in page.text and page.plots == 16
 

@@ -6,12 +6,14 @@ import base64
 import io
 import json
 import re
+import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from browser import photograph
+from devtools import opened
 from PIL import Image
 from result_folder import write_result
 from room_result import write_room_result
@@ -165,3 +167,33 @@ def test_a_browser_draws_the_page(room: Reconstruction, tmp_path: Path) -> None:
     without = photograph(page, tmp_path / "without", "--disable-3d-apis")
     # A line of text on an even ground.
     assert 0.001 < (np.abs(without.astype(int) - 0x12).max(axis=2) > 25).mean() < 0.06
+
+
+@pytest.mark.slow
+def test_the_page_is_used_on_a_phone_and_by_keyboard(room: Reconstruction, tmp_path: Path) -> None:
+    file = tmp_path / "room.html"
+    save_page(room.folder, file)
+    with opened("about:blank", tmp_path / "profile", tmp_path) as page:
+        page.call("Emulation.setDeviceMetricsOverride", width=390, height=844, deviceScaleFactor=1, mobile=True)
+        page.call("Page.navigate", url=file.as_uri())
+        end = time.monotonic() + 30
+        while page.value("document.body && document.body.dataset.state") != "drawn" and time.monotonic() < end:
+            time.sleep(0.1)
+        # The controls are out of the way until they are asked for.
+        height = "document.getElementById('panel').clientHeight"
+        assert page.value(height) < 60
+        page.press("+")
+        assert page.value(height) > 300
+        page.value("document.getElementById('fold').click()")
+        first = page.picture().astype(int)
+        # In a tall window the first picture's whole width is there: what is at its edges lies beside the middle.
+        drawn = np.abs(first[100:] - 0x12).max(axis=2) > 25
+        rows = np.flatnonzero(drawn.any(axis=1))
+        assert rows[-1] - rows[0] < 500
+        page.value("document.getElementById('canvas').focus()")
+        for kind in ("keyDown", "keyUp"):
+            page.call("Input.dispatchKeyEvent", type=kind, key="ArrowLeft", code="ArrowLeft", windowsVirtualKeyCode=37)
+        time.sleep(0.5)
+        assert np.abs(page.picture().astype(int) - first)[100:-100, 20:-20].mean() > 1
+        page.value("hidden.value = 40; hidden.dispatchEvent(new Event('input'))")
+        assert page.value("document.getElementById('share').textContent") == "hide 40 %"
