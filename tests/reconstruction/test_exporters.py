@@ -241,6 +241,35 @@ def test_the_camera_of_the_scene_flies_the_path(result: Reconstruction, exports:
     assert view.yfov == pytest.approx(2 * np.arctan(48 / result.intrinsics[0, 1, 1]))
 
 
+@pytest.mark.parametrize("up", ["+x", "-x", "+y", "-y", "+z", "-z"])
+def test_what_is_up_in_a_given_world_is_up_in_the_scene(up: str, tmp_path: Path) -> None:
+    """A robot's poses have z up; programs that open a GLB hold y for it. Coordinates stay, but for order and sign."""
+    trimesh = pytest.importorskip("trimesh", reason="extra `formats` is not installed")
+    result = write_room_result(tmp_path, count=2)
+    world = np.zeros((3, 3))  # from the room's world, in which y is down
+    world["xyz".index(up[1]), 1] = -1 if up[0] == "+" else 1
+    world["yzx".index(up[1]), 2] = 1
+    world[:, 0] = np.cross(world[:, 1], world[:, 2])
+    document = json.loads((result.folder / "cameras.json").read_text())
+    document["world_is_given"] = True
+    for frame in document["frames"]:
+        extrinsics = np.array(frame["extrinsics"])
+        frame["extrinsics"] = np.hstack([extrinsics[:, :3] @ world.T, extrinsics[:, 3:]]).tolist()
+
+    def vertices(output: str) -> np.ndarray:
+        reopened = Reconstruction.open(result.folder)
+        (file,) = export(reopened, ["glb"], tmp_path / output, point_filter=FEW_POINTS, progress=False)
+        return np.asarray(trimesh.load(file).geometry["points"].vertices)
+
+    expected = vertices("own")
+    (result.folder / "cameras.json").write_text(json.dumps(document))
+    found = vertices("given")
+    np.testing.assert_allclose(found[:, 1], expected[:, 1], atol=1e-6)
+    turn = np.linalg.lstsq(expected, found, rcond=None)[0]
+    np.testing.assert_allclose(np.sort(np.abs(turn), axis=0), [[0] * 3, [0] * 3, [1] * 3], atol=1e-5)
+    assert np.linalg.det(turn) == pytest.approx(1, abs=1e-4)
+
+
 def test_the_camera_of_the_scene_is_as_wide_as_the_frames(tmp_path: Path) -> None:
     pytest.importorskip("trimesh", reason="extra `formats` is not installed")
     reader = pytest.importorskip("pygltflib", reason="extra `dev` is not installed")

@@ -11,9 +11,10 @@ from result_folder import write_result
 from logvggt_jax.colours import depth_picture
 from logvggt_jax.reconstruction.points.cloud_file import Cloud
 from logvggt_jax.reconstruction.result import Reconstruction
+from logvggt_jax.reconstruction.up_direction import up_direction
 from logvggt_jax.reconstruction.viewer.colouring import colourings, level_limits, palette, point_colours, point_levels
 from logvggt_jax.reconstruction.viewer.detail import Detail, levels_of_detail
-from logvggt_jax.reconstruction.viewer.opening_view import opening_view, point_spacing, scene_span, up_direction
+from logvggt_jax.reconstruction.viewer.opening_view import opening_view, point_spacing, scene_span
 
 
 def test_of_twenty_million_points_two_are_shown_evenly() -> None:

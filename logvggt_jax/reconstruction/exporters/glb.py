@@ -16,6 +16,7 @@ from logvggt_jax.reconstruction.exporters.cloud import whole_cloud
 from logvggt_jax.reconstruction.exporters.libraries import library
 from logvggt_jax.reconstruction.points.point_filter import PointFilter
 from logvggt_jax.reconstruction.result import Reconstruction
+from logvggt_jax.reconstruction.up_direction import up_direction
 
 _NUM_POINTS = 500_000
 _MOST_FRUSTA = 500
@@ -37,7 +38,8 @@ def export_glb(
 ) -> None:
     """Writes points, frusta of at most 500 cameras, and a camera that is animated along the path.
 
-    Axes are glTF's (x right, y up, z backward of the result's world). Its cameras look through the middle of their
+    Axes are glTF's, y up: those of the first camera (x right, y up, z backward), or of a world that poses have brought
+    along, whose axis that points up becomes y and which is else as it was. Its cameras look through the middle of their
     pictures and keep their lens: the animated one has the median of the focal lengths. The animation has the frames'
     time stamps from the first on; where they are positions and not times, it shows ten frames a second.
 
@@ -52,10 +54,10 @@ def export_glb(
     """
     trimesh = library("trimesh")
     vertices = whole_cloud(result, point_filter or result.filtered(_NUM_POINTS), progress=progress)
-    turn = OPENGL_AXES.diagonal()[:3]
-    points = np.stack([vertices[axis] for axis in "xyz"], axis=-1) * turn
+    turn = _turn(result)
+    points = np.stack([vertices[axis] for axis in "xyz"], axis=-1) @ turn[:3, :3].T
     colours = _LINEAR[np.stack([vertices[channel] for channel in ("red", "green", "blue")], axis=-1)]
-    poses = OPENGL_AXES @ np.asarray(invert(result.extrinsics)) @ OPENGL_AXES
+    poses = turn @ np.asarray(invert(result.extrinsics)) @ OPENGL_AXES
     scene = trimesh.Scene()
     if len(points):
         scene.add_geometry(trimesh.PointCloud(points, colours), node_name="points", geom_name="points")
@@ -70,6 +72,22 @@ def export_glb(
     content = trimesh.exchange.gltf.export_glb(scene, buffer_postprocessor=add_camera)
     with atomic_file(path) as temporary:
         temporary.write_bytes(content)
+
+
+def _turn(result: Reconstruction) -> np.ndarray:
+    """What turns the result's world so that y is up, [4, 4]; by right angles, so that coordinates are known again."""
+    if not result.world_is_given:
+        return OPENGL_AXES
+    up = up_direction(result.extrinsics)
+    axis, turn = int(np.abs(up).argmax()), np.zeros((4, 4))
+    turn[1, axis] = np.sign(up[axis])
+    if axis == 0:
+        turn[0, 1] = -turn[1, 0]
+    else:
+        turn[0, 0] = 1
+    turn[2, :3] = np.cross(turn[0, :3], turn[1, :3])
+    turn[3, 3] = 1
+    return turn
 
 
 def _frustum(result: Reconstruction, index: int, pose: np.ndarray, depth: float) -> np.ndarray:

@@ -15,6 +15,7 @@ from logvggt_jax.errors import one_line, printable
 from logvggt_jax.frames import evenly_spaced
 from logvggt_jax.geometry import camera_centres
 from logvggt_jax.reconstruction.result import Reconstruction
+from logvggt_jax.reconstruction.up_direction import up_direction
 from logvggt_jax.reconstruction.viewer.drawing import (
     PRESENT,
     camera_size,
@@ -26,13 +27,7 @@ from logvggt_jax.reconstruction.viewer.drawing import (
     shrunk,
 )
 from logvggt_jax.reconstruction.viewer.growing_scene import GrowingScene, Scene
-from logvggt_jax.reconstruction.viewer.opening_view import (
-    View,
-    opening_view,
-    point_spacing,
-    scene_span,
-    up_direction,
-)
+from logvggt_jax.reconstruction.viewer.opening_view import View, opening_view, point_spacing, scene_span
 from logvggt_jax.reconstruction.viewer.window import Window
 from logvggt_jax.reconstruction.watching import LiveResult
 
