@@ -65,7 +65,7 @@ test-all: test
 
 docs: install
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
-	@echo "The documentation: runs/site/index.html"
+	@echo "The documentation: runs/site/index.html (its search needs a server: python3 -m http.server -d runs/site)"
 
 # What the targets above made. The other folders in runs/ are somebody's hours of training.
 clean:

@@ -134,7 +134,7 @@ class _Formatter(argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescription
     """Keeps the example's line and shows defaults that say something."""
 
     def _get_help_string(self, action: argparse.Action) -> str | None:
-        if action.default in (None, False):
+        if action.default is None or action.default is False or action.default == []:
             return action.help
         if isinstance(action.default, tuple):
             return f"{action.help} (default: {'x'.join(map(str, action.default))})"

@@ -22,7 +22,7 @@ from logvggt_jax.reconstruction.health.measures import Measures
 from logvggt_jax.reconstruction.health.plot import svg_plot
 from logvggt_jax.reconstruction.health.recorder import HealthRecorder
 from logvggt_jax.reconstruction.health.rules import Stretch, stretches
-from logvggt_jax.reconstruction.health.words import in_short, paragraph
+from logvggt_jax.reconstruction.health.words import in_short, paragraph, reasons
 from logvggt_jax.streaming import Signals
 
 # Frames by which a stretch may begin or end beside the fault: zoom and movement are seen over a few frames.
@@ -154,6 +154,11 @@ def test_trouble_that_the_footage_does_not_explain_is_said_to_be_so() -> None:
     (found,) = stretches(measures)
     assert found.cause is None and found.first >= 30 and found.last <= 32
     assert "nothing that is measured of the footage says why" in paragraph((found,), measures, ["x"] * rooms.COUNT)
+
+
+def test_signs_are_told_as_a_list() -> None:
+    told = reasons(Stretch(None, 3, 5, ("correction", "confidence", "chunks")))
+    assert "camera far, the model is unsure of its depth and chunks do not fit one another; nothing" in told
 
 
 def test_chunks_whose_scale_jumps_are_doubtful() -> None:

@@ -66,7 +66,8 @@ def in_short(found: Sequence[Stretch], count: int) -> str:
 
 def reasons(stretch: Stretch) -> str:
     """Cause and signs of a stretch, as a clause."""
-    signs = " and ".join(SIGNS[name] for name in stretch.signs)
+    *others, last = [SIGNS[name] for name in stretch.signs] or [""]
+    signs = f"{', '.join(others)} and {last}" if others else last
     if stretch.cause is None:
         return f"{signs}; nothing that is measured of the footage says why"
     if _wrong_depth_looks_so(stretch):
