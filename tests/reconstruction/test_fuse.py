@@ -159,6 +159,29 @@ def test_poses_of_pictures_that_lie_on_their_side_are_refused(
     assert not (tmp_path / "fused").exists()
 
 
+@pytest.mark.parametrize(
+    ("axes", "clockwise", "how"),
+    [
+        ([1, 1, 1], 90, "those of pictures turned clockwise by 90 degrees"),
+        ([1, 1, 1], 180, "those of pictures turned clockwise by 180 degrees"),
+        ([1, 1, 1], 270, "those of pictures turned clockwise by 270 degrees"),
+        ([1, -1, -1], 0, "those with axes x right, y down, z forward instead of y up, z backward"),
+        ([1, -1, -1], 90, "y up, z backward and of pictures turned clockwise by 90 degrees"),
+    ],
+)
+def test_poses_of_turned_cameras_are_refused(
+    truth: Reconstruction, disordered: Reconstruction, tmp_path: Path, axes: list[int], clockwise: int, how: str
+) -> None:
+    """A phone's poses are of its sensor, which lies on its side, and programs of graphics have OpenGL's axes."""
+    back = np.radians(-clockwise)
+    turn = np.array([[np.cos(back), -np.sin(back), 0], [np.sin(back), np.cos(back), 0], [0, 0, 1]])
+    poses = tmp_path / "poses.txt"
+    write_trajectory(poses, truth.timestamps, np.diag(axes) @ turn @ truth.extrinsics)
+    with pytest.raises(InputError, match=how):
+        fuse(disordered, tmp_path / "fused", poses=poses, progress=False)
+    assert not (tmp_path / "fused").exists()
+
+
 def test_frames_without_a_pose_and_poses_without_a_frame_are_said(
     truth: Reconstruction, disordered: Reconstruction, tmp_path: Path
 ) -> None:

@@ -17,6 +17,7 @@ from logvggt_jax.reconstruction.fusion.derived_result import check_derived, writ
 from logvggt_jax.reconstruction.fusion.matching import match_poses
 from logvggt_jax.reconstruction.fusion.pose_files import ExternalPose, read_poses
 from logvggt_jax.reconstruction.fusion.same_view import is_same_view, lies_on_its_side
+from logvggt_jax.reconstruction.fusion.turned import turn_between
 from logvggt_jax.reconstruction.result import Reconstruction
 
 # How far the cameras of a result may lie from given ones, as a share of how far these lie from their middle.
@@ -117,13 +118,22 @@ def _depth_note(scales: np.ndarray, before: float, after: float) -> str:
 def align(result: Reconstruction, matched: dict[int, ExternalPose], path: str | Path) -> tuple[Similarity, str]:
     """What moves the result's world to that of some poses, by frame, and how well they then agree, in words.
 
-    Raises InputError, naming the file `path` of the poses, where there is none.
+    Raises InputError, naming the file `path` of the poses, where there is none, or pictures were turned.
     """
     frames, extrinsics = list(matched), np.stack([pose.extrinsics for pose in matched.values()])
     try:
         similarity = pose_similarity(result.extrinsics[frames], extrinsics)
+        turn = turn_between(result.extrinsics[frames], extrinsics)
     except NoSimilarity as error:
         raise InputError(f"{path}: {error}") from error
+    if turn is not None:
+        how = ["with axes x right, y down, z forward instead of y up, z backward"] if turn.opengl else []
+        how += [f"of pictures turned clockwise by {turn.clockwise} degrees"] if turn.clockwise else []
+        raise InputError(
+            f"{path}: the poses fit the frames only as those {' and '.join(how)} (cameras then differ by "
+            f"{turn.after:.1f} degrees, as they are by {turn.before:.1f}): give poses of upright pictures, as frames "
+            "are, with OpenCV's axes"
+        )
     moved = similarity.apply_to_extrinsics(result.extrinsics[frames])
     distances = np.linalg.norm(camera_centres(moved) - camera_centres(extrinsics), axis=1)
     angles = np.degrees(rotation_angle(moved[:, :3, :3], extrinsics[:, :3, :3]))
