@@ -149,6 +149,13 @@ def test_a_result_with_errors_everywhere_is_not_called_movement() -> None:
     assert all("conflicts" in stretch.signs for stretch in found)
 
 
+def test_what_hides_nearly_all_of_the_view_at_its_height_is_no_movement() -> None:
+    measures = measured(rooms.clean(), rooms.signals(rooms.COUNT, range(20, 25)))
+    measures.conflicts[20:25] = 0.1, 0.3, 0.9, 0.3, 0.1
+    (found,) = stretches(measures)
+    assert (found.cause, found.first, found.last) == (None, 20, 24) and "conflicts" in found.signs
+
+
 def test_trouble_that_the_footage_does_not_explain_is_said_to_be_so() -> None:
     measures = measured(rooms.clean(), rooms.signals(rooms.COUNT, range(30, 33)))
     (found,) = stretches(measures)

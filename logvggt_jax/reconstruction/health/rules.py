@@ -46,7 +46,7 @@ ZOOM, ZOOM_FRAMES, ZOOM_TIMES = 0.1, 8, 6.0
 # Something moves: this share of the points that should be seen from four frames away is not, and so many times as many.
 CONFLICTS, CONFLICT_TIMES = 0.04, 4.0
 # Nobody can tell movement from an error of the result where the median frame has so many of these already, and nothing
-# that moves hides so much of the view.
+# that moves hides so much of the view, in any frame of a stretch.
 CLEAN_CONFLICTS, MOST_CONFLICTS = 0.01, 0.6
 
 # Signs that the result suffers: above this number and so many times the median.
@@ -170,7 +170,9 @@ def _causes(m: Measures, signs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 def _signs(m: Measures) -> dict[str, np.ndarray]:
     scales = np.full(m.num_frames, np.nan)
     missing = _over(m.conflicts, CONFLICTS, CONFLICT_TIMES)
-    no_movement = (m.conflicts > MOST_CONFLICTS) | (_median(m.conflicts) > CLEAN_CONFLICTS)
+    no_movement = missing & (_median(m.conflicts) > CLEAN_CONFLICTS)
+    for first, last in _runs(missing):  # one error makes conflicts of all sizes
+        no_movement[first : last + 1] |= (m.conflicts[first : last + 1] > MOST_CONFLICTS).any()
     joints = np.flatnonzero(np.isfinite(m.chunk_scale))
     scales[joints] = np.abs(np.diff(np.log(m.chunk_scale[joints]), prepend=0.0))  # the first chunk's is one
     return {
