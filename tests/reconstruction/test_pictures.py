@@ -151,6 +151,11 @@ def test_the_content_decides_what_a_file_is(tmp_path: Path) -> None:
         (b"version https://git-lfs.github.com/spec/v1\n", "Git LFS pointer"),
         (b"hello there", "is no picture"),
         (b"\x89PNG\r\n\x1a\n" + bytes(100), "damaged"),
+def test_alpha_that_is_nothing_throughout_is_meant_by_nobody(tmp_path: Path) -> None:
+    Image.fromarray(np.dstack([SCENE, np.zeros((32, 48), np.uint8)])).save(tmp_path / "a.png")
+    np.testing.assert_array_equal(read(tmp_path / "a.png"), SCENE)
+
+
         (b"\xff\xd8\xff\xe0" + bytes(100), "damaged"),
         (b"II*\0" + bytes(100), "damaged"),
         (b"BM" + bytes(100), "damaged"),

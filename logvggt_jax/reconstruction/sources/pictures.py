@@ -70,7 +70,8 @@ _UPRIGHT = MappingProxyType(
 def read_picture(path: Path, *, orientation: int = 1) -> np.ndarray:
     """The pixels [H, W, 3] uint8 RGB, turned upright by the EXIF orientation that the header gave.
 
-    Grey is repeated, alpha composited over white, 16 bits a channel become the upper 8, CMYK is converted.
+    Grey is repeated, alpha composited over white unless it is 0 throughout, 16 bits a channel become the upper 8, CMYK
+    is converted.
 
     Raises:
       BrokenPicture: truncated, damaged or no picture.
@@ -198,7 +199,9 @@ def _colours(path: Path, picture: Image.Image) -> np.ndarray:
         if picture.mode == "RGB" and "transparency" not in picture.info:
             return np.array(picture)
         if picture.has_transparency_data:
-            return over_white(np.asarray(picture.convert("RGBA")))
+            levels = np.array(picture.convert("RGBA"))
+            # Of screenshots and of what game engines render alpha is often 0 throughout, and meant by nobody.
+            return over_white(levels) if levels[..., 3].any() else levels[..., :3].copy()
         return np.array(picture.convert("RGB"))
 
 
