@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import sys
 import warnings
 from collections.abc import Callable
@@ -110,6 +111,21 @@ def test_sixteen_bits_become_the_upper_eight(tmp_path: Path, suffix: str) -> Non
     np.testing.assert_array_equal(read(tmp_path / f"grey.{suffix}"), (deep[..., :1] >> 8).repeat(3, 2))
 
 
+@pytest.mark.parametrize(
+    ("tag", "value", "told"),
+    [(262, 0, "0 is white.*convert"), (284, 2, "planar.*convert"), (259, 34712, "not read.*34712.*convert it")],
+)
+def test_tiffs_that_decoders_read_wrong_or_not_are_told_what_they_are(
+    tmp_path: Path, tag: int, value: int, told: str
+) -> None:
+    tags = {256: 6, 257: 5, 258: 16, 259: 1, 262: 1, 273: 200, 277: 1, 278: 5, 279: 60, 284: 1} | {tag: value}
+    entries = b"".join(struct.pack("<HHII", name, 4, 1, content) for name, content in tags.items())
+    head = b"II*\0" + struct.pack("<IH", 8, len(tags)) + entries
+    (tmp_path / "a.tif").write_bytes(head.ljust(200, b"\0") + bytes(range(60)))
+    with pytest.raises(InputError, match=rf"a\.tif.*{told}"):
+        read_header(tmp_path / "a.tif")
+
+
 @pytest.mark.parametrize("mode", ["1", "L", "P", "CMYK"])
 @pytest.mark.parametrize("suffix", ["jpg", "png", "tif", "bmp"])
 def test_other_kinds_of_colour_become_rgb(tmp_path: Path, suffix: str, mode: str) -> None:
@@ -135,6 +151,11 @@ def test_what_is_transparent_is_white(tmp_path: Path, mode: str) -> None:
     assert (image[:, :24] == 255).all() and (image[:, 24:] == 100).all()
 
 
+def test_alpha_that_is_nothing_throughout_is_meant_by_nobody(tmp_path: Path) -> None:
+    Image.fromarray(np.dstack([SCENE, np.zeros((32, 48), np.uint8)])).save(tmp_path / "a.png")
+    np.testing.assert_array_equal(read(tmp_path / "a.png"), SCENE)
+
+
 def test_the_content_decides_what_a_file_is(tmp_path: Path) -> None:
     Image.fromarray(SCENE).save(tmp_path / "a.webp", lossless=True)
     (tmp_path / "a.webp").rename(tmp_path / "a.jpg")
@@ -151,11 +172,6 @@ def test_the_content_decides_what_a_file_is(tmp_path: Path) -> None:
         (b"version https://git-lfs.github.com/spec/v1\n", "Git LFS pointer"),
         (b"hello there", "is no picture"),
         (b"\x89PNG\r\n\x1a\n" + bytes(100), "damaged"),
-def test_alpha_that_is_nothing_throughout_is_meant_by_nobody(tmp_path: Path) -> None:
-    Image.fromarray(np.dstack([SCENE, np.zeros((32, 48), np.uint8)])).save(tmp_path / "a.png")
-    np.testing.assert_array_equal(read(tmp_path / "a.png"), SCENE)
-
-
         (b"\xff\xd8\xff\xe0" + bytes(100), "damaged"),
         (b"II*\0" + bytes(100), "damaged"),
         (b"BM" + bytes(100), "damaged"),

@@ -22,7 +22,7 @@ from PIL import (
 from logvggt_jax.data.errors import BrokenPicture
 from logvggt_jax.data.formats.image import decoding_errors, over_white, png_is_whole
 from logvggt_jax.data.formats.jpeg import decode_jpeg
-from logvggt_jax.errors import InputError, MissingPackage, disk_errors
+from logvggt_jax.errors import InputError, MissingPackage, disk_errors, one_line
 
 IMAGE_SUFFIXES = (
     *(".jpg", ".jpeg", ".jpe", ".jfif"),
@@ -148,11 +148,17 @@ def open_picture(path: Path, stream: IO[bytes]) -> tuple[str, ImageFile.ImageFil
         raise BrokenPicture(f"{path} is {found}: expected JPEG, PNG, WebP, TIFF, BMP, AVIF or HEIC")
     with decoding_errors(path):
         try:
-            return kind, reader(stream)
-        except SyntaxError as error:
+            picture = reader(stream)
+        except (SyntaxError, KeyError) as error:
             if kind == "TIFF" and _is_floating_point(stream):
                 raise not_colours(path, "floating point") from error
-            raise
+            reason = f"compression {error}" if isinstance(error, KeyError) else one_line(error)
+            raise BrokenPicture(
+                f"{path}: damaged, or a {kind} of a kind that is not read ({reason}): fetch it again, or convert it"
+            ) from error
+    if isinstance(picture, TiffImagePlugin.TiffImageFile) and (misread := _misread(picture.tag_v2)):
+        raise InputError(f"{path}: a TIFF of {misread}, which is not read: convert it to PNG")
+    return kind, picture
 
 
 def kind_of(start: bytes) -> str:
@@ -211,6 +217,17 @@ def _heic_reader(path: Path) -> type[ImageFile.ImageFile]:
     except ImportError as error:
         raise MissingPackage(f"{path} is HEIC: install logvggt-jax[heic], or convert it to JPEG") from error
     return HeifImageFile
+
+
+def _misread(tags: TiffImagePlugin.ImageFileDirectory_v2) -> str | None:
+    """What Pillow and OpenCV would decode to other colours without an error; None for the others."""
+    if 16 not in tags.get(TiffImagePlugin.BITSPERSAMPLE, ()):
+        return None
+    if tags.get(TiffImagePlugin.PHOTOMETRIC_INTERPRETATION) == 0:
+        return "16 bits whose 0 is white"
+    if tags.get(TiffImagePlugin.PLANAR_CONFIGURATION) == 2 and tags.get(TiffImagePlugin.COMPRESSION, 1) == 1:
+        return "16 bits with its colours one after the other (planar) and without compression"
+    return None
 
 
 def _is_floating_point(stream: IO[bytes]) -> bool:
