@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import http.server
+import io
 import os
 import re
 import socket
@@ -361,6 +362,22 @@ def test_pictures_are_upright_by_a_tag(tmp_path: Path, library: str, degrees: in
                 output.mux(packet)
     image = next(iter(open_source(tagged))).image
     np.testing.assert_allclose(corners(image), corners(np.rot90(quarters(), -degrees // 90)), atol=12)
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_photos_as_a_video_keep_what_their_camera_noted(tmp_path: Path, orientation: int) -> None:
+    def photo(_: int, packet: bytes) -> bytes:
+        exif, picture = Image.Exif(), io.BytesIO()
+        exif[0x0112] = orientation
+        Image.open(io.BytesIO(packet)).save(picture, "JPEG", quality=95, exif=exif)
+        return picture.getvalue()
+
+    plain = write(tmp_path / "plain.avi", [quarters()] * 2, codec="mjpeg", pixels="yuvj420p")
+    source = open_source(rewritten(tmp_path / "photos.avi", plain, photo))
+    expected = np.rot90(quarters(), {1: 0, 3: 2, 6: -1, 8: 1}[orientation])
+    image = next(iter(source)).image
+    assert source.image_size == image.shape[:2] == expected.shape[:2]
+    np.testing.assert_allclose(corners(image), corners(expected), atol=16)
 
 
 def interlaced(count: int) -> list[np.ndarray]:

@@ -37,8 +37,8 @@ def notes_on(
         yield no_times(name, float(average_rate(container, stream) or 1))
     if is_interlaced(frame, stream):
         yield f"{name} is interlaced: its frames are deinterlaced (bwdif), and finest lines lose some detail"
-    spherical = frame.side_data.get("SPHERICAL")
-    if spherical and (projection := _PROJECTIONS.get(int.from_bytes(bytes(spherical)[:4], "little"))):
+    spherical = _side_data(frame, "SPHERICAL")
+    if spherical and (projection := _PROJECTIONS.get(int.from_bytes(spherical[:4], "little"))):
         yield all_around(name, projection)
     if transfer := _HDR_TRANSFERS.get(frame.color_trc):
         yield high_dynamic_range(name, transfer, "reduced to 8 bits without tone mapping, which makes them look pale")
@@ -49,13 +49,29 @@ def notes_on(
 
 def display_matrix(frame: av.VideoFrame, stream: av.video.stream.VideoStream) -> np.ndarray | None:
     """See `orientation`; None where nothing is turned."""
-    if data := frame.side_data.get("DISPLAYMATRIX"):
-        return np.frombuffer(bytes(data), np.int32)[:9].reshape(3, 3)[:2, :2].astype(np.float64)
+    if data := _side_data(frame, "DISPLAYMATRIX"):
+        return np.frombuffer(data, np.int32)[:9].reshape(3, 3)[:2, :2].astype(np.float64)
     tags = {name.lower(): value for name, value in stream.metadata.items()}
     if tags.get("rotate", "").lstrip("-").isdecimal():
         # Clockwise, as older programs wrote it into any file.
-        return np.linalg.matrix_power(np.array([[0, 1], [-1, 0]]), round(int(tags["rotate"]) / 90) % 4)
-    return None
+        return _clockwise(int(tags["rotate"]))
+    return _clockwise(-frame.rotation) if frame.rotation else None
+
+
+def _clockwise(degrees: int) -> np.ndarray:
+    return np.linalg.matrix_power(np.array([[0, 1], [-1, 0]]), round(degrees / 90) % 4)
+
+
+def _side_data(frame: av.VideoFrame, kind: str) -> bytes | None:
+    """What a frame tells beside its picture; None where it tells none of this kind.
+
+    PyAV gives none at all of a frame that has some which is newer than PyAV, as EXIF in the pictures of a camera.
+    """
+    try:
+        data = frame.side_data.get(kind)
+    except ValueError:
+        return None
+    return None if data is None else bytes(data)
 
 
 def moving_streams(container: av.container.InputContainer) -> list[av.video.stream.VideoStream]:
