@@ -1230,6 +1230,11 @@ def test_addresses_of_which_nothing_is_read_are_refused(given: str | Path, shown
         open_source(given)
 
 
+def test_a_pattern_with_a_number_is_told_as_a_glob(tmp_path: Path) -> None:
+    with pytest.raises(MissingInput, match=r"img_%04d\.png does not exist.*'.*/img_\*\.png'"):
+        open_source(tmp_path / "img_%04d.png")
+
+
 def test_the_address_of_a_file_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(MissingInput, match=rf"^{tmp_path}/x\.mp4 does not exist"):
         open_source(f"file://{tmp_path}/x.mp4")

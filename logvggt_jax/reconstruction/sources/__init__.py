@@ -20,6 +20,8 @@ __all__ = ["FolderSource", "SkippedFrame", "Source", "SourceFrame", "SourceOptio
 
 
 _ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar")
+# How FFmpeg and OpenCV are told of a sequence of images.
+_NUMBER = re.compile(r"%0?\d*d")
 _EXPECTED = "expected a folder of images or a video file"
 # As file managers give it; a `Path` keeps one slash only.
 _FILE_ADDRESS = re.compile(r"file:(?://(?:localhost)?)?(/[^/].*)")
@@ -54,7 +56,9 @@ def open_source(path: str | Path, *, masks: str | Path | None = None, **options:
                 path.stat()
     except MissingInput as error:
         refuse_address(given)
-        raise MissingInput(f"{path} does not exist: {_EXPECTED}") from error
+        glob = _NUMBER.sub("*", str(path))
+        hint = "" if glob == str(path) else f"; a sequence with numbers is given as a glob, '{glob}'"
+        raise MissingInput(f"{path} does not exist: {_EXPECTED}{hint}") from error
     except (RuntimeError, ValueError) as error:
         # No such user, or a null character.
         raise error if isinstance(error, InputError) else InputError(f"{given!r} is no path: {error}") from error
