@@ -339,6 +339,13 @@ def test_folders_without_pictures_say_what_they_hold(tmp_path: Path) -> None:
         open_source(tmp_path / "rgb", pattern="*.jpg")
 
 
+def test_a_folder_with_nothing_but_a_video_or_hidden_files_says_so(tmp_path: Path) -> None:
+    (tmp_path / "walk.mp4").touch()
+    (tmp_path / "._a.png").touch()
+    with pytest.raises(MissingInput, match=r"found 1 hidden \.png, 1 \.mp4; .*the file of a video"):
+        open_source(tmp_path)
+
+
 def test_missing_and_wrong_sources_are_named(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="nowhere does not exist"):
         open_source(tmp_path / "nowhere")

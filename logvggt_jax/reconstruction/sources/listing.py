@@ -99,7 +99,7 @@ def _of_folder(folder: Path, pattern: str | None) -> Listing:
         expected = "expected a picture" if pattern is None else f"none matches --pattern {pattern!r}: expected one"
         raise MissingInput(
             f"no image in {folder}: {expected} ({', '.join(IMAGE_SUFFIXES)}), found {_contents(entries)}; give the "
-            "folder that holds the images themselves, or convert them"
+            "folder that holds the images themselves, or the file of a video, or convert them"
         )
     folders = _folders_with_pictures(entries)
     if folders and pattern is None:
@@ -261,7 +261,9 @@ def _contents(entries: list[Path]) -> str:
 
 
 def _suffixes(files: list[Path]) -> str:
-    counts = Counter(file.suffix or "without suffix" for file in files)
+    counts = Counter(
+        ("hidden " if file.name.startswith(".") else "") + (file.suffix or "without suffix") for file in files
+    )
     return ", ".join(f"{count} {suffix}" for suffix, count in counts.most_common(6)) + (
         ", …" if len(counts) > 6 else ""
     )
