@@ -68,6 +68,8 @@ def choose_weights(names: Sequence[str], where: str, prefix: str) -> str:
     MissingInput if none is a checkpoint, InputError naming them if several are and none has a usual name.
     """
     weights = sorted(name for name in names if _is_weights(name) and not is_shard(name))
+    # macOS leaves ._model.pt beside model.pt on other systems' disks.
+    weights = [name for name in weights if not name.startswith(".")] or weights
     weights = [name for name in weights if not _NO_MODEL.search(name)] or weights
     usual = [name for name in _USUAL_NAMES if name in weights]
     if usual or len(weights) == 1:

@@ -29,8 +29,10 @@ def test_a_folder_means_its_only_checkpoint_and_of_several_the_user_chooses(tmp_
         find_weights(tmp_path)
 
 
-@pytest.mark.parametrize("beside", ["optimizer.bin", "rng_state.pth", "training_args.bin", "scheduler.pt"])
-def test_what_trainers_write_beside_a_model_is_no_second_one(tmp_path, beside):
+@pytest.mark.parametrize(
+    "beside", ["optimizer.bin", "rng_state.pth", "training_args.bin", "scheduler.pt", "._pytorch_model_fsdp.bin"]
+)
+def test_what_trainers_and_macos_write_beside_a_model_is_no_second_one(tmp_path, beside):
     for name in ("pytorch_model_fsdp.bin", beside):
         save_file({"w": np.ones(1, np.float32)}, tmp_path / name)
     assert find_weights(tmp_path).name == "pytorch_model_fsdp.bin"
