@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import os
 import signal
@@ -63,8 +64,9 @@ def one_line_at_ctrl_c(program: str) -> Iterator[None]:
     """While entered, Ctrl-C ends `program` with one line and the code `INTERRUPTED`, where what runs lets it pass.
 
     It does so at once while modules are imported: libraries take a KeyboardInterrupt in the middle of their extensions
-    for an error of their own, crash, or forget it. Outside of the main thread that does not work, nor where something
-    else handles the signal, or it is ignored.
+    for an error of their own, crash, or forget it. When all is done, and libraries clean up, it ends the process
+    without a word. Outside of the main thread that does not work, nor where something else handles the signal, or it
+    is ignored.
     """
     line = f"{program}: interrupted"
 
@@ -88,6 +90,8 @@ def one_line_at_ctrl_c(program: str) -> Iterator[None]:
     finally:
         if ours:
             signal.signal(signal.SIGINT, signal.default_int_handler)
+            # Nothing is left to be done but what libraries clean up, JAX for a second: that would be a traceback.
+            atexit.register(signal.signal, signal.SIGINT, signal.SIG_DFL)
 
 
 def _importing(frame: FrameType | None) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -46,3 +47,21 @@ def test_ctrl_c_while_modules_are_imported_is_one_line(
         [sys.executable, *command], cwd=ROOT, capture_output=True, text=True, env=environment, check=False, timeout=60
     )
     assert (finished.returncode, finished.stderr) == (130, f"{name}: interrupted\n")
+
+
+def test_ctrl_c_while_libraries_clean_up_is_no_traceback() -> None:
+    program = """
+import atexit, os, signal, time
+signal.signal(signal.SIGINT, signal.default_int_handler)
+@atexit.register
+def clean_up():
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(5)
+from logvggt_jax.interruption import one_line_at_ctrl_c
+with one_line_at_ctrl_c("program"):
+    print("done", flush=True)
+"""
+    finished = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=False, timeout=60
+    )
+    assert (finished.returncode, finished.stdout, finished.stderr) == (-signal.SIGINT, "done\n", "")
