@@ -1048,6 +1048,11 @@ def test_a_file_in_fragments_is_expected_whole(tmp_path: Path, library: str) -> 
     with av.open(str(path)) as container:
         assert container.streams.video[0].frames == 4, "the header states all frames"
     assert open_source(path).expected_frames == len(list(open_source(path))) == 24
+    assert not open_source(path).notes
+    content = path.read_bytes()
+    path.write_bytes(content[: content.rindex(b"moof") + 20])
+    source = open_source(path)
+    assert len(list(source)) == 20 and any("lacks its end" in note for note in source.notes)
 
 
 def test_the_unit_of_time_is_no_rate(tmp_path: Path) -> None:

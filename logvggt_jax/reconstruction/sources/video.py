@@ -299,17 +299,21 @@ def _check_file(path: Path) -> Iterator[str]:
 
 def _check_index(path: Path, file: BinaryIO, size: int) -> Iterator[str]:
     """Refuses an mp4 or mov file that lacks the box `moov`, without which none of it can be decoded; tells of a second
-    one, which is not read, though fragments after it are."""
+    one, which is not read, though fragments after it are, and of fragments that break off."""
     file.seek(0)
     head = file.read(12)
     if head[4:8] != b"ftyp" or head[8:] in _PICTURES:
         return
-    kinds = [box.kind for box in boxes(file, size) if box.end <= size]
+    found = list(boxes(file, size))
+    kinds = [box.kind for box in found if box.end <= size]
     if b"moov" not in kinds:
         raise InputError(
             f"{path} lacks its index (moov), or part of it: the recording or the copy was broken off; copy it anew, or "
             "restore it with untrunc and a whole video of the same camera"
         )
+    # Nothing announces how many fragments there are to be.
+    if any(box.kind == b"moof" for box in found) and found[-1].end != size:
+        yield f"{path} lacks its end: the recording or the copy was broken off, and its last frames are missing"
     if kinds.count(b"moov") > 1 and b"moof" not in kinds:
         yield (
             f"{path} holds {kinds.count(b'moov')} videos one after the other, of which the first alone is read; join "
