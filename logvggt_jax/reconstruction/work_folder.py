@@ -167,7 +167,7 @@ def _saved(folder: Path) -> State | None:
 
 
 def _check_ours(path: Path) -> None:
-    if path.exists() and not (path / _PROGRESS).is_dir() and any(path.iterdir()):
+    if path.exists() and not (path / _PROGRESS).is_dir() and (not path.is_dir() or any(path.iterdir())):
         raise OutputExists(f"{path} is in the way and was not made by this program: move it elsewhere")
 
 

@@ -403,7 +403,7 @@ def test_a_full_disk_is_named_and_keeps_the_state_before(tmp_path: Path) -> None
     assert saved is not None and saved.facts == {"num_taken": 1}
 
 
-def test_a_folder_of_somebody_else_is_left_alone(tmp_path: Path) -> None:
+def test_a_folder_or_file_of_somebody_else_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "out.partial").mkdir()
     (tmp_path / "out.partial" / "thesis.tex").write_text("x")
     with (
@@ -412,6 +412,13 @@ def test_a_folder_of_somebody_else_is_left_alone(tmp_path: Path) -> None:
     ):
         pass
     assert (tmp_path / "out.partial" / "thesis.tex").read_text() == "x"
+    (tmp_path / "walk.partial").write_text("x")
+    with (
+        pytest.raises(OutputExists, match=r"walk\.partial is in the way and was not made by this program"),
+        WorkFolder(tmp_path / "walk", {}, overwrite=True),
+    ):
+        pass
+    assert (tmp_path / "walk.partial").read_text() == "x"
 
 
 def test_leftovers_are_known_before_the_weights(walk: Path, tmp_path: Path) -> None:
