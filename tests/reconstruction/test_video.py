@@ -492,6 +492,19 @@ def test_a_change_of_size_is_noticed(tmp_path: Path, library: str, stride: int) 
     assert len(list(open_source(path, end=0.55))) == 6
 
 
+@pytest.mark.parametrize(("height", "width", "scaled"), [(2 * HEIGHT, 2 * WIDTH, True), (WIDTH, HEIGHT, False)])
+def test_scaling_is_advised_where_it_squashes_nothing(
+    tmp_path: Path, library: str, height: int, width: int, scaled: bool
+) -> None:
+    one = write(tmp_path / "one.ts", [grey(i) for i in range(6)])
+    two = write(tmp_path / "two.ts", [grey(i, height, width) for i in range(6)], stamps=range(6, 12))
+    path = tmp_path / "both.ts"
+    path.write_bytes(one.read_bytes() + two.read_bytes())
+    with pytest.raises(InputError, match="all frames need one size; cut it there") as caught:
+        list(open_source(path))
+    assert ("scale=64:48" in str(caught.value)) == scaled
+
+
 def joined(path: Path, parts: Sequence[Path]) -> Path:
     """One file of the packets of several, one after the other in time."""
     with av.open(str(path), "w") as output:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import secrets
 import stat
@@ -212,10 +213,12 @@ class VideoSource(Source):
             )
 
     def _refuse_size(self, position: int, size: tuple[int, int], first: tuple[int, int]) -> None:
+        # One shape scaled to another would be squashed.
+        alike = math.isclose(size[0] * first[1], size[1] * first[0], rel_tol=0.02)
+        scale = f", or scale all of it with ffmpeg -i INPUT -vf scale={first[1]}:{first[0]} OUTPUT.mp4" if alike else ""
         raise InputError(
             f"{self.name}: frame {position} is {size[1]} x {size[0]} pixels but the video begins with {first[1]} x "
-            f"{first[0]}: all frames need one size; cut it there, or scale all of it with ffmpeg -i INPUT -vf "
-            f"scale={first[1]}:{first[0]} OUTPUT.mp4"
+            f"{first[0]}: all frames need one size; cut it there{scale}"
         )
 
     def _check_range(self, header: VideoHeader) -> None:
