@@ -1,5 +1,6 @@
-"""The examples of docs/jax.md run as they stand, one after the other."""
+"""The Python examples of docs/jax.md and of the README run as they stand, one after the other."""
 
+import functools
 import re
 import subprocess
 import sys
@@ -19,8 +20,7 @@ ROOT = Path(__file__).parents[1]
 @pytest.fixture(scope="module")
 def ran(small_config: ModelConfig, small_variables: dict) -> dict[str, Any]:
     """The names that the blocks leave; with a small model in place of the one that ships."""
-    text = (ROOT / "docs" / "jax.md").read_text()
-    blocks = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    blocks = _blocks(ROOT / "docs" / "jax.md")
     assert len(blocks) > 7
     names: dict[str, Any] = {}
     cache = jax.config.jax_compilation_cache_dir
@@ -30,6 +30,28 @@ def ran(small_config: ModelConfig, small_variables: dict) -> dict[str, Any]:
             exec(compile(block, "docs/jax.md", "exec"), names)
     jax.config.update("jax_compilation_cache_dir", cache)
     return names
+
+
+def _blocks(page: Path) -> list[str]:
+    return re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
+
+
+@pytest.mark.slow
+def test_the_readmes_examples_agree(small_config: ModelConfig, small_variables: dict[str, Any]) -> None:
+    whole, stream, split = _blocks(ROOT / "README.md")
+    names: dict[str, Any] = {"frames": np.random.default_rng(0).integers(0, 256, (4, 32, 45, 3), np.uint8)}
+    model = LogVGGT(small_config), jax.device_put(small_variables)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(logvggt_jax, "load_model", lambda _: model)
+        patch.setattr(logvggt_jax, "preprocess", functools.partial(logvggt_jax.preprocess, longer_edge=42))
+        exec(whole, names)
+    expected = names["predictions"]
+    assert names["points"].shape == (*expected.depth.shape, 3)
+    exec(stream, names)
+    np.testing.assert_allclose(names["poses"][:, :, -1], expected.pose_encoding, rtol=1e-4, atol=2e-5)
+    names["clip"] = np.repeat(names["clip"], jax.device_count(), axis=0)
+    exec(split, names)
+    np.testing.assert_allclose(names["predictions"].depth[-1:], expected.depth, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.slow
