@@ -42,9 +42,11 @@ def point_cloud_metrics(
 
     Raises:
       NotMeasurable: an empty cloud, points that are not finite.
-      ValueError: wrong shapes.
+      ValueError: wrong shapes, an `icp_threshold` that is not above 0.
       MissingPackage: Open3D (ICP, normals) is not installed.
     """
+    if icp_threshold is not None and not icp_threshold > 0:  # NaN as well, with which nothing would move
+        raise ValueError(f"icp_threshold must be a distance above 0, or None for no ICP, got {icp_threshold}")
     prediction, target = _cloud(prediction, "prediction"), _cloud(target, "target")
     if prediction_normals is not None:
         prediction_normals = _normals_of(prediction, prediction_normals, "prediction_normals")

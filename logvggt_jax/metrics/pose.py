@@ -68,7 +68,7 @@ def pose_accuracy(rotation: np.ndarray, translation: np.ndarray, threshold: int 
         )
     if np.isnan(rotation).any() or np.isnan(translation).any():
         raise ValueError("pose_accuracy: errors contain NaN; every pair must have a finite pose")
-    if threshold < 1 or int(threshold) != threshold:
+    if not threshold >= 1 or threshold % 1:  # NaN and infinity as well
         raise ValueError(f"pose_accuracy: threshold must be a positive whole number, got {threshold}")
     larger = np.maximum(rotation, translation)
     counts, _ = np.histogram(larger, bins=np.arange(int(threshold) + 1))

@@ -154,3 +154,10 @@ def test_bad_clouds_are_named(prediction: np.ndarray, message: str, kind: type[V
 def test_normals_need_the_shape_of_their_points() -> None:
     with pytest.raises(ValueError, match="target_normals must have the shape"):
         point_cloud_metrics(np.zeros((4, 3)), np.zeros((4, 3)), target_normals=np.zeros((3, 3)))
+
+
+@pytest.mark.parametrize("threshold", [0, -0.1, np.nan])
+def test_a_threshold_that_no_distance_is_below_is_refused(threshold: float) -> None:
+    """Open3D's own error is a RuntimeError of several lines; for NaN there is none, and no ICP either."""
+    with pytest.raises(ValueError, match="icp_threshold must be a distance above 0"):
+        point_cloud_metrics(np.eye(3), np.eye(3), icp_threshold=threshold)

@@ -144,6 +144,8 @@ def test_bad_shapes_are_named(shapes: tuple[tuple[int, ...], tuple[int, ...]], m
         ([np.nan], [1.0], 30, "NaN"),
         ([1.0], [1.0], 0, "positive whole number"),
         ([1.0], [1.0], 2.5, "positive whole number"),
+        ([1.0], [1.0], np.nan, "positive whole number"),
+        ([1.0], [1.0], np.inf, "positive whole number"),
     ],
 )
 def test_bad_errors_are_refused(rotation: list[float], translation: list[float], threshold: Any, message: str) -> None:
