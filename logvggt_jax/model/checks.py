@@ -44,12 +44,9 @@ def check_pixels(images: Any, patch_size: int, name: str) -> None:
         raise ValueError(f"{name} must be uint8 or floating point in [0, 1], got dtype {images.dtype}")
     if images.dtype != jnp.uint8 and not isinstance(images, jax.core.Tracer | jax.ShapeDtypeStruct):
         with jax.ensure_compile_time_eval():  # also where a function that is traced closes over them
-            low, high = float(images.min()), float(images.max())
-        if not (low >= -_SLACK and high <= 1 + _SLACK):  # NaN as well
-            raise ValueError(
-                f"{name} must be floating point in [0, 1], got values from {low:g} to {high:g}; divide those of 0 to "
-                "255 by 255, or give uint8"
-            )
+            wrong = _wrong_values(images)
+        if wrong is not None:
+            raise ValueError(f"{name} must be floating point in [0, 1], got {wrong}")
 
 
 def check_masks(images: jax.Array, masks: jax.Array | None) -> None:
@@ -70,3 +67,14 @@ def _shape(name: str, array: Any) -> tuple[int, ...]:
     if not hasattr(array, "shape"):
         raise ValueError(f"{name} must be an array, got {type(array).__name__}")
     return tuple(array.shape)
+
+
+def _wrong_values(images: Any) -> str | None:
+    """What there is beyond [0, 1] in images of floating point, and how to mend it; None for none."""
+    # Pixel by pixel: where one is NaN, the smallest and largest value may on a CPU be those of the others.
+    if ((images >= -_SLACK) & (images <= 1 + _SLACK)).all():
+        return None
+    if jnp.isnan(images).any():
+        return "NaN: look at what made the images"
+    low, high = float(images.min()), float(images.max())
+    return f"values from {low:g} to {high:g}; divide those of 0 to 255 by 255, or give uint8"

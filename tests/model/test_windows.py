@@ -305,6 +305,15 @@ def test_a_traced_function_may_close_over_images_of_floating_point(small_config,
         jax.eval_shape(lambda variables: model.start(variables, grey_levels), small_variables)
 
 
+@pytest.mark.parametrize("to_array", [np.asarray, jnp.asarray])
+def test_one_pixel_that_is_no_number_is_found(small_config, small_variables, to_array):
+    """Of so many values XLA gives a smallest and a largest one on a CPU as if that pixel were not there."""
+    images = np.full((2, 4, 28, 42, 3), 0.5, np.float32)
+    images[1, 3, 4, 5, 0] = np.nan
+    with pytest.raises(ValueError, match=r"images must be floating point in \[0, 1\], got NaN: look"):
+        LogVGGT(small_config).apply(small_variables, to_array(images))
+
+
 def test_before_the_first_window_no_frame_counts(small_config, small_variables):
     model = LogVGGT(small_config)
     start, step, finish = jitted(model)
