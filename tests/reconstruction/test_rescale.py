@@ -17,6 +17,7 @@ from logvggt_jax.geometry import camera_centres, unproject
 from logvggt_jax.reconstruction import Reconstruction, rescale, write_trajectory
 from logvggt_jax.reconstruction.depth_files import write_picture
 from logvggt_jax.reconstruction.exporters import export
+from logvggt_jax.reconstruction.fusion.rescale import find_frame
 from logvggt_jax.reconstruction.points.cloud_file import count_points
 from logvggt_jax.reconstruction.points.point_filter import PointFilter
 from logvggt_jax.reconstruction.sources.record import SourceRecord
@@ -50,6 +51,12 @@ def test_from_the_distance_of_two_frames(truth: Reconstruction, result: Reconstr
     made, notes = rescale(result, tmp_path / "a", frames=("0", "view 3"), distance=distance, progress=False)
     assert_true(made, truth)
     assert "all lengths are multiplied by 4" in notes[-1]
+
+
+def test_a_frames_number_may_be_one_of_python(result: Reconstruction) -> None:
+    assert [find_frame(result, number) for number in (0, np.int64(COUNT - 1))] == [0, COUNT - 1]
+    with pytest.raises(InputError, match="there is no frame -1: give a name such as 'view 0', or a number from 0 to 3"):
+        find_frame(result, -1)
 
 
 @pytest.mark.parametrize("metres", [1e9, 1e-9])

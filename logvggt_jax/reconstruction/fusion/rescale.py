@@ -30,7 +30,7 @@ def rescale(
     poses: str | Path | None = None,
     depth: str | Path | None = None,
     depth_unit: float | None = None,
-    frames: tuple[str, str] | None = None,
+    frames: tuple[str | int, str | int] | None = None,
     pixels: tuple[str, str] | None = None,
     distance: float | None = None,
     overwrite: bool = False,
@@ -97,14 +97,15 @@ def rescale(
     return Fused(made, [*notes, f"all lengths are multiplied by {factor:.6g}"])
 
 
-def find_frame(result: Reconstruction, text: str) -> int:
+def find_frame(result: Reconstruction, frame: str | int) -> int:
     """The number of a frame that is given by its name, or else by its number; InputError where there is none."""
-    if text in result.names:
-        return result.names.index(text)
+    if frame in result.names:
+        return result.names.index(frame)
+    text = str(frame)
     if text.isascii() and text.isdecimal() and int(text) < result.num_frames:
         return int(text)
     raise InputError(
-        f"there is no frame {text!r}: give a name such as {result.names[0]!r}, or a number from 0 to "
+        f"there is no frame {frame!r}: give a name such as {result.names[0]!r}, or a number from 0 to "
         f"{result.num_frames - 1}"
     )
 
