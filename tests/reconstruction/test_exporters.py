@@ -586,6 +586,12 @@ def test_pictures_and_depth_take_what_is_estimated(tmp_path: Path, name: str) ->
     assert written < 1.2 * frame_bytes([name], result.image_size, result.image_size) + 150_000
 
 
+def test_a_single_format_may_be_given_by_its_name(result: Reconstruction, tmp_path: Path) -> None:
+    assert export(result, "tum", tmp_path, progress=False) == [tmp_path / "tum.txt"]
+    with pytest.raises(InputError, match="there is no format 'tun': choose among"):
+        export(result, "tun", tmp_path, progress=False)
+
+
 def test_what_exists_is_refused_before_anything_is_written(result: Reconstruction, tmp_path: Path) -> None:
     (tmp_path / "kitti.txt").write_text("mine")
     with pytest.raises(OutputExists, match=r"kitti\.txt exists: .*--overwrite"):

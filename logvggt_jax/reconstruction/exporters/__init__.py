@@ -105,7 +105,7 @@ def frame_bytes(names: Iterable[str], pictures: tuple[int, int], depth: tuple[in
 
 def export(
     result: Reconstruction,
-    names: Sequence[str],
+    names: Sequence[str] | str,
     output: str | Path | None = None,
     *,
     point_filter: PointFilter | None = None,
@@ -118,7 +118,7 @@ def export(
 
     Args:
       result: the reconstruction.
-      names: keys of `EXPORTERS`.
+      names: keys of `EXPORTERS`, or a single one.
       output: folder, made if need be; None for `exports` of the result's own.
       point_filter: which pixels become points; None takes the result's filter, for each format's own number of points.
       overwrite: replace earlier exports.
@@ -134,8 +134,8 @@ def export(
       OutputExists: something is at a place where a format has to go.
       DiskError: the disk has too little room for pictures and depth, or cannot be written.
     """
+    names = [names] if isinstance(names, str) else list(dict.fromkeys(names))
     check_formats(names)
-    names = list(dict.fromkeys(names))
     folder = result.folder / EXPORT_FOLDER if output is None else user_path(output)
     inside, own = folder.resolve(), result.folder.resolve()
     if inside.is_relative_to(own) and not inside.is_relative_to(own / EXPORT_FOLDER):
