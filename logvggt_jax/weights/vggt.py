@@ -222,14 +222,15 @@ def check_vggt(state_dict: Mapping[str, np.ndarray], config: ModelConfig) -> Non
             f"unknown key {unknown[0]!r}{others} in the state dict, expected those of VGGT's aggregator, camera_head, "
             f"depth_head, point_head and track_head{_differences(state_dict, config)}"
         )
-    missing = [rule.name for rule in rules if rule.name not in state_dict and rule.name != _MASK_TOKEN]
+    present = set(state_dict)  # a lazy mapping may read a tensor to say whether it is there
+    missing = [rule.name for rule in rules if rule.name not in present and rule.name != _MASK_TOKEN]
     if missing:
         raise InputError(
             f"{len(missing)} of {len(rules)} keys are missing from the state dict, first {', '.join(missing[:3])}"
             f"{_differences(state_dict, config)}; {_seen(state_dict)}"
         )
     for rule in rules:
-        if rule.name in state_dict and (header := _header(state_dict, rule.name)) is not None:
+        if rule.name in present and (header := _header(state_dict, rule.name)) is not None:
             _check_header(rule, header, state_dict, config)
 
 
@@ -256,10 +257,11 @@ def params_from_vggt(
     check_vggt(state_dict, config)
     rules = vggt_rules(config)
     known = {rule.name for rule in rules}
+    present = set(state_dict)
     report = ConversionReport(skipped=[name for name in state_dict if name not in known])
     params: dict[str, Any] = {}
     for rule in rules:
-        if rule.name not in state_dict:
+        if rule.name not in present:
             continue
         tensor = np.asarray(state_dict[rule.name])
         _check_header(rule, Header(tensor.shape, tensor.dtype.name), state_dict, config)

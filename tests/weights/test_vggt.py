@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from collections.abc import Mapping
 
 import jax
 import ml_dtypes
@@ -142,6 +143,26 @@ def test_tensors_are_read_once_cast_and_copied(shallow):
     source["aggregator.patch_embed.norm.weight"][:] = 7
     before = state_dict["aggregator.patch_embed.norm.weight"]
     np.testing.assert_array_equal(params["encoder"]["norm"]["scale"], before)
+
+
+def test_a_lazy_mapping_of_somebody_elses_is_read_once(shallow):
+    """One that says by reading whether a name is there, as `collections.abc.Mapping` does."""
+    config, source = shallow
+    read = []
+
+    class Lazy(Mapping):
+        def __getitem__(self, name):
+            read.append(name)
+            return source[name]
+
+        def __iter__(self):
+            return iter(source)
+
+        def __len__(self):
+            return len(source)
+
+    _, report = params_from_vggt(Lazy(), config)
+    assert sorted(read) == sorted(report.used)
 
 
 def test_an_unknown_key_is_refused(vggt_state_dict, vggt_config):
