@@ -213,6 +213,13 @@ METHODS: dict[str, Method] = {
 }
 
 
+def known_method(name: str) -> Method:
+    """The method of this name; InputError where there is none."""
+    if name not in METHODS:
+        raise InputError(f"unknown method {name!r}; known are {', '.join(METHODS)}")
+    return METHODS[name]
+
+
 def open_predictor(method: str, model: LogVGGT, variables: Variables, settings: Any = None) -> Predictor:
     """A method's predictor for one sequence.
 
@@ -226,9 +233,7 @@ def open_predictor(method: str, model: LogVGGT, variables: Variables, settings: 
       InputError: the method is not known.
       ValueError: settings of another method.
     """
-    if method not in METHODS:
-        raise InputError(f"unknown method {method!r}; known are {', '.join(METHODS)}")
-    found = METHODS[method]
+    found = known_method(method)
     settings = found.settings() if settings is None else settings
     if not isinstance(settings, found.settings):
         raise ValueError(f"method {method!r} takes {found.settings.__name__}, got {type(settings).__name__}")

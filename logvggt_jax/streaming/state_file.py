@@ -14,7 +14,7 @@ from safetensors.numpy import save_file
 from logvggt_jax.errors import DiskError, InputError, disk_errors, one_line
 from logvggt_jax.files import atomic_file, to_disk
 from logvggt_jax.model.logvggt import LogVGGT, Variables
-from logvggt_jax.streaming.predictor import METHODS, Predictor, open_predictor
+from logvggt_jax.streaming.predictor import Predictor, known_method, open_predictor
 from logvggt_jax.streaming.results import FrameResult
 from logvggt_jax.weights.digests import digests, json_digest, named_leaves
 
@@ -48,9 +48,13 @@ def save_stream(
       settings: of the method, as the stream was opened with them; None for its defaults.
 
     Raises:
+      ValueError: the stream is closed, and has nothing to go on from.
+      InputError: the method is not known.
       DiskError: the file cannot be written.
     """
     results, arrays = predictor.snapshot()
+    if predictor.num_frames and not arrays:  # in place of an earlier state there would be one of no frames
+        raise ValueError("this stream is closed: save a stream before it is closed")
     write_state(path, State(arrays, _facts(model, variables, method, settings)))
     return results
 
@@ -68,7 +72,8 @@ def load_stream(
       settings: of the method; None for its defaults.
 
     Raises:
-      InputError: the file is missing or damaged, or of another method, model or parameters, or of other settings.
+      InputError: the method is not known; the file is missing or damaged, or of another method, model or parameters, or
+        of other settings.
     """
     state, facts = read_state(path), _facts(model, variables, method, settings)
     if others := sorted(name for name in facts if state.facts.get(name) != facts[name]):
@@ -109,7 +114,7 @@ def read_state(path: str | Path) -> State:
 def _facts(model: LogVGGT, variables: Variables, method: str, settings: Any) -> dict[str, Any]:
     return {
         "method": method,
-        "settings": str(METHODS[method].settings() if settings is None else settings),
+        "settings": str(known_method(method).settings() if settings is None else settings),
         "model": json_digest(model.config.to_dict()),
         "parameters": json_digest([[name, *_glimpse(leaf)] for name, leaf in named_leaves(variables)]),
     }

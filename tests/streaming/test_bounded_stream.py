@@ -230,3 +230,18 @@ def test_a_stream_goes_on_from_a_file_of_the_same_model_alone(
         load_stream(file, model, small_variables, settings=settings)
     with pytest.raises(InputError, match="No such file"):
         load_stream(tmp_path / "nothing", model, small_variables)
+
+
+def test_a_closed_stream_does_not_take_the_place_of_an_earlier_state(
+    small_config: ModelConfig, small_variables: dict, frames: np.ndarray, tmp_path: Path
+) -> None:
+    model, file = with_refinement(small_config, **CONSTANT), tmp_path / "stream.safetensors"
+    session = StreamSession(model, small_variables)
+    session.push(frames[:5])
+    save_stream(file, session, model, small_variables)
+    session.close()
+    with pytest.raises(ValueError, match="this stream is closed: save a stream before it is closed"):
+        save_stream(file, session, model, small_variables)
+    assert load_stream(file, model, small_variables).num_frames == 2
+    with pytest.raises(InputError, match="unknown method 'window'; known are windows, "):
+        load_stream(file, model, small_variables, method="window")
