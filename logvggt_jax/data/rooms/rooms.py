@@ -117,7 +117,7 @@ class Rooms(Reader):
         if seed < 0:
             raise InputError(f"rooms: seed must not be negative, got {seed}")
         low, high = speed if isinstance(speed, Sequence) else (speed, speed)
-        if not 0 < low <= high:
+        if not 0 < low <= high < np.inf:
             raise InputError(f"rooms: speed must be positive or a pair low <= high, got {speed}")
         shares = {"facing_north": facing_north, "repetition": repetition, "motion_blur": motion_blur}
         for name, share in shares.items():

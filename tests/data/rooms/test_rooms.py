@@ -182,6 +182,7 @@ def test_only_compass_rooms_share_their_wall_colours():
         ({"num_rooms": 0}, "num_rooms"),
         ({"seed": -1}, "seed"),
         ({"speed": (2.0, 1.0)}, "speed"),
+        ({"speed": np.inf}, "speed"),
     ],
 )
 def test_bad_options_are_named(options: dict, named: str):
