@@ -32,7 +32,8 @@ def depth_metrics(
       target: [..., H, W] true depth; pixels with 0 < target (< `max_depth`) are valid.
       alignment: `metric` none; `scale` ten reweighted steps towards the least absolute error; `median` ratio
         of the lower medians; `lstsq` least-squares scale and shift; `scale_shift` at most 1,000 Adam steps on
-        the sum of absolute errors.
+        the sum of absolute errors. As in the reference the factor of `scale` is at least 0.001 and these steps have one
+        length in every unit: a prediction in millimetres for a target in metres suits neither.
       max_depth: exclusive upper bound of valid target depth.
       clip: upper bound put on the aligned prediction (Sintel: 70 m).
       mask: [..., H, W] bool; restricts the errors, not the alignment.
