@@ -10,8 +10,9 @@ import stat
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 from filelock import FileLock, Timeout
 
@@ -20,6 +21,8 @@ from logvggt_jax.errors import DiskError, InputError, OutputExists, disk_errors,
 EMPTY_PATH = "the path is empty (a variable without a value?)"
 _LONGEST_NAME, _LONGEST_SUFFIX = 255, 32  # bytes
 _LOCK, _OWNER = ".lock", ".owner"
+# What they leave in any folder that somebody looks at.
+_OF_FILE_MANAGERS = (".DS_Store", "._*", ".directory", "Thumbs.db", "desktop.ini")
 # A name beside the one that a file is to have: see `_temporary_name`.
 _TEMPORARY = re.compile(r"\..*\.\d+-[0-9a-f]{8}(\.[^.]*)?", re.DOTALL)
 
@@ -118,13 +121,25 @@ def user_path(path: str | Path, *, resolved: bool = False) -> Path:
         raise InputError(f"{path}: {one_line(error)}") from error
 
 
-def check_output(output: str | Path, *, overwrite: bool, marker: str, in_place: bool = False) -> Path:
+class FolderKind(NamedTuple):
+    """What folders of one kind hold.
+
+    Attributes:
+      marker: a file that every finished one has, as a path in it.
+      names: patterns of all that lies in one; what has another name is not of this program.
+    """
+
+    marker: str
+    names: tuple[str, ...]
+
+
+def check_output(output: str | Path, *, overwrite: bool, kind: FolderKind, in_place: bool = False) -> Path:
     """The absolute path of `output`, provided that a result may be written there; OutputExists otherwise.
 
     An empty folder that was made beforehand is as good as none. With `overwrite` an existing folder may be replaced
-    that holds `marker`, a file that every finished folder of this kind has, so that a slip of the keyboard deletes no
-    other folder. Unless what is written goes `in_place`, into the folder itself, which then may hold what a lock left,
-    a new folder takes its place at the end, which the top of a volume gives up for nobody.
+    that is of this `kind` and holds nothing else, so that a slip of the keyboard deletes no other folder, nor what
+    somebody has put into this one. Unless what is written goes `in_place`, into the folder itself, which then may hold
+    what a lock left, a new folder takes its place at the end, which the top of a volume gives up for nobody.
     """
     output = user_path(output, resolved=True)
     with disk_errors(output):
@@ -134,11 +149,21 @@ def check_output(output: str | Path, *, overwrite: bool, marker: str, in_place: 
             return output
         if not overwrite:
             raise _exists(output)
-        replaceable = (output / marker).is_file()
+        replaceable = (output / kind.marker).is_file()
+        known = (*kind.names, *_OF_FILE_MANAGERS)
+        foreign = sorted(
+            entry.name for entry in output.iterdir() if not any(fnmatchcase(entry.name, name) for name in known)
+        )
     if not replaceable:
         raise OutputExists(
-            f"{output} is not overwritten: it holds no {marker}, so it is no earlier result; choose another "
+            f"{output} is not overwritten: it holds no {kind.marker}, so it is no earlier result; choose another "
             "output or delete it yourself"
+        )
+    if foreign and not in_place:
+        others = f" and {len(foreign) - 1} more" if len(foreign) > 1 else ""
+        raise OutputExists(
+            f"{output} is not overwritten: {foreign[0]}{others} in it was not made with it, and would be gone; move it "
+            "elsewhere, or choose another output"
         )
     return output
 

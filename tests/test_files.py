@@ -7,7 +7,9 @@ from pathlib import Path
 import pytest
 
 from logvggt_jax.errors import DiskError, InputError, MissingInput, OutputExists, one_line, printable
-from logvggt_jax.files import atomic_file, atomic_folder, check_output, open_regular, user_path, write_text
+from logvggt_jax.files import FolderKind, atomic_file, atomic_folder, check_output, open_regular, user_path, write_text
+
+DONE = FolderKind("done", ("done", "frame-*"))
 
 
 def names(folder: Path) -> list[str]:
@@ -75,7 +77,7 @@ def test_only_regular_files_are_opened(tmp_path: Path) -> None:
     # Python 3.13 resolves such a path without complaint.
     with (
         pytest.raises(InputError, match="loop"),
-        atomic_folder(check_output(tmp_path / "loop" / "out", overwrite=True, marker="done")),
+        atomic_folder(check_output(tmp_path / "loop" / "out", overwrite=True, kind=DONE)),
     ):
         pass
 
@@ -106,14 +108,23 @@ def test_only_results_are_overwritten_and_only_when_asked(tmp_path: Path) -> Non
     (target / "thesis.tex").write_text("years of work")
     for overwrite in (False, True):
         with pytest.raises(OutputExists, match=str(target)):
-            check_output(target, overwrite=overwrite, marker="done")
+            check_output(target, overwrite=overwrite, kind=DONE)
     (target / "done").touch()
-    assert check_output(target, overwrite=True, marker="done") == target
+    with pytest.raises(OutputExists, match=r"out is not overwritten: thesis\.tex in it was not made with it"):
+        check_output(target, overwrite=True, kind=DONE)
+    (target / "thesis.aux").touch()
+    with pytest.raises(OutputExists, match=r"thesis\.aux and 1 more in it"):
+        check_output(target, overwrite=True, kind=DONE)
+    for name in ("thesis.aux", "thesis.tex"):
+        (target / name).unlink()
+    for name in ("frame-000001", ".DS_Store", "._done"):
+        (target / name).touch()
+    assert check_output(target, overwrite=True, kind=DONE) == target
     with pytest.raises(OutputExists, match="--overwrite"), atomic_folder(target):
         pass
     with pytest.raises(RuntimeError), atomic_folder(target, replace=True):
         raise RuntimeError
-    assert (target / "thesis.tex").exists()
+    assert (target / "done").exists()
     with atomic_folder(target, replace=True) as folder:
         (folder / "new").touch()
     assert names(target) == ["new"] and names(tmp_path) == ["out"]
@@ -122,12 +133,12 @@ def test_only_results_are_overwritten_and_only_when_asked(tmp_path: Path) -> Non
 def test_an_empty_folder_is_as_good_as_none(tmp_path: Path) -> None:
     target = tmp_path / "out"
     target.mkdir()
-    assert check_output(target, overwrite=False, marker="done") == target
+    assert check_output(target, overwrite=False, kind=DONE) == target
     with atomic_folder(target) as folder:
         (folder / "done").touch()
     assert names(target) == ["done"] and names(tmp_path) == ["out"]
     with pytest.raises(OutputExists, match="--overwrite"):
-        check_output(target, overwrite=False, marker="done")
+        check_output(target, overwrite=False, kind=DONE)
 
 
 def test_the_top_of_a_volume_is_told_before_the_work_is_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -135,9 +146,9 @@ def test_the_top_of_a_volume_is_told_before_the_work_is_done(tmp_path: Path, mon
     monkeypatch.setattr(Path, "is_mount", lambda self: self == tmp_path)
     for overwrite in (False, True):
         with pytest.raises(OutputExists, match="top of a volume"):
-            check_output(tmp_path, overwrite=overwrite, marker="done")
-    assert check_output(tmp_path, overwrite=True, marker="done", in_place=True) == tmp_path
-    assert check_output(tmp_path / "new", overwrite=False, marker="done") == tmp_path / "new"
+            check_output(tmp_path, overwrite=overwrite, kind=DONE)
+    assert check_output(tmp_path, overwrite=True, kind=DONE, in_place=True) == tmp_path
+    assert check_output(tmp_path / "new", overwrite=False, kind=DONE) == tmp_path / "new"
 
 
 def test_a_folder_that_cannot_be_replaced_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

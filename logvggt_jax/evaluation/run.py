@@ -17,7 +17,7 @@ from logvggt_jax.evaluation.records import RECORDS_FILE
 from logvggt_jax.evaluation.report.report import write_report
 from logvggt_jax.evaluation.runner import evaluate
 from logvggt_jax.evaluation.settings import ClipRun, PaperRun, read_run
-from logvggt_jax.files import FolderLock, check_output, check_writable
+from logvggt_jax.files import FolderKind, FolderLock, check_output, check_writable
 from logvggt_jax.streaming import METHODS, expectation
 from logvggt_jax.weights.address import resolve
 from logvggt_jax.weights.checkpoints import read_config, read_provenance
@@ -55,7 +55,7 @@ def run_evaluation(
       InputError: a setting, the data or the checkpoint cannot be used, or another run is at work on `output`.
     """
     run = read_run(configuration)
-    output = check_output(output, overwrite=True, marker=RECORDS_FILE, in_place=True)
+    output = check_output(output, overwrite=True, kind=FolderKind(RECORDS_FILE, ("*",)), in_place=True)
     check_writable(output / RECORDS_FILE)
     asks = isinstance(run, ClipRun) and run.evaluation.image_size is None
     longer_edge = read_provenance(checkpoint).longer_edge if asks else None

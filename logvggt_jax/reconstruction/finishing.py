@@ -11,13 +11,8 @@ from logvggt_jax.reconstruction.exporters.tum import export_tum
 from logvggt_jax.reconstruction.frame_pool import FramePool
 from logvggt_jax.reconstruction.points.selection import PointSelection
 from logvggt_jax.reconstruction.previews import write_previews
-from logvggt_jax.reconstruction.result import (
-    EXPORT_FOLDER,
-    POINTS_FILE,
-    PREVIEW_FOLDER,
-    TRAJECTORY_FILE,
-    Reconstruction,
-)
+from logvggt_jax.reconstruction.result import Reconstruction
+from logvggt_jax.reconstruction.result_folder import EXPORT_FOLDER, POINTS_FILE, PREVIEW_FOLDER, TRAJECTORY_FILE
 
 
 def finish(

@@ -11,7 +11,8 @@ from logvggt_jax.colours import depth_limits, depth_picture
 from logvggt_jax.frames import evenly_spaced
 from logvggt_jax.reconstruction.depth_files import write_picture
 from logvggt_jax.reconstruction.frame_pool import FramePool
-from logvggt_jax.reconstruction.result import PREVIEW_FOLDER, Reconstruction, preview_file
+from logvggt_jax.reconstruction.result import Reconstruction, preview_file
+from logvggt_jax.reconstruction.result_folder import PREVIEW_FOLDER
 
 # Pixels that image and depth are wide at least.
 WIDTH = 512

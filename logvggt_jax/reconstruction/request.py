@@ -18,10 +18,10 @@ from logvggt_jax.files import check_apart, check_output, check_space, check_writ
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.operations import matmul_flops_per_second
 from logvggt_jax.reconstruction.calibration import Calibration
-from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE
 from logvggt_jax.reconstruction.exporters import frame_bytes
 from logvggt_jax.reconstruction.points.cloud_file import VERTEX
 from logvggt_jax.reconstruction.points.point_filter import PointFilter
+from logvggt_jax.reconstruction.result_folder import RESULT
 from logvggt_jax.reconstruction.sources import Source
 from logvggt_jax.reconstruction.work_folder import is_unfinished
 from logvggt_jax.streaming import METHODS
@@ -62,7 +62,7 @@ def check_request(
     if target in (source.path.resolve(), *source.path.resolve().parents):
         raise InputError(f"output {output} contains the source {source.path}: choose another output")
     if overwrite or not is_unfinished(target):
-        check_output(target, overwrite=overwrite, marker=CAMERAS_FILE)
+        check_output(target, overwrite=overwrite, kind=RESULT)
     check_apart(target, source.files())
     check_writable(target)
     return target

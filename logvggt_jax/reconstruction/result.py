@@ -21,13 +21,9 @@ from logvggt_jax.reconstruction.depth_files import (
 from logvggt_jax.reconstruction.health.report import HEALTH_FILE, HEALTH_PAGE, Health, read_health
 from logvggt_jax.reconstruction.points.cloud_file import Cloud, count_points, read_cloud, read_points
 from logvggt_jax.reconstruction.points.point_filter import PointFilter
+from logvggt_jax.reconstruction.result_folder import POINTS_FILE, PREVIEW_FOLDER, TRAJECTORY_FILE
 from logvggt_jax.reconstruction.sources.record import SourceRecord
 from logvggt_jax.reconstruction.work_folder import is_unfinished
-
-TRAJECTORY_FILE = "trajectory.txt"
-POINTS_FILE = "points.ply"
-PREVIEW_FOLDER = "previews"
-EXPORT_FOLDER = "exports"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -10,12 +10,13 @@ from rich.progress import track
 from logvggt_jax.data.formats.image import read_depth, read_rgb
 from logvggt_jax.data.rooms.rooms import Rooms
 from logvggt_jax.errors import InputError, MissingInput, disk_errors
-from logvggt_jax.files import atomic_folder, check_output
+from logvggt_jax.files import FolderKind, atomic_folder, check_output
 from logvggt_jax.frames import Frames
 from logvggt_jax.geometry import invert
 from logvggt_jax.reconstruction.depth_files import write_picture
 
 INTRINSICS_FILE = "intrinsics.txt"
+_SEQUENCE = FolderKind(INTRINSICS_FILE, (INTRINSICS_FILE, "frame-*"))
 # Of a frame: drawing it takes 120 bytes of memory a pixel, 2 GB in all.
 _MOST_PIXELS = 4096 * 4096
 
@@ -57,7 +58,7 @@ def write_room_sequence(
         raise InputError(f"image size {height}x{width} is too large: rooms have at most {_MOST_PIXELS:,} pixels")
     rooms = Rooms(split, height=height, width=width, num_frames=num_frames, num_rooms=1, seed=seed)
     sequence = rooms.sequences[0]
-    target = check_output(output, overwrite=overwrite, marker=INTRINSICS_FILE)
+    target = check_output(output, overwrite=overwrite, kind=_SEQUENCE)
     with atomic_folder(target, replace=overwrite) as folder, disk_errors(target):
         steps = track(range(num_frames), description=f"Rendering {sequence}", disable=not progress)
         for index in steps:

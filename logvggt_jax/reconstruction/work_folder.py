@@ -20,11 +20,11 @@ from logvggt_jax.files import (
     write_text,
 )
 from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE, PARTIAL, is_complete
+from logvggt_jax.reconstruction.result_folder import PROGRESS_FOLDER, RESULT
 from logvggt_jax.reconstruction.saved_source import check_frames, check_source
 from logvggt_jax.reconstruction.sources import Source
 from logvggt_jax.streaming.state_file import State, read_state, write_state
 
-_PROGRESS = ".progress"
 _REQUEST, _STATE, _RESERVE = "request.json", "state.safetensors", "reserve"
 _MEND = "pass --overwrite to start anew"
 _ELSEWHERE = "choose another output"
@@ -50,7 +50,7 @@ class WorkFolder:
     def __init__(self, output: Path, request: Mapping[str, str], *, overwrite: bool) -> None:
         self._output, self._request, self._overwrite = output, dict(request), overwrite
         self.path = work_path(output)
-        self._progress = self.path / _PROGRESS
+        self._progress = self.path / PROGRESS_FOLDER
         self._lock: FolderLock | None = None
         # Whether the folder was the incomplete result at `output`, and is still as it was.
         self._unchanged_result = False
@@ -61,7 +61,7 @@ class WorkFolder:
                 _check_request(self._output, self._request)
                 self._output.rename(self.path)
                 self._unchanged_result = True
-            check_output(self._output, overwrite=self._overwrite, marker=CAMERAS_FILE)
+            check_output(self._output, overwrite=self._overwrite, kind=RESULT)
             _check_ours(self.path)
         self._lock = FolderLock(self._progress, _ELSEWHERE)
         try:
@@ -123,10 +123,10 @@ class WorkFolder:
     def commit(self, *, complete: bool) -> None:
         """Puts the folder in the result's place; an incomplete one can still be taken up."""
         with disk_errors(self._output):
-            check_output(self._output, overwrite=self._overwrite, marker=CAMERAS_FILE)
+            check_output(self._output, overwrite=self._overwrite, kind=RESULT)
             move_folder(self.path, self._output, replace=self._overwrite)
         if complete:
-            shutil.rmtree(self._output / _PROGRESS, ignore_errors=True)
+            shutil.rmtree(self._output / PROGRESS_FOLDER, ignore_errors=True)
 
 
 def work_path(output: Path) -> Path:
@@ -137,7 +137,7 @@ def work_path(output: Path) -> Path:
 def is_unfinished(folder: Path) -> bool:
     """Whether a result folder was left early and can be taken up."""
     with disk_errors(folder):
-        return (folder / _PROGRESS / _STATE).is_file() and not is_complete(folder / CAMERAS_FILE)
+        return (folder / PROGRESS_FOLDER / _STATE).is_file() and not is_complete(folder / CAMERAS_FILE)
 
 
 def check_leftovers(output: Path, request: Mapping[str, str], source: Source, *, overwrite: bool) -> None:
@@ -146,10 +146,10 @@ def check_leftovers(output: Path, request: Mapping[str, str], source: Source, *,
     path = work_path(output)
     with disk_errors(path):
         _check_ours(path)
-        if (path / _PROGRESS).is_dir():
-            FolderLock(path / _PROGRESS, _ELSEWHERE).release()
+        if (path / PROGRESS_FOLDER).is_dir():
+            FolderLock(path / PROGRESS_FOLDER, _ELSEWHERE).release()
         unfinished = path if path.exists() else output
-        if not overwrite and (unfinished / _PROGRESS / _REQUEST).exists():
+        if not overwrite and (unfinished / PROGRESS_FOLDER / _REQUEST).exists():
             _check_request(unfinished, request, unknown=("weights", "precision"))
             if (saved := _saved(unfinished)) is not None:
                 check_source(source, saved.facts, unfinished)
@@ -157,7 +157,7 @@ def check_leftovers(output: Path, request: Mapping[str, str], source: Source, *,
 
 
 def _saved(folder: Path) -> State | None:
-    file = folder / _PROGRESS / _STATE
+    file = folder / PROGRESS_FOLDER / _STATE
     if not file.is_file():
         return None
     try:
@@ -167,12 +167,12 @@ def _saved(folder: Path) -> State | None:
 
 
 def _check_ours(path: Path) -> None:
-    if path.exists() and not (path / _PROGRESS).is_dir() and (not path.is_dir() or any(path.iterdir())):
+    if path.exists() and not (path / PROGRESS_FOLDER).is_dir() and (not path.is_dir() or any(path.iterdir())):
         raise OutputExists(f"{path} is in the way and was not made by this program: move it elsewhere")
 
 
 def _check_request(folder: Path, request: Mapping[str, str], unknown: Collection[str] = ()) -> None:
-    file = folder / _PROGRESS / _REQUEST
+    file = folder / PROGRESS_FOLDER / _REQUEST
     try:
         stored = json.loads(file.read_text("utf-8"))
         names = (stored.keys() | request.keys()).difference(unknown)

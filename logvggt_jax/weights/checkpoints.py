@@ -23,6 +23,7 @@ from rich.progress import Progress
 from logvggt_jax.config import ModelConfig, from_mapping
 from logvggt_jax.errors import InputError, MissingInput, OutputExists, disk_errors, one_line
 from logvggt_jax.files import (
+    FolderKind,
     atomic_folder,
     check_apart,
     check_output,
@@ -53,6 +54,7 @@ from logvggt_jax.weights.vggt import (
 
 _UNKNOWN = Provenance()
 _VGGT_LONGER_EDGE = 518
+_MODEL_FOLDER = FolderKind("config.json", ("config.json", "params", PARAMETERS_FILE))
 # Of arrays that Orbax holds at once; by its default of 96 every parameter is there twice.
 _GB_IN_FLIGHT = 1
 
@@ -266,7 +268,7 @@ def convert(
     unless it is a model folder and `overwrite` is set; DiskError where the space does not suffice; InputError as
     `from_pretrained`. Nothing is left behind, and an older model folder goes once the new one is complete.
     """
-    destination = check_output(destination, overwrite=overwrite, marker="config.json")
+    destination = check_output(destination, overwrite=overwrite, kind=_MODEL_FOLDER)
     check_destination(destination)
     check_writable(destination)
     path, progress_console = resolve(source), Console(stderr=True)

@@ -15,7 +15,7 @@ from logvggt_jax.reconstruction import PointFilter, Reconstruction, open_source
 from logvggt_jax.reconstruction.cameras_file import write_cameras
 from logvggt_jax.reconstruction.depth_files import depth_file, image_file, write_depth, write_picture
 from logvggt_jax.reconstruction.exporters.ply import export_ply
-from logvggt_jax.reconstruction.result import POINTS_FILE
+from logvggt_jax.reconstruction.result_folder import POINTS_FILE
 from logvggt_jax.reconstruction.sources.record import record_source
 
 

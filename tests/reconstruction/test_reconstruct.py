@@ -357,7 +357,7 @@ def test_bad_arguments_are_named(
         run(output=result.folder)
     with pytest.raises(ValueError, match="contains the source"):
         run(output=room.parent, overwrite=True)
-    kept = result.folder / "mine"
+    kept = result.folder / "exports"
     kept.mkdir()
     mine = [Path(shutil.copy(picture, kept)) for picture in sorted(room.glob("*.color.png"))[:3]]
     (tmp_path / "walk.txt").write_text("".join(f"{picture}\n" for picture in mine))
@@ -368,7 +368,10 @@ def test_bad_arguments_are_named(
     for source in (tmp_path / "walk.txt", tmp_path / "links", open_source(room, masks=mask)):
         with pytest.raises(InputError, match=rf"output {result.folder} contains \S*, which is read: choose another"):
             run(source, result.folder, overwrite=True)  # type: ignore[arg-type]
-    shutil.rmtree(kept)
+    kept.rename(result.folder / "mine")
+    with pytest.raises(FileExistsError, match="not overwritten: mine in it was not made with it, and would be gone"):
+        run(output=result.folder, overwrite=True)
+    shutil.rmtree(result.folder / "mine")
     shutil.rmtree(tmp_path / "links")
     (tmp_path / "walk.txt").unlink()
     with pytest.raises(ValueError, match="previews must not be negative"):

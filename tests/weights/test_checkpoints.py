@@ -317,6 +317,9 @@ def test_conversion_checks_the_destination_before_it_reads(tmp_path, vggt_file, 
         convert(vggt_file, saved)
     # A hub repository has a description of the same name.
     (tmp_path / "config.json").write_text("{}")
+    with pytest.raises(OutputExists, match=r"notes\.txt in it was not made with it"):
+        convert(vggt_file, tmp_path, overwrite=True)
+    (tmp_path / "notes.txt").unlink()
     with pytest.raises(OutputExists, match="not a model folder"):
         convert(vggt_file, tmp_path, overwrite=True)
 
@@ -328,7 +331,7 @@ def test_conversion_replaces_a_model_folder_only_when_asked(folder, vggt_file, v
     with pytest.raises(InputError, match="no such file"):
         convert(folder.parent / "absent.pt", folder, overwrite=True)
     _assert_same(load_model(folder)[1], small_variables)
-    within = shutil.copy(vggt_file, folder)
+    within = shutil.copy(vggt_file, folder / "params")
     with pytest.raises(InputError, match=rf"output {folder} contains {within}, which is read: choose another output"):
         convert(within, folder, overwrite=True)
     convert(vggt_file, folder, overwrite=True)

@@ -15,7 +15,7 @@ from typing import Protocol
 
 from logvggt_jax.data.formats.nerfstudio_transforms import TRANSFORMS_FILE
 from logvggt_jax.errors import InputError, OutputExists, disk_errors
-from logvggt_jax.files import atomic_folder, check_output, check_space, check_writable, user_path
+from logvggt_jax.files import FolderKind, atomic_folder, check_output, check_space, check_writable, user_path
 from logvggt_jax.reconstruction.exporters.colmap import export_colmap, export_colmap_text
 from logvggt_jax.reconstruction.exporters.depth_exr import export_depth_exr
 from logvggt_jax.reconstruction.exporters.depth_npz import export_depth_npz
@@ -32,7 +32,8 @@ from logvggt_jax.reconstruction.exporters.rosbag import export_rosbag
 from logvggt_jax.reconstruction.exporters.splats import export_splats
 from logvggt_jax.reconstruction.exporters.tum import export_tum
 from logvggt_jax.reconstruction.points.point_filter import PointFilter
-from logvggt_jax.reconstruction.result import EXPORT_FOLDER, Reconstruction
+from logvggt_jax.reconstruction.result import Reconstruction
+from logvggt_jax.reconstruction.result_folder import EXPORT_FOLDER
 
 
 class Exporter(Protocol):
@@ -51,7 +52,7 @@ class Format:
     Attributes:
       write: the exporter.
       file: name of the file or folder that an export makes.
-      marker: a file that every such folder holds; None where a format is one file.
+      folder: what such a folder holds; None where a format is one file.
       needs: the library that it is written with; None for this package's own means.
       picture_bytes: of the pictures that it writes, about, for each pixel of theirs.
       depth_bytes: of its depth, about, for each pixel of the original images, on which it lies, as measured on smooth
@@ -60,7 +61,7 @@ class Format:
 
     write: Exporter
     file: str
-    marker: str | None = None
+    folder: FolderKind | None = None
     needs: str | None = None
     picture_bytes: float = 0.0
     depth_bytes: float = 0.0
@@ -68,21 +69,27 @@ class Format:
 
 # At the quality that pictures are written at.
 _JPEG = 1.0
+_COLMAP, _COLMAP_TEXT = (
+    FolderKind(f"sparse/0/cameras.{suffix}", ("sparse", "images", "masks")) for suffix in ("bin", "txt")
+)
+_NERFSTUDIO = FolderKind(TRANSFORMS_FILE, (TRANSFORMS_FILE, "images", "masks", "points.ply"))
+_PNG, _EXR, _NPZ = (FolderKind(DEPTH_INDEX, (DEPTH_INDEX, f"*.{suffix}")) for suffix in ("png", "exr", "npz"))
+_BAG = FolderKind("metadata.yaml", ("metadata.yaml", "*.db3", "*.mcap"))
 
 EXPORTERS: dict[str, Format] = {
-    "colmap": Format(export_colmap, "colmap", "sparse/0/cameras.bin", "pycolmap", _JPEG),
-    "colmap-text": Format(export_colmap_text, "colmap-text", "sparse/0/cameras.txt", "pycolmap", _JPEG),
-    "nerfstudio": Format(export_nerfstudio, "nerfstudio", TRANSFORMS_FILE, picture_bytes=_JPEG),
+    "colmap": Format(export_colmap, "colmap", _COLMAP, "pycolmap", _JPEG),
+    "colmap-text": Format(export_colmap_text, "colmap-text", _COLMAP_TEXT, "pycolmap", _JPEG),
+    "nerfstudio": Format(export_nerfstudio, "nerfstudio", _NERFSTUDIO, picture_bytes=_JPEG),
     "glb": Format(export_glb, "scene.glb", needs="trimesh"),
     "ply": Format(export_ply, "points.ply"),
     "splats": Format(export_splats, "splats.ply"),
     "tum": Format(export_tum, "tum.txt"),
     "kitti": Format(export_kitti, "kitti.txt"),
     "euroc": Format(export_euroc, "euroc.csv"),
-    "depth-png": Format(export_depth_png, "depth-png", DEPTH_INDEX, depth_bytes=1.5),
-    "depth-exr": Format(export_depth_exr, "depth-exr", DEPTH_INDEX, "OpenEXR", depth_bytes=3.9),
-    "depth-npz": Format(export_depth_npz, "depth-npz", DEPTH_INDEX, depth_bytes=3.6),
-    "rosbag2": Format(export_rosbag, "rosbag2", "metadata.yaml", "rosbags", _JPEG, depth_bytes=4.0),
+    "depth-png": Format(export_depth_png, "depth-png", _PNG, depth_bytes=1.5),
+    "depth-exr": Format(export_depth_exr, "depth-exr", _EXR, "OpenEXR", depth_bytes=3.9),
+    "depth-npz": Format(export_depth_npz, "depth-npz", _NPZ, depth_bytes=3.6),
+    "rosbag2": Format(export_rosbag, "rosbag2", _BAG, "rosbags", _JPEG, depth_bytes=4.0),
 }
 """Formats by name."""
 
@@ -152,7 +159,7 @@ def export(
         folder.mkdir(parents=True, exist_ok=True)
     for name, target in zip(names, targets, strict=True):
         write = EXPORTERS[name].write
-        if EXPORTERS[name].marker is None:
+        if EXPORTERS[name].folder is None:
             write(result, target, point_filter=point_filter, progress=progress)
             continue
         with atomic_folder(target, replace=overwrite) as partial, disk_errors(target):
@@ -162,8 +169,8 @@ def export(
 
 def _checked(target: Path, kind: Format, overwrite: bool) -> Path:
     """The absolute path of an export, if it can go there."""
-    if kind.marker is not None:
-        target = check_output(target, overwrite=overwrite, marker=kind.marker)
+    if kind.folder is not None:
+        target = check_output(target, overwrite=overwrite, kind=kind.folder)
     else:
         target = target.absolute()
         with disk_errors(target):

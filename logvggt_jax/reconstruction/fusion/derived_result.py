@@ -28,12 +28,8 @@ from logvggt_jax.reconstruction.frame_pool import FramePool
 from logvggt_jax.reconstruction.health.recorder import HealthRecorder
 from logvggt_jax.reconstruction.health.report import HEALTH_FILE, HEALTH_PAGE, examine, without_harm, write_health
 from logvggt_jax.reconstruction.previews import write_previews
-from logvggt_jax.reconstruction.result import (
-    POINTS_FILE,
-    TRAJECTORY_FILE,
-    Reconstruction,
-    preview_file,
-)
+from logvggt_jax.reconstruction.result import Reconstruction, preview_file
+from logvggt_jax.reconstruction.result_folder import POINTS_FILE, RESULT, TRAJECTORY_FILE
 from logvggt_jax.streaming import Signals
 
 
@@ -42,7 +38,7 @@ def check_derived(
 ) -> Path:
     """The absolute path for a result that is made from another, and from what else is `read`; OutputExists or
     InputError if it cannot go there."""
-    target = check_output(output, overwrite=overwrite, marker=CAMERAS_FILE)
+    target = check_output(output, overwrite=overwrite, kind=RESULT)
     source = result.folder.resolve()
     if target == source or source in target.parents or target in source.parents:
         raise InputError(f"{target} is the result itself, or one lies in the other: choose another output")
