@@ -21,7 +21,7 @@ from logvggt_jax.errors import DiskError, InputError, OutputExists, disk_errors,
 EMPTY_PATH = "the path is empty (a variable without a value?)"
 _LONGEST_NAME, _LONGEST_SUFFIX = 255, 32  # bytes
 _LOCK, _OWNER = ".lock", ".owner"
-# What they leave in any folder that somebody looks at.
+# What file managers leave in any folder that somebody looks at.
 _OF_FILE_MANAGERS = (".DS_Store", "._*", ".directory", "Thumbs.db", "desktop.ini")
 # A name beside the one that a file is to have: see `_temporary_name`.
 _TEMPORARY = re.compile(r"\..*\.\d+-[0-9a-f]{8}(\.[^.]*)?", re.DOTALL)
@@ -138,8 +138,8 @@ def check_output(output: str | Path, *, overwrite: bool, kind: FolderKind, in_pl
 
     An empty folder that was made beforehand is as good as none. With `overwrite` an existing folder may be replaced
     that is of this `kind` and holds nothing else, so that a slip of the keyboard deletes no other folder, nor what
-    somebody has put into this one. Unless what is written goes `in_place`, into the folder itself, which then may hold
-    what a lock left, a new folder takes its place at the end, which the top of a volume gives up for nobody.
+    somebody has put beside its content. Unless what is written goes `in_place`, into the folder itself, which then may
+    hold what a lock left, a new folder takes its place at the end, which the top of a volume gives up for nobody.
     """
     output = user_path(output, resolved=True)
     with disk_errors(output):
@@ -149,23 +149,25 @@ def check_output(output: str | Path, *, overwrite: bool, kind: FolderKind, in_pl
             return output
         if not overwrite:
             raise _exists(output)
-        replaceable = (output / kind.marker).is_file()
-        known = (*kind.names, *_OF_FILE_MANAGERS)
-        foreign = sorted(
-            entry.name for entry in output.iterdir() if not any(fnmatchcase(entry.name, name) for name in known)
-        )
-    if not replaceable:
-        raise OutputExists(
-            f"{output} is not overwritten: it holds no {kind.marker}, so it is no earlier result; choose another "
-            "output or delete it yourself"
-        )
-    if foreign and not in_place:
+        if not (output / kind.marker).is_file():
+            raise OutputExists(
+                f"{output} is not overwritten: it holds no {kind.marker}, so it is no earlier result; choose another "
+                "output or delete it yourself"
+            )
+        foreign = foreign_entries(output, kind)
+    if foreign:
         others = f" and {len(foreign) - 1} more" if len(foreign) > 1 else ""
         raise OutputExists(
-            f"{output} is not overwritten: {foreign[0]}{others} in it was not made with it, and would be gone; move it "
-            "elsewhere, or choose another output"
+            f"{output} is not overwritten: {foreign[0]}{others} in it is not of an earlier result, and would be "
+            "deleted; move it elsewhere, or choose another output"
         )
     return output
+
+
+def foreign_entries(folder: Path, kind: FolderKind) -> list[str]:
+    """Names in a folder, in order, which folders of this kind do not hold; what lies deeper is not looked at."""
+    known = (*kind.names, *_OF_FILE_MANAGERS)
+    return sorted(entry.name for entry in folder.iterdir() if not any(fnmatchcase(entry.name, name) for name in known))
 
 
 def check_apart(output: Path, read: Iterable[str | Path]) -> None:

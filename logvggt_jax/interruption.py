@@ -91,7 +91,13 @@ def one_line_at_ctrl_c(program: str) -> Iterator[None]:
         if ours:
             signal.signal(signal.SIGINT, signal.default_int_handler)
             # Nothing is left to be done but what libraries clean up, JAX for a second: that would be a traceback.
-            atexit.register(signal.signal, signal.SIGINT, signal.SIG_DFL)
+            atexit.register(_end_at_once)
+
+
+def _end_at_once() -> None:
+    """Lets Ctrl-C end the process from here on, unless somebody else handles it by now."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def _importing(frame: FrameType | None) -> bool:

@@ -109,8 +109,12 @@ def test_only_results_are_overwritten_and_only_when_asked(tmp_path: Path) -> Non
     for overwrite in (False, True):
         with pytest.raises(OutputExists, match=str(target)):
             check_output(target, overwrite=overwrite, kind=DONE)
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputExists, match="it holds no done, so it is no earlier result"):
+        check_output(tmp_path / "file", overwrite=True, kind=DONE)
+    (tmp_path / "file").unlink()
     (target / "done").touch()
-    with pytest.raises(OutputExists, match=r"out is not overwritten: thesis\.tex in it was not made with it"):
+    with pytest.raises(OutputExists, match=r"out is not overwritten: thesis\.tex in it is not of an earlier result"):
         check_output(target, overwrite=True, kind=DONE)
     (target / "thesis.aux").touch()
     with pytest.raises(OutputExists, match=r"thesis\.aux and 1 more in it"):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import jax
@@ -75,7 +74,7 @@ def _wrong_values(images: Any) -> str | None:
     # Pixel by pixel: where one is NaN, the smallest and largest value may on a CPU be those of the others.
     if ((images >= -_SLACK) & (images <= 1 + _SLACK)).all():
         return None
-    low, high = float(images.min()), float(images.max())
     if jnp.isnan(images).any():
-        low = high = math.nan
+        return "values from nan to nan; no pixel may be NaN"
+    low, high = float(images.min()), float(images.max())
     return f"values from {low:g} to {high:g}; divide those of 0 to 255 by 255, or give uint8"

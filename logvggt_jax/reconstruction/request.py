@@ -18,7 +18,7 @@ from logvggt_jax.files import check_apart, check_output, check_space, check_writ
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.operations import matmul_flops_per_second
 from logvggt_jax.reconstruction.calibration import Calibration
-from logvggt_jax.reconstruction.exporters import frame_bytes
+from logvggt_jax.reconstruction.exporters import check_exports, frame_bytes
 from logvggt_jax.reconstruction.points.cloud_file import VERTEX
 from logvggt_jax.reconstruction.points.point_filter import PointFilter
 from logvggt_jax.reconstruction.result_folder import RESULT
@@ -63,6 +63,7 @@ def check_request(
         raise InputError(f"output {output} contains the source {source.path}: choose another output")
     if overwrite or not is_unfinished(target):
         check_output(target, overwrite=overwrite, kind=RESULT)
+        check_exports(target)
     check_apart(target, source.files())
     check_writable(target)
     return target

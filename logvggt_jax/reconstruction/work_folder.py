@@ -54,6 +54,8 @@ class WorkFolder:
         self._lock: FolderLock | None = None
         # Whether the folder was the incomplete result at `output`, and is still as it was.
         self._unchanged_result = False
+        # Whether all is done, and only the place of the result was taken.
+        self._refused = False
 
     def __enter__(self) -> WorkFolder:
         with disk_errors(self.path):
@@ -73,8 +75,9 @@ class WorkFolder:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: object, trace: TracebackType | None) -> None:
-        """Lets go of the folder; without a saved state nobody can use it, and it goes. A result goes back."""
-        if self._progress.is_dir() and not (self._progress / _STATE).is_file():
+        """Lets go of the folder; without a saved state nobody can use it, and it goes. A result goes back; a new one
+        that was refused its place stays."""
+        if self._progress.is_dir() and not (self._progress / _STATE).is_file() and not self._refused:
             shutil.rmtree(self.path, ignore_errors=True)
         elif self._unchanged_result and not self._output.exists():
             self.path.rename(self._output)
@@ -123,7 +126,14 @@ class WorkFolder:
     def commit(self, *, complete: bool) -> None:
         """Puts the folder in the result's place; an incomplete one can still be taken up."""
         with disk_errors(self._output):
-            check_output(self._output, overwrite=self._overwrite, kind=RESULT)
+            try:
+                check_output(self._output, overwrite=self._overwrite, kind=RESULT)
+            except OutputExists as error:  # what is in the way came while the run was at work
+                self._refused = True
+                raise OutputExists(
+                    f"{error}; the new result is whole in {self.path}: give that folder another name, since the same "
+                    "command would begin anew"
+                ) from error
             move_folder(self.path, self._output, replace=self._overwrite)
         if complete:
             shutil.rmtree(self._output / PROGRESS_FOLDER, ignore_errors=True)

@@ -233,6 +233,8 @@ class ChunkSession:
 
     def snapshot(self) -> tuple[list[FrameResult], dict[str, np.ndarray]]:
         """See `Predictor.snapshot`: the images of the chunk to come, and what the next is aligned with."""
+        if self._closed:
+            return [], {}
         final = {f"final/{name}": array for name, array in self._final.arrays().items()}
         loops = {} if self._loops is None else self._loops.arrays()
         return [], {**final, **self._chain.arrays(), **{f"loops/{name}": array for name, array in loops.items()}}

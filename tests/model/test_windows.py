@@ -310,7 +310,9 @@ def test_one_pixel_that_is_no_number_is_found(small_config, small_variables, to_
     """Of so many values XLA gives a smallest and a largest one on a CPU as if that pixel were not there."""
     images = np.full((2, 4, 28, 42, 3), 0.5, np.float32)
     images[1, 3, 4, 5, 0] = np.nan
-    with pytest.raises(ValueError, match=r"images must be floating point in \[0, 1\], got values from nan to nan;"):
+    with pytest.raises(
+        ValueError, match=r"images must be floating point in \[0, 1\], got values from nan to nan; no pixel may"
+    ):
         LogVGGT(small_config).apply(small_variables, to_array(images))
 
 

@@ -162,11 +162,11 @@ def test_poses_of_pictures_that_lie_on_their_side_are_refused(
 @pytest.mark.parametrize(
     ("axes", "clockwise", "how"),
     [
-        ([1, 1, 1], 90, "those of pictures turned clockwise by 90 degrees"),
-        ([1, 1, 1], 180, "those of pictures turned clockwise by 180 degrees"),
-        ([1, 1, 1], 270, "those of pictures turned clockwise by 270 degrees"),
-        ([1, -1, -1], 0, "those with axes x right, y down, z forward instead of y up, z backward"),
-        ([1, -1, -1], 90, "y up, z backward and of pictures turned clockwise by 90 degrees"),
+        ([1, 1, 1], 90, "pictures that have to be turned clockwise by 90 degrees"),
+        ([1, 1, 1], 180, "pictures that have to be turned clockwise by 180 degrees"),
+        ([1, 1, 1], 270, "pictures that have to be turned clockwise by 270 degrees"),
+        ([1, -1, -1], 0, r"OpenGL's axes \(y up, z backward\): give cameras"),
+        ([1, -1, -1], 90, r"z backward\) and pictures that have to be turned clockwise by 90 degrees"),
     ],
 )
 def test_poses_of_turned_cameras_are_refused(

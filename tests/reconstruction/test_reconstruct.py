@@ -357,8 +357,8 @@ def test_bad_arguments_are_named(
         run(output=result.folder)
     with pytest.raises(ValueError, match="contains the source"):
         run(output=room.parent, overwrite=True)
-    kept = result.folder / "exports"
-    kept.mkdir()
+    kept = result.folder / "previews" / "mine"
+    kept.mkdir(parents=True)
     mine = [Path(shutil.copy(picture, kept)) for picture in sorted(room.glob("*.color.png"))[:3]]
     (tmp_path / "walk.txt").write_text("".join(f"{picture}\n" for picture in mine))
     (tmp_path / "links").mkdir()
@@ -369,9 +369,16 @@ def test_bad_arguments_are_named(
         with pytest.raises(InputError, match=rf"output {result.folder} contains \S*, which is read: choose another"):
             run(source, result.folder, overwrite=True)  # type: ignore[arg-type]
     kept.rename(result.folder / "mine")
-    with pytest.raises(FileExistsError, match="not overwritten: mine in it was not made with it, and would be gone"):
+    with pytest.raises(
+        FileExistsError, match="not overwritten: mine in it is not of an earlier result, and would be del"
+    ):
         run(output=result.folder, overwrite=True)
-    shutil.rmtree(result.folder / "mine")
+    trained = result.folder / "exports" / "colmap" / "trained"
+    trained.parent.mkdir(parents=True)
+    (result.folder / "mine").rename(trained)
+    with pytest.raises(FileExistsError, match=rf"is not overwritten: {trained} is not of an export, and would be"):
+        run(output=result.folder, overwrite=True)
+    shutil.rmtree(result.folder / "exports")
     shutil.rmtree(tmp_path / "links")
     (tmp_path / "walk.txt").unlink()
     with pytest.raises(ValueError, match="previews must not be negative"):

@@ -510,3 +510,21 @@ def test_a_killed_process_can_be_taken_up(walk: Path, tmp_path: Path, straight: 
     run(last, walk, output)
     assert last.num_pushed == COUNT - 7 and time.monotonic() - started < 60
     assert contents(output) == straight
+
+
+def test_a_new_result_whose_place_was_taken_stays_where_it_is(tmp_path: Path) -> None:
+    """Somebody has put a file into the earlier result while the run was at work, which was too short to save a state."""
+    output = tmp_path / "walk"
+    output.mkdir()
+    (output / "cameras.json").write_text("{}")
+    with (
+        pytest.raises(
+            OutputExists, match=r"notes\.txt in it is not .*; the new result is whole in .*walk\.partial: give"
+        ),
+        WorkFolder(output, {}, overwrite=True) as work,
+    ):
+        (work.path / "cameras.json").write_text("new")
+        (output / "notes.txt").touch()
+        work.commit(complete=True)
+    assert (output / "notes.txt").is_file() and (output / "cameras.json").read_text() == "{}"
+    assert (tmp_path / "walk.partial" / "cameras.json").read_text() == "new"

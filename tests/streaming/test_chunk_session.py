@@ -63,6 +63,7 @@ def test_misuse_is_named(session: ChunkSession) -> None:
         session.push(np.zeros((15, 28, 3), np.uint8))
     assert len(session.close()) == 2
     assert session.close() == []
+    assert session.snapshot() == ([], {}), "nothing goes on from a closed stream"
     with pytest.raises(ValueError, match="closed"):
         session.push(IMAGES[0])
 

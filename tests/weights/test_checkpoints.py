@@ -317,7 +317,7 @@ def test_conversion_checks_the_destination_before_it_reads(tmp_path, vggt_file, 
         convert(vggt_file, saved)
     # A hub repository has a description of the same name.
     (tmp_path / "config.json").write_text("{}")
-    with pytest.raises(OutputExists, match=r"notes\.txt in it was not made with it"):
+    with pytest.raises(OutputExists, match=r"notes\.txt in it is not of an earlier result"):
         convert(vggt_file, tmp_path, overwrite=True)
     (tmp_path / "notes.txt").unlink()
     with pytest.raises(OutputExists, match="not a model folder"):

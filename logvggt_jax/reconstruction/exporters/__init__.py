@@ -15,7 +15,15 @@ from typing import Protocol
 
 from logvggt_jax.data.formats.nerfstudio_transforms import TRANSFORMS_FILE
 from logvggt_jax.errors import InputError, OutputExists, disk_errors
-from logvggt_jax.files import FolderKind, atomic_folder, check_output, check_space, check_writable, user_path
+from logvggt_jax.files import (
+    FolderKind,
+    atomic_folder,
+    check_output,
+    check_space,
+    check_writable,
+    foreign_entries,
+    user_path,
+)
 from logvggt_jax.reconstruction.exporters.colmap import export_colmap, export_colmap_text
 from logvggt_jax.reconstruction.exporters.depth_exr import export_depth_exr
 from logvggt_jax.reconstruction.exporters.depth_npz import export_depth_npz
@@ -101,6 +109,24 @@ def check_formats(names: Sequence[str]) -> None:
             raise InputError(f"there is no format {name!r}: choose among {', '.join(EXPORTERS)}")
         if (library := EXPORTERS[name].needs) is not None:
             check_library(library)
+
+
+def check_exports(folder: Path) -> None:
+    """Raises OutputExists where something lies among a result's exports, in its `folder`, that no export has made: it
+    would be deleted with the result."""
+    exports = folder / EXPORT_FOLDER
+    if not exports.is_dir():
+        return
+    kinds = {kind.file: kind.folder for kind in EXPORTERS.values()}
+    found = [exports / name for name in foreign_entries(exports, FolderKind("", tuple(kinds)))]
+    for name, kind in kinds.items():
+        if kind is not None and (exports / name).is_dir():
+            found += [exports / name / entry for entry in foreign_entries(exports / name, kind)]
+    if found:
+        raise OutputExists(
+            f"{folder} is not overwritten: {found[0]} is not of an export, and would be deleted; move it elsewhere, or "
+            "choose another output"
+        )
 
 
 def frame_bytes(names: Iterable[str], pictures: tuple[int, int], depth: tuple[int, int]) -> int:

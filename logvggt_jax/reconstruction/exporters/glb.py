@@ -39,9 +39,10 @@ def export_glb(
     """Writes points, frusta of at most 500 cameras, and a camera that is animated along the path.
 
     Axes are glTF's, y up: those of the first camera (x right, y up, z backward), or of a world that poses have brought
-    along, whose axis that points up becomes y and which is else as it was. Its cameras look through the middle of their
-    pictures and keep their lens: the animated one has the median of the focal lengths. The animation has the frames'
-    time stamps from the first on; where they are positions and not times, it shows ten frames a second.
+    along, turned by right angles so that its axis nearest to what is up for the cameras becomes y. The cameras look
+    through the middle of their pictures and keep their lens: the animated one has the median of the focal lengths. The
+    animation has the frames' time stamps from the first on; where they are positions and not times, it shows ten
+    frames a second.
 
     Args:
       result: the reconstruction.

@@ -22,6 +22,7 @@ from logvggt_jax.reconstruction.depth_files import (
     original_file,
     write_depth,
 )
+from logvggt_jax.reconstruction.exporters import check_exports
 from logvggt_jax.reconstruction.exporters.ply import export_ply
 from logvggt_jax.reconstruction.exporters.tum import export_tum
 from logvggt_jax.reconstruction.frame_pool import FramePool
@@ -39,6 +40,7 @@ def check_derived(
     """The absolute path for a result that is made from another, and from what else is `read`; OutputExists or
     InputError if it cannot go there."""
     target = check_output(output, overwrite=overwrite, kind=RESULT)
+    check_exports(target)
     source = result.folder.resolve()
     if target == source or source in target.parents or target in source.parents:
         raise InputError(f"{target} is the result itself, or one lies in the other: choose another output")

@@ -115,6 +115,13 @@ def _depth_note(scales: np.ndarray, before: float, after: float) -> str:
     )
 
 
+def _in_words(way: tuple[bool, int]) -> str:
+    opengl, clockwise = way
+    parts = ["OpenGL's axes (y up, z backward)"] if opengl else []
+    parts += [f"pictures that have to be turned clockwise by {clockwise} degrees"] if clockwise else []
+    return " and ".join(parts)
+
+
 def align(result: Reconstruction, matched: dict[int, ExternalPose], path: str | Path) -> tuple[Similarity, str]:
     """What moves the result's world to that of some poses, by frame, and how well they then agree, in words.
 
@@ -127,12 +134,10 @@ def align(result: Reconstruction, matched: dict[int, ExternalPose], path: str | 
     except NoSimilarity as error:
         raise InputError(f"{path}: {error}") from error
     if turn is not None:
-        how = ["with axes x right, y down, z forward instead of y up, z backward"] if turn.opengl else []
-        how += [f"of pictures turned clockwise by {turn.clockwise} degrees"] if turn.clockwise else []
         raise InputError(
-            f"{path}: the poses fit the frames only as those {' and '.join(how)} (cameras then differ by "
-            f"{turn.after:.1f} degrees, as they are by {turn.before:.1f}): give poses of upright pictures, as frames "
-            "are, with OpenCV's axes"
+            f"{path}: these cameras differ from the frames' by {turn.before:.1f} degrees, and by {turn.after:.1f} if "
+            f"theirs are {', or '.join(map(_in_words, turn.ways))}: give cameras with OpenCV's axes, of pictures as "
+            "upright as the frames"
         )
     moved = similarity.apply_to_extrinsics(result.extrinsics[frames])
     distances = np.linalg.norm(camera_centres(moved) - camera_centres(extrinsics), axis=1)

@@ -15,18 +15,21 @@ _FEWEST = 4
 _APART, _TIMES = 2.0, 3.0
 
 
+# Degrees, and a share, by which a way may fit less well than the best and still be meant.
+_ALIKE, _ALIKE_SHARE = 0.1, 0.1
+
+
 class Turn(NamedTuple):
     """How cameras have to be turned to fit others.
 
     Attributes:
-      opengl: whether their axes are OpenGL's: y up, z backward.
-      clockwise: degrees by which their pictures have to be turned.
+      ways: each whether their axes are OpenGL's (y up, z backward), and the degrees by which their pictures have to be
+        turned clockwise; cameras that turn about one axis alone do not tell all of them apart.
       before: degrees by which cameras differ as they are, the median.
       after: the same once they are turned.
     """
 
-    opengl: bool
-    clockwise: int
+    ways: list[tuple[bool, int]]
     before: float
     after: float
 
@@ -56,5 +59,8 @@ def turn_between(extrinsics: np.ndarray, others: np.ndarray) -> Turn | None:
 
     ways = [(opengl, clockwise) for opengl in (False, True) for clockwise in (0, 90, 180, 270)]
     before, *differences = (difference(*way) for way in ways)
-    after, way = min(zip(differences, ways[1:], strict=True))
-    return Turn(*way, before, after) if before > max(_APART, _TIMES * after) else None
+    after = min(differences)
+    alike = [
+        way for way, each in zip(ways[1:], differences, strict=True) if each <= after * (1 + _ALIKE_SHARE) + _ALIKE
+    ]
+    return Turn(alike, before, after) if before > max(_APART, _TIMES * after) else None

@@ -170,7 +170,7 @@ def _causes(m: Measures, signs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 def _signs(m: Measures) -> dict[str, np.ndarray]:
     scales = np.full(m.num_frames, np.nan)
     missing = _over(m.conflicts, CONFLICTS, CONFLICT_TIMES)
-    no_movement = missing & (_median(m.conflicts) > CLEAN_CONFLICTS)
+    no_movement = np.full(m.num_frames, _median(m.conflicts) > CLEAN_CONFLICTS)
     for first, last in _runs(missing):  # one error makes conflicts of all sizes
         no_movement[first : last + 1] |= (m.conflicts[first : last + 1] > MOST_CONFLICTS).any()
     joints = np.flatnonzero(np.isfinite(m.chunk_scale))

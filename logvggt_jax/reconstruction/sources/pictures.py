@@ -70,8 +70,8 @@ _UPRIGHT = MappingProxyType(
 def read_picture(path: Path, *, orientation: int = 1) -> np.ndarray:
     """The pixels [H, W, 3] uint8 RGB, turned upright by the EXIF orientation that the header gave.
 
-    Grey is repeated, alpha composited over white unless it is 0 throughout, 16 bits a channel become the upper 8, CMYK
-    is converted.
+    Grey is repeated, alpha composited over white unless it is 0 throughout a picture of several colours, 16 bits a
+    channel become the upper 8, CMYK is converted.
 
     Raises:
       BrokenPicture: truncated, damaged or no picture.
@@ -152,7 +152,7 @@ def open_picture(path: Path, stream: IO[bytes]) -> tuple[str, ImageFile.ImageFil
         except (SyntaxError, KeyError) as error:
             if kind == "TIFF" and _is_floating_point(stream):
                 raise not_colours(path, "floating point") from error
-            reason = f"compression {error}" if isinstance(error, KeyError) else one_line(error)
+            reason = f"unknown or missing: {error}" if isinstance(error, KeyError) else one_line(error)
             raise BrokenPicture(
                 f"{path}: damaged, or a {kind} of a kind that is not read ({reason}): fetch it again, or convert it"
             ) from error
@@ -206,8 +206,10 @@ def _colours(path: Path, picture: Image.Image) -> np.ndarray:
             return np.array(picture)
         if picture.has_transparency_data:
             levels = np.array(picture.convert("RGBA"))
-            # Of screenshots and of what game engines render alpha is often 0 throughout, and meant by nobody.
-            return over_white(levels) if levels[..., 3].any() else levels[..., :3].copy()
+            # Of screenshots and of what game engines render alpha is often 0 throughout, and meant by nobody: unless
+            # there is nothing to be seen.
+            meant = levels[..., 3].any() or levels[..., :3].min() == levels[..., :3].max()
+            return over_white(levels) if meant else levels[..., :3].copy()
         return np.array(picture.convert("RGB"))
 
 
@@ -225,8 +227,9 @@ def _misread(tags: TiffImagePlugin.ImageFileDirectory_v2) -> str | None:
         return None
     if tags.get(TiffImagePlugin.PHOTOMETRIC_INTERPRETATION) == 0:
         return "16 bits whose 0 is white"
-    if tags.get(TiffImagePlugin.PLANAR_CONFIGURATION) == 2 and tags.get(TiffImagePlugin.COMPRESSION, 1) == 1:
-        return "16 bits with its colours one after the other (planar) and without compression"
+    planes = tags.get(TiffImagePlugin.PLANAR_CONFIGURATION) == 2 and tags.get(TiffImagePlugin.SAMPLESPERPIXEL, 1) > 1
+    if planes and tags.get(TiffImagePlugin.COMPRESSION, 1) == 1:
+        return "16 bits in planes (planar) and without compression"
     return None
 
 

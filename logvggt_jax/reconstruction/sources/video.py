@@ -316,7 +316,7 @@ def _check_index(path: Path, file: BinaryIO, size: int) -> Iterator[str]:
         )
     # Nothing announces how many fragments there are to be.
     if any(box.kind == b"moof" for box in found) and found[-1].end != size:
-        yield f"{path} lacks its end: the recording or the copy was broken off, and its last frames are missing"
+        yield f"{path} lacks its end: the recording or the copy was broken off, and its last frames may be missing"
     if kinds.count(b"moov") > 1 and b"moof" not in kinds:
         yield (
             f"{path} holds {kinds.count(b'moov')} videos one after the other, of which the first alone is read; join "

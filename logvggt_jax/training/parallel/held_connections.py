@@ -1,8 +1,8 @@
 """The coordinator's connections to the other processes, kept open for a moment after process 0 is killed.
 
-JAX ends a process with a trace of C++ as soon as its connection to the coordinator closes, which lives in process 0. A
+The coordinator lives in process 0, and JAX ends a process with a trace of C++ as soon as its connection to it closes. A
 connection closes with the last process that holds it: a second one, which does nothing else, gives the others the time
-to say in a line who is gone.
+to say in a line who is gone. Where both end at once, with their container or job, the trace may still come.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import subprocess
 from pathlib import Path
 from socket import socket
 
-# The lifeline needs milliseconds.
+# The lifeline needs milliseconds; the rest is room for a busy machine.
 _SECONDS = 5
 _OPEN_FILES = Path("/dev/fd")
 

@@ -84,7 +84,6 @@ def _lifeline() -> Lifeline | None:
         return None
     assert global_state.client is not None and global_state.coordinator_address is not None
     host, coordinator_port = global_state.coordinator_address.rsplit(":", 1)
-    held = HeldConnections(int(coordinator_port)) if process == 0 else None
     try:
         if process == 0:
             secret = secrets.token_hex(16)
@@ -109,6 +108,7 @@ def _lifeline() -> Lifeline | None:
             HEARTBEAT_SECONDS,
         )
         return None
+    held = HeldConnections(int(coordinator_port)) if process == 0 else None
     return Lifeline(peers, process=process, on_loss=end_process, held=held)
 
 

@@ -111,7 +111,8 @@ class RunTimes:
             # The last step of a stage is saved whatever its number.
             saves += step < begin <= end and begin % config.save_every > 0
             compilations += step <= first < end and not stage.clip_shapes <= compiled
-            compiled |= stage.clip_shapes
+            # Of stages that were done before this start, whatever JAX's cache on the disk may hold, nothing is known.
+            compiled |= stage.clip_shapes if begin > step else set()
         validations = 0
         if config.validation is not None:
             every = config.validation.every

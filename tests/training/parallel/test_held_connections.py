@@ -11,7 +11,7 @@ import pytest
 SERVER = """
 import socket
 from logvggt_jax.training.parallel import held_connections
-held_connections._SECONDS = 1
+held_connections._SECONDS = 3
 servers = [socket.create_server(("localhost", 0)) for _ in range(2)]
 ports = [server.getsockname()[1] for server in servers]
 print(*ports, flush=True)
