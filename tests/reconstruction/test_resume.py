@@ -513,7 +513,7 @@ def test_a_killed_process_can_be_taken_up(walk: Path, tmp_path: Path, straight: 
 
 
 def test_a_new_result_whose_place_was_taken_stays_where_it_is(tmp_path: Path) -> None:
-    """Somebody has put a file into the earlier result while the run was at work, which was too short to save a state."""
+    """Somebody has put a file into the earlier result during a run that was too short to save a state."""
     output = tmp_path / "walk"
     output.mkdir()
     (output / "cameras.json").write_text("{}")
