@@ -52,7 +52,9 @@ class _WritesLeftBehind:
 
 def _is_no_write_left_behind(record: logging.LogRecord) -> bool:
     message = record.getMessage()
-    return not (message.startswith("Task exception was never retrieved") and f"{os.sep}orbax{os.sep}" in message)
+    left = message.startswith(("Task exception was never retrieved", "Future exception was never retrieved"))
+    # Orbax's tasks name its code, the futures of its library the error of the operating system alone.
+    return not (left and (f"{os.sep}orbax{os.sep}" in message or "os_error_code=" in message))
 
 
 def _is_not_orbaxs(record: logging.LogRecord) -> bool:

@@ -22,10 +22,17 @@ def test_a_save_says_nothing_and_a_failed_one_its_line_alone(tmp_path, small_con
     told = (
         "Task exception was never retrieved\nfuture: <Task finished coro=<write() at /site/orbax/checkpoint/write.py:1>"
     )
-    left_behind = logging.LogRecord("asyncio", logging.ERROR, "/lib/asyncio/base_events.py", 1, told, None, None)
+    future = (
+        "Future exception was never retrieved\nfuture: <Future finished exception=ValueError('[os_error_code='27']')>"
+    )
+    left_behind = [
+        logging.LogRecord("asyncio", logging.ERROR, "/lib/asyncio/base_events.py", 1, text, None, None)
+        for text in (told, future)
+    ]
     with pytest.raises(DiskError, match="No space left"), writing_with_orbax(tmp_path):
         logging.getLogger("absl").handle(library)
-        logging.getLogger("asyncio").handle(left_behind)
+        for record in left_behind:
+            logging.getLogger("asyncio").handle(record)
         logging.getLogger("absl").error("ours")
         raise ValueError("RESOURCE_EXHAUSTED: Error writing: No space left on device [os_error_code='28']")
     assert [record.getMessage() for record in caplog.records] == ["ours"]
