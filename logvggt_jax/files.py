@@ -154,7 +154,7 @@ def check_output(output: str | Path, *, overwrite: bool, kind: FolderKind, in_pl
                 f"{output} is not overwritten: it holds no {kind.marker}, so it is no earlier result; choose another "
                 "output or delete it yourself"
             )
-        foreign = foreign_entries(output, kind)
+        foreign = foreign_entries(output, kind.names)
     if foreign:
         others = f" and {len(foreign) - 1} more" if len(foreign) > 1 else ""
         raise OutputExists(
@@ -164,9 +164,9 @@ def check_output(output: str | Path, *, overwrite: bool, kind: FolderKind, in_pl
     return output
 
 
-def foreign_entries(folder: Path, kind: FolderKind) -> list[str]:
-    """Names in a folder, in order, which folders of this kind do not hold; what lies deeper is not looked at."""
-    known = (*kind.names, *_OF_FILE_MANAGERS)
+def foreign_entries(folder: Path, names: Iterable[str]) -> list[str]:
+    """What a folder holds beside the patterns `names`, in order; what lies deeper is not looked at."""
+    known = (*names, *_OF_FILE_MANAGERS)
     return sorted(entry.name for entry in folder.iterdir() if not any(fnmatchcase(entry.name, name) for name in known))
 
 

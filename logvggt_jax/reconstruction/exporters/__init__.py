@@ -118,10 +118,10 @@ def check_exports(folder: Path) -> None:
     if not exports.is_dir():
         return
     kinds = {kind.file: kind.folder for kind in EXPORTERS.values()}
-    found = [exports / name for name in foreign_entries(exports, FolderKind("", tuple(kinds)))]
+    found = [exports / name for name in foreign_entries(exports, kinds)]
     for name, kind in kinds.items():
         if kind is not None and (exports / name).is_dir():
-            found += [exports / name / entry for entry in foreign_entries(exports / name, kind)]
+            found += [exports / name / entry for entry in foreign_entries(exports / name, kind.names)]
     if found:
         raise OutputExists(
             f"{folder} is not overwritten: {found[0]} is not of an export, and would be deleted; move it elsewhere, or "
