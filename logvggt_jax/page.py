@@ -19,6 +19,7 @@ tr.own, tr.own td:first-child { background: #e3eefb; } tr.own td:first-child { f
 p.note, li { color: #555; font-size: 0.9rem; }
 pre { background: #f5f5f5; padding: 0.6rem 0.8rem; overflow-x: auto; }
 h1, h2, p, li, figcaption { overflow-wrap: anywhere; }
+.drawings { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 480px), 1fr)); column-gap: 2rem; }
 figure { margin: 1.5rem 0; } img { max-width: 100%; } figcaption { color: #555; font-size: 0.85rem; }
 """
 
@@ -61,3 +62,8 @@ def figure(path: Path, caption: str) -> str:
 def drawing(svg: str, caption: str) -> str:
     """A picture that is SVG text, embedded as it is."""
     return f"<figure>{svg}<figcaption>{html.escape(printable(caption))}</figcaption></figure>"
+
+
+def side_by_side(drawings: Sequence[str]) -> str:
+    """Small pictures, each of `drawing`, as many in a row as fit."""
+    return f'<div class="drawings">{"".join(drawings)}</div>'

@@ -135,8 +135,10 @@ def _page(health: Health, names: Sequence[str]) -> str:
             for each in found
         ]
     parts += [page.heading("Measures"), page.paragraph("Over the frames; doubtful ones are tinted.")]
-    for name, values in measures.arrays().items():
-        if np.isfinite(values).any():
-            title, unit = TITLES[name]
-            parts.append(page.drawing(svg_plot(values, shaded, label=title), f"{title} ({unit})"))
+    plots = [
+        page.drawing(svg_plot(values, shaded, label=TITLES[name][0]), "{} ({})".format(*TITLES[name]))
+        for name, values in measures.arrays().items()
+        if np.isfinite(values).any()
+    ]
+    parts.append(page.side_by_side(plots))
     return page.document("Health of a reconstruction", parts)
