@@ -133,7 +133,7 @@ def _pack(
         task = bar.add_task("Shards", total=count)
         for number in range(count):
             names = [each.name for each in sequences if each.shard == number and each.error is None]
-            found = _whole(output, number, plan, {name: contents[name] for name in names})
+            found = _whole(reader, output, number, plan, {name: contents[name] for name in names})
             if found is not None:
                 shards[number] = found
                 bar.advance(task)
@@ -204,9 +204,11 @@ def _size(reader: Reader, name: str) -> tuple[int, int] | None:
         return None
 
 
-def _whole(output: Path, number: int, plan: str, contents: Mapping[str, str]) -> tuple[PackedShard, list[str]] | None:
+def _whole(
+    reader: Reader, output: Path, number: int, plan: str, contents: Mapping[str, str]
+) -> tuple[PackedShard, list[str]] | None:
     """A shard of an earlier run, and what in it cannot be read; None unless it is what that run wrote, of sequences
-    with these `contents`."""
+    with these `contents`, and what could not be read then cannot now."""
     try:
         notes = read_json_object(notes_file(output, number))
         shard, path = PackedShard(**notes["shard"]), shard_file(output, number)
@@ -214,11 +216,16 @@ def _whole(output: Path, number: int, plan: str, contents: Mapping[str, str]) ->
         packed = {name: notes["sequences"][name]["content"] for name in contents}
         if notes["plan"] != plan or packed != contents or notes["digest"] != json_digest(content):
             return None
+        broken = [(str(name), int(index), str(message)) for name, index, message in notes["broken"]]
         if file_digest(path) != shard.sha256:
             return None
-    except (InputError, LookupError, TypeError):
+    except (InputError, LookupError, TypeError, ValueError):
         return None
-    return shard, list(notes["broken"])
+    # A file that was made readable, or replaced by one of as many bytes, leaves the contents as they were.
+    for name, index, message in broken:
+        if _record(reader, name, index)[1] != message:
+            return None
+    return shard, [message for _, _, message in broken]
 
 
 def _written(
@@ -258,7 +265,7 @@ def _write(
 ) -> tuple[PackedShard, list[str]]:
     path = shard_file(output, number)
     notes: dict[str, Any] = {}
-    broken: list[str] = []
+    broken: list[tuple[str, int, str]] = []
     with atomic_file(path) as temporary:
         with _writing(path):
             writer = _open_writer(temporary)
@@ -267,11 +274,9 @@ def _write(
                 continue
             notes[sequence.name] = _notes(reader, sequence, contents[sequence.name])
             for index in range(sequence.frames):
-                try:
-                    record = frame_record(reader.read(sequence.name, [index]))
-                except Exception as error:  # whatever a decoder raises
-                    broken.append(describe(error))
-                    record = broken_record(broken[-1])
+                record, message = _record(reader, sequence.name, index)
+                if message is not None:
+                    broken.append((sequence.name, index, message))
                 with _writing(path):
                     writer.write(record)
         with _writing(path):
@@ -280,7 +285,16 @@ def _write(
     shard = PackedShard(sum(each.frames for each in sequences), path.stat().st_size, file_digest(path))
     content = {"plan": plan, "shard": asdict(shard), "broken": broken, "sequences": notes}
     write_text(notes_file(output, number), json.dumps({**content, "digest": json_digest(content)}) + "\n")
-    return shard, broken
+    return shard, [message for _, _, message in broken]
+
+
+def _record(reader: Reader, sequence: str, index: int) -> tuple[bytes, str | None]:
+    """The record of a frame, and why it cannot be read, if it cannot."""
+    try:
+        return frame_record(reader.read(sequence, [index])), None
+    except Exception as error:  # whatever a decoder raises
+        message = describe(error)
+        return broken_record(message), message
 
 
 def _notes(reader: Reader, sequence: PackedSequence, content: str) -> dict[str, Any]:

@@ -186,6 +186,22 @@ def test_what_was_corrected_since_is_written_anew_and_nothing_else(tmp_path: Pat
         assert found.content_digest(name) == original.content_digest(name)
 
 
+def test_a_file_that_was_mended_without_a_byte_more_or_less_is_written_anew(tmp_path: Path) -> None:
+    layout = blendedmvs.LAYOUT
+    layout.write(tmp_path / "set", layout.views)
+    depth = tmp_path / "set" / layout.depth
+    whole = depth.read_bytes()
+    depth.write_bytes(b"??" + whole[2:])
+    assert len(pack("blendedmvs", tmp_path / "set", tmp_path / "packed").broken) == 1
+    report = pack("blendedmvs", tmp_path / "set", tmp_path / "packed")
+    assert (report.written, report.kept, len(report.broken)) == (0, 1, 1)
+    depth.write_bytes(whole)
+    report = pack("blendedmvs", tmp_path / "set", tmp_path / "packed")
+    assert (report.written, report.kept, report.broken) == (1, 0, ())
+    original, found = (open_dataset("blendedmvs", tmp_path / each) for each in ("set", "packed"))
+    same(found.read(layout.sequence, range(4)), original.read(layout.sequence, range(4)))
+
+
 def test_damage_beside_the_frames_of_one_scene_keeps_no_other_from_being_packed(tmp_path: Path) -> None:
     layout = blendedmvs.LAYOUT
     layout.write(tmp_path / "set", layout.views)
