@@ -38,6 +38,8 @@ FRAMES_PER_SHARD = 2000
 # One record in a group: a frame is read without its neighbours. Stronger compression takes twice the time for 3 %.
 _WRITER = "group_size:1,zstd:1"
 _SHOWN = 10
+# What a reader raises though the data set is sound: shards of such frames would be worth nothing.
+_NOT_THE_FILES = (ImportError, MemoryError)
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,8 @@ def pack(
     kept as such: reading it back fails with the same message. `workers` processes read at once.
 
     Raises OutputExists where `output` holds something else, InputError where it was begun with other data or settings
-    or another run is at work on it, DiskError where it cannot be written; and as `open_dataset`.
+    or another run is at work on it, DiskError where it cannot be written, MissingPackage where the set's files need a
+    package that is not installed; and as `open_dataset`.
     """
     if frames_per_shard < 1 or workers < 1:
         raise InputError(f"frames per shard and workers must be at least 1, got {frames_per_shard} and {workers}")
@@ -187,6 +190,8 @@ def _placed(reader: Reader, frames_per_shard: int) -> tuple[list[PackedSequence]
             if isinstance(reader, CovisibleDataset):
                 reader.covisibility(name)
             contents[name] = reader.content_digest(name)
+        except _NOT_THE_FILES:
+            raise
         # Whatever a decoder raises: one damaged sequence is not to keep the others from being packed.
         except Exception as reason:
             frames, size, error = 0, None, describe(reason)
@@ -200,6 +205,8 @@ def _placed(reader: Reader, frames_per_shard: int) -> tuple[list[PackedSequence]
 def _size(reader: Reader, name: str) -> tuple[int, int] | None:
     try:
         return reader.image_size(name)
+    except _NOT_THE_FILES:
+        raise
     except Exception:  # as above; its frames are packed as broken ones
         return None
 
@@ -292,6 +299,8 @@ def _record(reader: Reader, sequence: str, index: int) -> tuple[bytes, str | Non
     """The record of a frame, and why it cannot be read, if it cannot."""
     try:
         return frame_record(reader.read(sequence, [index])), None
+    except _NOT_THE_FILES:
+        raise
     except Exception as error:  # whatever a decoder raises
         message = describe(error)
         return broken_record(message), message

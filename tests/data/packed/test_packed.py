@@ -2,12 +2,13 @@
 
 import pickle
 import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from layouts import blendedmvs, seven_scenes
+from layouts import blendedmvs, mvs_synth, seven_scenes
 
 from logvggt_jax.cli import main
 from logvggt_jax.data import open_dataset, training_batches
@@ -15,7 +16,7 @@ from logvggt_jax.data.checks.check import check_copy
 from logvggt_jax.data.feeding.sampling import CovisibleDataset
 from logvggt_jax.data.packed import pack as module
 from logvggt_jax.data.packed.pack import pack
-from logvggt_jax.errors import InputError, OutputExists
+from logvggt_jax.errors import InputError, MissingPackage, OutputExists
 from logvggt_jax.files import atomic_file
 
 NAME = "seven_scenes"
@@ -200,6 +201,15 @@ def test_a_file_that_was_mended_without_a_byte_more_or_less_is_written_anew(tmp_
     assert (report.written, report.kept, report.broken) == (1, 0, ())
     original, found = (open_dataset("blendedmvs", tmp_path / each) for each in ("set", "packed"))
     same(found.read(layout.sequence, range(4)), original.read(layout.sequence, range(4)))
+
+
+def test_a_missing_package_ends_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    mvs_synth.LAYOUT.write(tmp_path / "set", mvs_synth.LAYOUT.views)
+    with monkeypatch.context() as patch, pytest.raises(MissingPackage, match="OpenEXR"):
+        patch.setitem(sys.modules, "OpenEXR", None)
+        pack("mvs_synth", tmp_path / "set", tmp_path / "packed")
+    assert not (tmp_path / "packed/packed.json").exists()
+    assert pack("mvs_synth", tmp_path / "set", tmp_path / "packed").broken == ()
 
 
 def test_damage_beside_the_frames_of_one_scene_keeps_no_other_from_being_packed(tmp_path: Path) -> None:
