@@ -1,6 +1,7 @@
 """What every reader offers, and the checks that its frames pass before they reach a model."""
 
 import abc
+import operator
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -179,8 +180,17 @@ def check_sequence(sequence: str, sequences: Collection[str], where: str) -> Non
 
 
 def check_indices(indices: Sequence[int], num_frames: int, where: str) -> list[int]:
-    """`indices` as a list of integers; raises IndexError naming `where` for none or one outside [0, num_frames)."""
-    checked = [int(i) for i in indices]
+    """`indices` as a list of integers; raises IndexError naming `where` for none, for one outside [0, num_frames), and
+    for what is no whole number, such as a mask or a time."""
+    checked = []
+    for given in indices:
+        try:
+            number = None if isinstance(given, bool) else operator.index(given)
+        except TypeError:
+            number = None
+        if number is None:
+            raise IndexError(f"{where}: {given!r} is no frame's number; give whole numbers from 0 to {num_frames - 1}")
+        checked.append(number)
     if not checked:
         raise IndexError(f"{where}: no frame indices given; ask for at least one of 0 … {num_frames - 1}")
     for index in checked:

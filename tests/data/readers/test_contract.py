@@ -204,9 +204,10 @@ def test_sequences_and_frames_that_are_not_there_are_refused(layout: Layout, tmp
     dataset = opened(layout, tmp_path)
     with pytest.raises(KeyError, match="no sequence 'nowhere'"):
         dataset.read("nowhere", [0])
-    for indices in ([len(layout.views)], [-1], []):
+    for indices in ([len(layout.views)], [-1], [], [0.7], [np.float32(1)], [True], ["1"], np.ones(2, bool)):
         with pytest.raises(IndexError):
             dataset.read(layout.sequence, indices)
+    assert len(dataset.read(layout.sequence, np.array([1, 0], np.uint8)).images) == 2
 
 
 @every_set
