@@ -194,7 +194,15 @@ def _text_images(text: str, path: Path) -> Iterator[ColmapImage]:
             )
         values = numbers(" ".join(words[:9]), where, count=9)
         yield _image(words[9].strip(), whole_number(values[8], where), values[1:8], where)
-        next(lines, None)  # its keypoints, an empty line where it has none
+        number, keypoints = next(lines, (number, ""))
+        # The number of the last one's point. Files that others write may lack the line, and every second picture's
+        # would then be taken for it.
+        last = keypoints.rsplit(maxsplit=1)[-1:]
+        if last and not last[0].lstrip("-").isdecimal():
+            raise InputError(
+                f"{path}, line {number}: expected the keypoints of the picture in the line above it, or an empty line "
+                f"where it has none, got {keypoints[:60]!r}: write the line that is missing"
+            )
 
 
 def _binary_cameras(binary: "_Binary") -> Iterator[tuple[int, ColmapCamera]]:

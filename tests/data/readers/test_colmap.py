@@ -112,6 +112,12 @@ def test_distortion_that_is_not_opencvs_is_refused_by_name_with_the_mend(tmp_pat
         ("cameras", " 48 ", " 0 ", r"cameras\.txt, line 2: expected a width and height from 1"),
         ("cameras", "3 PIN", "4 PIN", r"cameras\.txt: no camera 3, which .*images\.txt names"),
         ("images", " 3 view10.png", "", r"images\.txt, line 5: expected a picture's number"),
+        (
+            "images",
+            "view11.png\n\n",
+            "view11.png\n",
+            r"images\.txt, line 4: expected the keypoints of .* line above it",
+        ),
         ("images", "view10.png", "/view10.png", r"images\.txt: '/view10\.png' is no file's name"),
         ("images", "view10.png", "view12.png", r"view12\.png: no such file, but .*images\.txt names it"),
     ],
