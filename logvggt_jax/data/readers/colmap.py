@@ -25,10 +25,10 @@ from logvggt_jax.data.formats.ordering import natural_order
 from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame, read_depth_of
 from logvggt_jax.data.readers.own_recordings import (
-    file_below,
     find_recordings,
     is_picture,
     names_beside,
+    pictures_below,
     without_distortion,
 )
 from logvggt_jax.errors import InputError
@@ -70,7 +70,7 @@ class Colmap(FolderDataset):
         camera_file, cameras = read_cameras(files, model)
         image_file, images = read_images(files, model)
         images = [images[position] for position in natural_order([image.name for image in images])]
-        paths = [file_below(pictures, image.name, image_file) for image in images]
+        paths = pictures_below(pictures, [image.name for image in images], image_file)
         names = {pictures: set(files.names(pictures, self.expects)), **names_beside(files, paths, image_file)}
         used = {image.camera for image in images}
         known = {number: _camera(cameras, number, camera_file, image_file) for number in used}

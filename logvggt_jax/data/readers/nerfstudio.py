@@ -6,9 +6,9 @@ Layout: the root is such a recording, or holds folders that are. `transforms.jso
   the first one at (0.5, 0.5). Of distortion `k1`, `k2`, `k3`, `p1`, `p2`, or with the `camera_model` `OPENCV_FISHEYE`
   (or instant-ngp's `is_fisheye`) `k1` … `k4`, each 0 where it is left out; other models than `PINHOLE`,
   `SIMPLE_PINHOLE`, `SIMPLE_RADIAL`, `RADIAL`, `OPENCV` and that are refused;
-- `frames`, each with a `file_path` relative to the recording, a `transform_matrix` (camera-to-world, [4, 4], axes of
-  OpenGL: x right, y up, z back) and for depth a `depth_file_path`: 16-bit, thousandths of the poses' unit of length, 0
-  where invalid, z and not ray length.
+- `frames`, each with a `file_path` relative to the recording (its suffix may be left out), a `transform_matrix`
+  (camera-to-world, [4, 4], axes of OpenGL: x right, y up, z back) and for depth a `depth_file_path`: 16-bit,
+  thousandths of the poses' unit of length, 0 where invalid, z and not ray length.
 """
 
 import math
@@ -27,7 +27,14 @@ from logvggt_jax.data.formats.nerfstudio_transforms import CAMERA, TRANSFORMS_FI
 from logvggt_jax.data.formats.ordering import natural_order
 from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame, read_depth_of
-from logvggt_jax.data.readers.own_recordings import file_below, find_recordings, names_beside, without_distortion
+from logvggt_jax.data.readers.own_recordings import (
+    file_below,
+    find_recordings,
+    names_beside,
+    pictures_below,
+    with_suffixes,
+    without_distortion,
+)
 from logvggt_jax.errors import InputError
 
 _DEPTH_UNITS = 1000.0
@@ -65,11 +72,12 @@ class Nerfstudio(FolderDataset):
         content = read_json(files.text(path, "cameras and frames in nerfstudio's form"), path)
         with expecting(path, "an object with a list of frames"):
             entries = [{**content, **entry} for entry in content["frames"]]
-            images = [file_below(folder, text_of(entry["file_path"]), path) for entry in entries]
+            images = pictures_below(folder, [text_of(entry["file_path"]) for entry in entries], path)
             depths = [
                 file_below(folder, text_of(entry["depth_file_path"]), path) if entry.get("depth_file_path") else None
                 for entry in entries
             ]
+        images = with_suffixes(files, images, path)
         names_beside(files, [file for file in (*images, *depths) if file is not None], path)
         names = [str(image.relative_to(folder)) for image in images]
         for place in natural_order(names):

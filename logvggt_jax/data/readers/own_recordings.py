@@ -43,6 +43,31 @@ def file_below(folder: Path, name: str, named_by: Path) -> Path:
     return folder / relative
 
 
+def pictures_below(folder: Path, names: Iterable[str], named_by: Path) -> list[Path]:
+    """The pictures of these names in the list `named_by`; InputError as `file_below`, and for one named twice."""
+    paths: dict[Path, None] = {}
+    for name in names:
+        path = file_below(folder, name, named_by)
+        if path in paths:
+            raise InputError(f"{named_by}: {name!r} is named twice: remove one of them")
+        paths[path] = None
+    return list(paths)
+
+
+def with_suffixes(files: SourceFiles, paths: Iterable[Path], named_by: Path) -> list[Path]:
+    """The paths, one without a suffix being the only picture there of that name with one: Blender's scripts and
+    instant-ngp leave it out. MissingFiles where a folder is not there."""
+    completed = list(paths)
+    for folder in {path.parent for path in completed if not path.suffix}:
+        held = [folder / name for name in files.names(folder, f"the files that {named_by} names")]
+        of_name: dict[Path, list[Path]] = {path: [path] for path in held if not path.suffix}
+        for picture in filter(is_picture, held):
+            of_name.setdefault(picture.with_suffix(""), []).append(picture)
+        chosen = {path: same[0] for path, same in of_name.items() if len(same) == 1 or same[0] == path}
+        completed = [chosen.get(path, path) for path in completed]
+    return completed
+
+
 def names_beside(files: SourceFiles, paths: Iterable[Path], named_by: Path) -> dict[Path, set[str]]:
     """The names in each folder of the files that the list `named_by` names; MissingFiles for those not there."""
     paths = list(paths)

@@ -9,6 +9,7 @@ import pytest
 from layouts.nerfstudio import LAYOUT, NAME, NAMES
 
 from logvggt_jax.data import open_dataset
+from logvggt_jax.errors import InputError
 
 
 @pytest.fixture
@@ -47,3 +48,21 @@ def test_where_some_have_depth_those_without_do_not_count(recording: Path):
     edit(recording, lambda content: content["frames"][0].pop("depth_file_path"))
     dataset = open_dataset("nerfstudio", recording)
     assert dataset.num_frames(NAME) == 3 and dataset.dropped_frames(NAME) == {"no depth": 1}
+
+
+def test_pictures_named_without_their_suffix_are_found(recording: Path):
+    expected = open_dataset("nerfstudio", recording).read(NAME, range(4))
+    edit(recording, lambda content: [e.update(file_path=e["file_path"][: -len(".png")]) for e in content["frames"]])
+    (recording / "images/frame_8_mask.png").touch()
+    dataset = open_dataset("nerfstudio", recording)
+    assert dataset.frame_names(NAME) == list(NAMES)
+    np.testing.assert_array_equal(dataset.read(NAME, range(4)).images, expected.images)
+    (recording / "images/frame_9.jpg").touch()
+    with pytest.raises(InputError, match=r"images/frame_9: no such file, but .*transforms\.json names it"):
+        open_dataset("nerfstudio", recording).num_frames(NAME)
+
+
+def test_a_picture_that_is_named_twice_is_refused(recording: Path):
+    edit(recording, lambda content: content["frames"].append(content["frames"][1]))
+    with pytest.raises(InputError, match=r"transforms\.json: '\./images/frame_10\.png' is named twice"):
+        open_dataset("nerfstudio", recording).num_frames(NAME)
