@@ -167,7 +167,7 @@ def listed_files(path: Path, files: SourceFiles) -> tuple[np.ndarray, list[Path]
     """Times [n] and files of a list `time file`, in order of time; every file is there."""
     entries: dict[Path, float] = {}
     for line, text in content_lines(files.text(path, "lines 'time file'")):
-        words = text.split()
+        words = text.split(maxsplit=1)  # names may have spaces
         if len(words) != 2:
             raise InputError(f"{path}, line {line}: expected 'time file', got {text!r}: fetch the file again")
         file = path.parent / words[1]

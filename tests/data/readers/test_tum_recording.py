@@ -47,6 +47,13 @@ def test_suffixes_as_cameras_write_them_and_a_calibration_with_tabs_are_read(rec
     check_views(TUMRecording(recording).read(NAME, range(5)), VIEWS, **ERRORS)
 
 
+def test_listed_names_may_have_spaces(recording: Path):
+    (recording / "rgb").rename(recording / "left camera")
+    listing = recording / "rgb.txt"
+    listing.write_text(listing.read_text().replace("rgb/", "left camera/"))
+    check_views(TUMRecording(recording).read(NAME, range(5)), VIEWS, **ERRORS)
+
+
 @pytest.mark.parametrize(("table", "kind"), [("groundtruth.txt", "poses"), ("depth.txt", "depth")])
 def test_recorders_with_clocks_of_their_own_are_told_apart(recording: Path, table: str, kind: str):
     lines = [line.split() for line in (recording / table).read_text().splitlines() if not line.startswith("#")]
