@@ -42,11 +42,12 @@ def open_regular(path: str | Path) -> Iterator[BinaryIO]:
 
 
 def read_json(path: str | Path, mend: str) -> Any:
-    """What a JSON file holds. Raises InputError ending in `mend` where it is no JSON, others as `open_regular`."""
+    """What a JSON file holds, which may begin with a byte order mark. Raises InputError ending in `mend` where it is no
+    JSON, others as `open_regular`."""
     with open_regular(path) as stream:
         content = stream.read()
     try:
-        return json.loads(content.decode())
+        return json.loads(content.decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not valid JSON ({one_line(error):.200}); {mend}") from error
 

@@ -1,5 +1,6 @@
 """What a file holds, by its first bytes: suffixes of checkpoints say nothing."""
 
+import codecs
 import re
 from pathlib import Path
 from typing import Literal
@@ -49,7 +50,7 @@ def content_of(path: Path) -> Content:
     for mark, name, mend in _OTHERS:
         if re.match(mark, start, re.DOTALL):
             raise InputError(f"{path}: {name}; {mend}")
-    if start.lstrip()[:1] in (b"{", b"["):
+    if start.removeprefix(codecs.BOM_UTF8).lstrip()[:1] in (b"{", b"["):
         return "json"
     if not start:
         raise InputError(f"{path}: an empty file, truncated to nothing; {_AGAIN}")

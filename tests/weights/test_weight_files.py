@@ -162,6 +162,14 @@ def test_all_shards_of_an_index_are_read(tmp_path, write_torch_file, torch):
         open_state_dict(tmp_path)
 
 
+def test_an_index_may_begin_with_a_byte_order_mark(tmp_path, write_torch_file):
+    index = _write_shards(tmp_path, write_torch_file, torch=False)
+    index.write_text(index.read_text(), encoding="utf-8-sig")
+    for path in (tmp_path, index):
+        with open_state_dict(path) as found:
+            assert set(found) == {"a", "b"}
+
+
 def test_an_index_that_does_not_fit_is_refused(tmp_path, write_torch_file):
     index = _write_shards(tmp_path, write_torch_file, torch=False)
     good = json.loads(index.read_text())["weight_map"]
