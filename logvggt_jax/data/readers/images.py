@@ -1,13 +1,16 @@
 """Pictures of videos, nothing else: what a teacher can label.
 
 Layout: the root is a folder of pictures, or holds folders of pictures; subfolders of those are not looked into. Frames
-are in the natural order of their names (`img2` before `img10`), which is taken for their order in time.
+are in the natural order of their names (`img2` before `img10`), which is taken for their order in time. HEIC and AVIF
+pictures are not read and do not count.
 """
 
+import contextlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
+from absl import logging
 
 from logvggt_jax.data.dataset import TRAINING, About
 from logvggt_jax.data.errors import MissingFiles
@@ -17,6 +20,9 @@ from logvggt_jax.data.formats.ordering import natural_order
 from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.data.readers.folder_dataset import NO_POSES, Dropped, FolderDataset, FrameRecord, frame
 from logvggt_jax.data.readers.own_recordings import find_recordings, is_picture
+from logvggt_jax.errors import DiskError
+
+_NOT_READ = frozenset({".avif", ".heic", ".heif", ".hif"})
 
 
 class Images(FolderDataset):
@@ -36,14 +42,34 @@ class Images(FolderDataset):
     about = About(source="film it", licence="your own", size="your own", roles=(TRAINING,))
 
     def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
-        return find_recordings(self.root, files, self.expects, lambda folder: _pictures(folder, files))
+        found = find_recordings(self.root, files, self.expects, lambda folder: _pictures(folder, files))
+        if self.root in found.values() and (hidden := self._hidden_recordings(files)):
+            logging.warning(
+                "%s is a sequence itself, of %s and others: folders of pictures in it are not looked into (%s)",
+                self.root,
+                _pictures(self.root, files)[0],
+                ", ".join(hidden[:3]) + (" …" if len(hidden) > 3 else ""),
+            )
+        return found
+
+    def _hidden_recordings(self, files: SourceFiles) -> list[str]:
+        """Folders of pictures in a root that is a recording itself."""
+        hidden = []
+        for name, folder in files.folders(self.root, "folders of pictures").items():
+            with contextlib.suppress(DiskError):  # nobody asked for it
+                if not name.startswith(".") and _pictures(folder, files):
+                    hidden.append(name)
+        return hidden
 
     def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
         names = _pictures(folder, files)
         if not names:
             raise MissingFiles(f"{folder}: no pictures; expected {self.expects}")
         nominal = pinhole(1.0, 1.0, 0.0, 0.0)
-        for place in natural_order(names):
+        for place in natural_order([Path(name).stem for name in names]):
+            if Path(names[place]).suffix.lower() in _NOT_READ:
+                yield Dropped("HEIC or AVIF: convert it to JPEG")
+                continue
             path = folder / names[place]
             yield frame(path, path, nominal, NO_POSES, name=names[place])
 
@@ -56,4 +82,7 @@ class Images(FolderDataset):
 
 
 def _pictures(folder: Path, files: SourceFiles) -> list[str]:
-    return [name for name in files.names(folder, "pictures") if is_picture(Path(name))]
+    """Names of a folder's pictures, of those that are not read as well."""
+    names = files.names(folder, "pictures")
+    unread = {name for name in names if Path(name).suffix.lower() in _NOT_READ and not name.startswith(".")}
+    return [name for name in names if name in unread or is_picture(Path(name))]

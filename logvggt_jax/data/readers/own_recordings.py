@@ -15,7 +15,7 @@ from logvggt_jax.errors import InputError
 
 # OpenCV's limit for a side of what it maps.
 _MOST_PIXELS = 2**15 - 1
-_PICTURE_SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
+_PICTURE_SUFFIXES = frozenset({".bmp", ".jfif", ".jpe", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
 
 
 def is_picture(path: Path) -> bool:

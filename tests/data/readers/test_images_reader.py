@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from absl import logging
 from room_views import write_image
 
 from logvggt_jax.data import check_frames, open_dataset
@@ -38,6 +39,36 @@ def test_what_is_hidden_is_no_picture(tmp_path: Path):
     (write_video(tmp_path / "walk") / "._img1.png").write_bytes(b"\0\5\x16\7 what macOS knows of it")
     dataset = open_dataset("images", tmp_path)
     assert dataset.sequences == ("walk",) and dataset.frame_names("walk") == ["img1.png", "img2.png", "img10.png"]
+
+
+def test_moments_before_the_first_are_in_their_order(tmp_path: Path):
+    for time in ("-1.5", "-0.5", "0.25", "1"):
+        write_image(tmp_path / f"walk/{time}.png", np.zeros((28, 42, 3), np.uint8))
+    names = open_dataset("images", tmp_path).frame_names("walk")
+    assert names == ["-1.5.png", "-0.5.png", "0.25.png", "1.png"]
+
+
+def test_jpegs_of_other_suffixes_are_read_and_heic_is_counted_as_left_out(tmp_path: Path):
+    write_image(tmp_path / "walk/1.jpg", np.full((28, 42, 3), 9, np.uint8))
+    (tmp_path / "walk/1.jpg").rename(tmp_path / "walk/1.JFIF")
+    (tmp_path / "walk/2.heic").write_bytes(b"\0\0\0\x18ftypheic")
+    (tmp_path / "phone").mkdir()
+    (tmp_path / "phone/1.HEIC").write_bytes(b"\0\0\0\x18ftypheic")
+    dataset = open_dataset("images", tmp_path)
+    assert dataset.read("walk", [0]).images[0, 0, 0].tolist() == [9, 9, 9]
+    assert dataset.dropped_frames("walk") == {"HEIC or AVIF: convert it to JPEG": 1}
+    with pytest.raises(InputError, match=r"phone: no frame .*'HEIC or AVIF: convert it to JPEG': 1"):
+        dataset.num_frames("phone")
+
+
+def test_a_picture_that_hides_folders_of_pictures_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    told: list[str] = []
+    monkeypatch.setattr(logging, "warning", lambda text, *values: told.append(text % values))
+    write_video(tmp_path / "walk")
+    assert open_dataset("images", tmp_path).sequences == ("walk",) and not told
+    write_image(tmp_path / "cover.png", np.zeros((28, 42, 3), np.uint8))
+    assert open_dataset("images", tmp_path).sequences == (tmp_path.name,)
+    assert len(told) == 1 and "cover.png" in told[0] and "not looked into (walk)" in told[0]
 
 
 def test_the_root_itself_may_hold_the_pictures(tmp_path: Path):
