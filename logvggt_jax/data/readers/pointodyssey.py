@@ -5,6 +5,7 @@ the latter's arrays `intrinsics` [T, 3, 3] (pixels) and `extrinsics` [T, 4, 4] (
 read; the point tracks beside them, a hundred times larger, are not. Depth is 16-bit, 65535 for 1000 m.
 """
 
+import re
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
@@ -22,6 +23,8 @@ from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, Fram
 from logvggt_jax.errors import InputError
 
 _FULL_SCALE, _FAR = 65535, 1000.0  # the stored value of `_FAR` metres
+# Not what file managers and network storage leave beside them, such as .thumbnails and @eaDir.
+_SEQUENCE = re.compile(r"[A-Za-z0-9][\w-]*")
 _SPLITS = ("train", "val", "test")
 # Only in the archives of later releases; v1.0 has other camera axes under the same names.
 _LATER_ARRAY = "valids"
@@ -52,7 +55,9 @@ class PointOdyssey(FolderDataset):
         return {
             f"{split}/{name}": folder
             for split in chosen
-            for name, folder in files.folders(self.root / split, f"the sequences of this split of {self.title}").items()
+            for name, folder in files.folders(
+                self.root / split, f"the sequences of this split of {self.title}", _SEQUENCE
+            ).items()
         }
 
     def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:

@@ -211,6 +211,23 @@ def test_sequences_and_frames_that_are_not_there_are_refused(layout: Layout, tmp
 
 
 @every_set
+def test_what_file_managers_and_network_storage_leave_is_passed_over(layout: Layout, tmp_path: Path):
+    layout.write(tmp_path, layout.views)
+    before = opened(layout, tmp_path)
+    frames = before.frame_names(layout.sequence)
+    for folder in [tmp_path, *(path for path in tmp_path.rglob("*") if path.is_dir())]:
+        for path in list(folder.iterdir()):
+            (folder / f"._{path.name}").write_bytes(b"\0\5\x16\7")
+        for name in (".DS_Store", "Thumbs.db", "desktop.ini"):
+            (folder / name).write_bytes(b"\0")
+        for name in ("@eaDir", ".ipynb_checkpoints"):
+            (folder / name).mkdir()
+    after = opened(layout, tmp_path)
+    assert after.sequences == before.sequences and after.frame_names(layout.sequence) == frames
+    assert after.dropped_frames(layout.sequence) == {}
+
+
+@every_set
 def test_a_copy_can_be_sent_to_a_worker(layout: Layout, tmp_path: Path):
     layout.write(tmp_path, layout.views)
     dataset = opened(layout, tmp_path)
