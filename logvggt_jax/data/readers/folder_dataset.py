@@ -333,10 +333,16 @@ def _packed(listing: Listing, root: Path) -> bytes:
     """A listing as the bytes of an npz file, a column for each field of its records."""
     columns: dict[str, Any] = {name: [getattr(record, name) for record in listing.frames] for name in _FIELDS}
     for name in _PATHS:
-        columns[name] = ["" if path is None else os.path.relpath(path, root) for path in columns[name]]
+        columns[name] = ["" if path is None else _stored(path, root) for path in columns[name]]
     buffer = io.BytesIO()
     np.savez(buffer, dropped=json.dumps(dict(listing.dropped)), **columns)
     return buffer.getvalue()
+
+
+def _stored(path: Path, root: Path) -> str:
+    """A path that, joined to `root`, is the same file. Those of lists may lead out of it, and `..` after a link to a
+    folder is not the folder before it."""
+    return str(path.relative_to(root) if path.is_relative_to(root) else path.absolute())
 
 
 def _unpacked(payload: bytes, root: Path) -> Listing | None:

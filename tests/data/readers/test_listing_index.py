@@ -10,9 +10,11 @@ from pathlib import Path
 
 import pytest
 from absl import logging
+from layouts import tum_recording
 from layouts.layout import VIEWS
 from layouts.replica import write, write_camera, write_scene
 
+from logvggt_jax.data import open_dataset
 from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.data.readers import folder_dataset
 from logvggt_jax.data.readers.listing_index import ListingIndex, code_digest
@@ -82,6 +84,21 @@ def test_the_second_start_reads_nothing_and_gives_the_same(root: Path, reads: Co
     assert not reads
     for name in ("images", "depth", "intrinsics", "extrinsics"):
         assert (getattr(frames, name) == getattr(expected, name)).all()
+
+
+@pytest.mark.parametrize("absolute", [True, False])
+def test_files_that_lists_name_outside_of_a_linked_root_are_found_again(tmp_path: Path, absolute: bool):
+    tum_recording.write(tmp_path / "far/away/set", tum_recording.LAYOUT.views)
+    recording = tmp_path / "far/away/set" / tum_recording.NAME
+    (recording / "rgb").rename(tmp_path / "far/away/pictures")
+    listing = recording / "rgb.txt"
+    place = tmp_path / "far/away/pictures" if absolute else "../../pictures"
+    listing.write_text(listing.read_text().replace("rgb/", f"{place}/"))
+    (tmp_path / "here/in").mkdir(parents=True)
+    (tmp_path / "here/in" / recording.name).symlink_to(recording)
+    (tmp_path / "set").symlink_to(tmp_path / "here/in")
+    for _ in range(2):  # listed, then from the index
+        assert len(open_dataset("tum_recording", tmp_path / "set").read(recording.name, [0, 1]).images) == 2
 
 
 def test_an_open_set_looks_at_its_files_once(root: Path, monkeypatch: pytest.MonkeyPatch):
