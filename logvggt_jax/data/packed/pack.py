@@ -92,6 +92,8 @@ def pack(
         raise InputError(f"frames per shard and workers must be at least 1, got {frames_per_shard} and {workers}")
     if is_packed(root):
         raise InputError(f"{root} is packed already")
+    if name in READERS and not READERS[name].needs_root:
+        raise InputError(f"{name} are made when they are read: there is no copy to pack")
     output = user_path(output).absolute()
     check_writable(output)
     reader = open_dataset(name, root, split, **options)

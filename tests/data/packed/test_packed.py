@@ -252,6 +252,8 @@ def test_another_set_split_option_or_plan_is_refused(scenes: Path, packed: Path,
         check_copy(NAME, packed)
     with pytest.raises(InputError, match="is packed already"):
         pack(NAME, packed, tmp_path / "twice")
+    with pytest.raises(InputError, match="rooms are made when they are read: there is no copy to pack"):
+        pack("rooms", tmp_path, tmp_path / "rooms")
 
 
 def test_sequences_of_another_split_are_known_by_name_alone(scenes: Path, tmp_path: Path) -> None:
