@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from logvggt_jax.data.checks.consistency import depth_consistency, visible_shares
+from logvggt_jax.data.checks.mistakes import figures, mend
 from logvggt_jax.data.checks.picture import check_picture_path, write_check_picture
 from logvggt_jax.data.checks.plausibility import complaints
 from logvggt_jax.data.checks.report import CheckReport, DepthRange, Problem, SequenceReport
@@ -162,10 +163,11 @@ def _check_sequence(
     has_poses = bool(np.isfinite(extrinsics).all())
     wanted = range(count) if all_images else evenly_spaced(count, _SAMPLE)
     frames = _decode(dataset, sequence, wanted, pool, problems)
-    figure, compared = None, None
+    figure, compared, mended = None, None, None
     if has_poses:
-        figure, compared = _consistency(dataset, sequence, extrinsics, set(wanted) - set(frames), problems)
-    if figure is not None and figure > INCONSISTENT:
+        figure, compared, mended = _consistency(dataset, sequence, extrinsics, set(wanted) - set(frames), problems)
+    if figure is not None and (figure > INCONSISTENT or mended):
+        expected = f"median; up to {INCONSISTENT:.0%} expected"
         cause = "poses, intrinsics or depth belong to another sequence or another release: fetch the sequence again"
         if dataset.own:
             cause = (
@@ -175,7 +177,7 @@ def _check_sequence(
         problems.add(
             "inconsistent depth and poses",
             f"{dataset.root}, {sequence}: depth carried into another frame differs from the depth there by "
-            f"{figure:.0%} (median; up to {INCONSISTENT:.0%} expected): {cause}",
+            f"{figure:.1%} ({f'it would by {mended}' if mended else expected}): {cause}",
         )
     decoded = list(frames)
     return SequenceReport(
@@ -253,10 +255,10 @@ def _depth_range(frames: Iterable[_Frame]) -> DepthRange | None:
 
 def _consistency(
     dataset: FolderDataset, sequence: str, extrinsics: np.ndarray, broken: set[int], problems: _Problems
-) -> tuple[float | None, float | None]:
-    """Medians of difference and share over a few pairs of frames that are not known to be broken; None where no two
-    see the same."""
-    compared = []
+) -> tuple[float | None, float | None, str | None]:
+    """Medians of difference and share over a few pairs of frames that are not known to be broken, None where no two
+    see the same; and of own recordings what would mend the difference, if that is known."""
+    compared, tried = [], []
     # Neither the first nor the last frame: those have neighbours on one side only.
     for index in sorted(set(evenly_spaced(len(extrinsics), _PAIRS + 2)[1:-1] or [0])):
         try:
@@ -266,13 +268,16 @@ def _consistency(
             seen = visible_shares(dataset.read(sequence, [index]), 0, extrinsics[candidates])
             # The first that sees enough; failing that, the one that sees most.
             partner = candidates[int(np.argmax(np.minimum(seen, _MIN_VISIBLE)))]
-            result = depth_consistency(dataset.read(sequence, [index, partner]), 0, 1)
+            pair = dataset.read(sequence, [index, partner])
+            result = depth_consistency(pair, 0, 1)
         except Exception as error:
             problems.add_error(error)
             continue
         if result.share >= _MIN_COMPARED:
             compared.append(result)
+            if dataset.own:
+                tried.append(figures(pair))
     if not compared:
-        return None, None
+        return None, None, None
     difference, share = np.median(compared, axis=0)
-    return float(difference), float(share)
+    return float(difference), float(share), mend(np.stack(tried)) if tried else None

@@ -40,6 +40,26 @@ def depth_consistency(frames: Frames, first: int, second: int) -> Consistency:
     return Consistency(float(difference), float(known.sum() / len(points)))
 
 
+def differences(frames: Frames, relative: np.ndarray) -> np.ndarray:
+    """As the difference of `depth_consistency` from the first to the second of `frames`, of a few pixels, for cameras
+    that are to each other as `relative` [M, 4, 4] says, from points of the first to points of the second: [M].
+
+    Infinite where less than half as many pixels can be compared as for the first of them.
+    """
+    depth, found = frames.depth[0].astype(np.float64), frames.depth[1].astype(np.float64)
+    points = unproject(depth, frames.intrinsics[0].astype(np.float64))[depth > 0]
+    points = points[:: max(1, len(points) // _POINTS)]
+    result, least = np.full(len(relative), np.inf), 1.0
+    for index, pose in enumerate(relative):
+        u, v, z = _pixels(points, frames.intrinsics[1], pose, found.shape)
+        known = found[v, u] > 0
+        if index == 0:
+            least = max(1.0, known.sum() / 2)
+        if known.sum() >= least:
+            result[index] = np.median(np.abs(found[v, u][known] - z[known]) / found[v, u][known])
+    return result
+
+
 def visible_shares(frames: Frames, index: int, extrinsics: np.ndarray) -> np.ndarray:
     """Share [M] of the pixels with depth of frame `index` that fall into the view of cameras `extrinsics` [M, 4, 4].
 
