@@ -57,35 +57,35 @@ def run_evaluation(
     run = read_run(configuration)
     output = check_output(output, overwrite=True, kind=FolderKind(RECORDS_FILE, ("*",)), in_place=True)
     check_writable(output / RECORDS_FILE)
-    asks = isinstance(run, ClipRun) and run.evaluation.image_size is None
-    longer_edge = read_provenance(checkpoint).longer_edge if asks else None
-    benchmarks, baselines = open_run(run, data_root, longer_edge)
+    provenance = read_provenance(checkpoint)
+    benchmarks, baselines = open_run(run, data_root, provenance.longer_edge)
     if isinstance(run, ClipRun):
         _check_room(run, checkpoint, _clip_size(benchmarks))
-    loaded = Checkpoint.load(checkpoint)
-    trained_for = read_provenance(checkpoint).trained_for
-    rows = {method: _row(method, loaded, run.settings_of(method), trained_for) for method in run.methods}
-    _warn_of_unsuited(trained_for, run.methods)
-    timings: Callable[[], Mapping[str, Any]] | None = None
-    if run.timings is not None and run.timings.lengths:
-        if isinstance(run, PaperRun):
-            others = [row for method, row in rows.items() if method != "windows"]
-            edge = run.protocol.longer_edge
-            timings = functools.partial(
-                measured_timings, loaded, others, run.timings, output, longer_edge=edge, fresh=fresh
-            )
-        else:
-            timings = functools.partial(
-                measured_costs,
-                list(rows.values()),
-                run.timings,
-                output,
-                image_size=_clip_size(benchmarks),
-                dtype=loaded.model.config.dtype,
-                fresh=fresh,
-            )
+    # Gigabytes of parameters are not read for a folder that another run has.
     lock = FolderLock(output, "choose another output")
     try:
+        loaded = Checkpoint.load(checkpoint)
+        trained_for = provenance.trained_for
+        rows = {method: _row(method, loaded, run.settings_of(method), trained_for) for method in run.methods}
+        _warn_of_unsuited(trained_for, run.methods)
+        timings: Callable[[], Mapping[str, Any]] | None = None
+        if run.timings is not None and run.timings.lengths:
+            if isinstance(run, PaperRun):
+                others = [row for method, row in rows.items() if method != "windows"]
+                edge = run.protocol.longer_edge
+                timings = functools.partial(
+                    measured_timings, loaded, others, run.timings, output, longer_edge=edge, fresh=fresh
+                )
+            else:
+                timings = functools.partial(
+                    measured_costs,
+                    list(rows.values()),
+                    run.timings,
+                    output,
+                    image_size=_clip_size(benchmarks),
+                    dtype=loaded.model.config.dtype,
+                    fresh=fresh,
+                )
         results = evaluate(
             benchmarks,
             [*rows.values(), *variant_methods(loaded, run.variants), *baselines(loaded.model)],

@@ -7,6 +7,7 @@ from typing import Any
 from logvggt_jax.config import from_mapping, require_counts
 from logvggt_jax.errors import InputError
 from logvggt_jax.evaluation.costs.streams import TimingConfig
+from logvggt_jax.evaluation.methods.variants import VARIANTS
 from logvggt_jax.evaluation.protocols import ProtocolSettings
 from logvggt_jax.evaluation.protocols.clips import ClipSettings
 from logvggt_jax.streaming import METHODS
@@ -28,10 +29,10 @@ class Run:
     timings: TimingConfig | None = None
 
     def __post_init__(self) -> None:
-        for field, names in {"methods": self.methods, "settings": self.settings}.items():
-            for name in names:
-                if name not in METHODS:
-                    raise InputError(f"{type(self).__name__}.{field}: unknown {name!r}; known are {', '.join(METHODS)}")
+        for field, known in {"methods": METHODS, "settings": METHODS, "variants": VARIANTS}.items():
+            for name in getattr(self, field):
+                if name not in known:
+                    raise InputError(f"{type(self).__name__}.{field}: unknown {name!r}; known are {', '.join(known)}")
         for name in self.settings:
             self.settings_of(name)
 

@@ -129,10 +129,12 @@ def test_the_model_and_all_baselines_make_a_table(
 
 
 def test_two_runs_do_not_share_a_folder(
-    small_config: ModelConfig, small_variables: dict[str, Any], tmp_path: Path
+    small_config: ModelConfig, small_variables: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """The second one is told before it has read gigabytes of parameters."""
     save_model(tmp_path / "model", small_config, small_variables["params"], Provenance("windows", 42))
     values, output = configuration("rooms", {"methods": ("windows",)}), tmp_path / "out"
+    monkeypatch.setattr(Checkpoint, "load", lambda path: pytest.fail("parameters are read"))
     lock = FolderLock(output, "")
     with pytest.raises(InputError, match=r"out: another run is using this folder .*choose another output"):
         run_evaluation(values, tmp_path / "model", output, command="command")

@@ -51,6 +51,7 @@ def test_wrong_clips_are_named(values: dict[str, Any], message: str) -> None:
         ("benchmarks", (), r"config\.benchmarks must name at least one"),
         ("max_sequences", 0, r"config\.max_sequences must be a positive integer"),
         ("methods", ("window",), r"config\.methods: unknown 'window'; known are windows, "),
+        ("variants", ("full", "no_gcrc"), r"config\.variants: unknown 'no_gcrc'; known are full, no_gccr, "),
         ("settings", {"offlin": {}}, r"config\.settings: unknown 'offlin'; known are windows, "),
         ("settings", {"offline": {"max_frames": 0}}, r"config: settings\.offline\.max_frames must be"),
         ("settings", {"chunks": {"overlaps": 4}}, r"unknown field settings\.chunks\.overlaps; did you mean overlap\?"),

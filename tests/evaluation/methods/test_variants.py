@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from logvggt_jax import LogVGGT, ModelConfig, WindowConfig
-from logvggt_jax.errors import InputError
 from logvggt_jax.evaluation.methods import variants as module
 from logvggt_jax.evaluation.methods.method import Checkpoint, ClipPrediction
 from logvggt_jax.evaluation.methods.variants import VARIANTS, variant_methods
@@ -111,8 +110,3 @@ def test_every_variant_is_a_valid_model() -> None:
     # which differ in what is done with the windows.
     plain = [name for name, variant in VARIANTS.items() if not (variant.loops or variant.chained)]
     assert len(configs) == 2 * (len(plain) - 2)
-
-
-def test_an_unknown_variant_is_named(small_config: ModelConfig, small_variables: dict) -> None:
-    with pytest.raises(InputError, match="unknown 'no_gcrc'; known are full, no_gccr"):
-        variant_methods(Checkpoint(LogVGGT(small_config), small_variables, ""), ("full", "no_gcrc"))
