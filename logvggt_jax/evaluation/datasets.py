@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 from logvggt_jax.data.dataset import Reader
-from logvggt_jax.data.option_fields import given_options
 from logvggt_jax.data.registry import READERS, checked_options, open_dataset
 from logvggt_jax.errors import InputError
 from logvggt_jax.evaluation.methods.baselines import all_baselines, static_camera, unit_depth
@@ -64,7 +63,6 @@ def open_evaluation_set(
     Raises InputError where `root` is missing, does not hold the data set, or is given for a set that has no folder,
     and for an option that its reader does not have or that the run decides.
     """
-    options = given_options(options)
     reader = READERS.get(name)
     if reader is not None and root is None and reader.needs_root:
         raise InputError(f"data set {name!r} is read from disk: give its folder with --data_root")
@@ -86,7 +84,7 @@ def open_benchmarks(
     not a folder, or has none of the data sets that were asked for, and for an option that no reader has.
     """
     for name, options in settings.options.items():
-        checked_options(name, given_options(options))
+        checked_options(name, options)
     root = None if data_root is None else Path(data_root)
     if root is not None and not root.is_dir():
         raise InputError(f"{root}: no such folder; --data_root is the folder that holds one folder a data set")

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from logvggt_jax.config import from_mapping, require_counts
+from logvggt_jax.data.option_fields import given_options
 from logvggt_jax.errors import InputError
 from logvggt_jax.evaluation.costs.streams import TimingConfig
 from logvggt_jax.evaluation.methods.variants import VARIANTS
@@ -51,6 +52,10 @@ class ClipRun(Run):
     split: str  # `train`, `val`, `test` or `all`
     evaluation: ClipSettings  # clips and metrics
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # further arguments of the set's reader
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "options", given_options(self.options))
 
     @property
     def max_sequences(self) -> int | None:

@@ -71,6 +71,14 @@ def test_settings_of_a_method_are_of_its_own_class() -> None:
     assert found.settings_of("chunks") == ChunkPlan(6, 3) and found.settings_of("windows") is None
 
 
+def test_options_that_nobody_has_given_are_not_recorded() -> None:
+    """A configuration file has a place for each option of a reader: None until the command line fills it."""
+    options = {"num_rooms": 8, "laps": None}
+    assert read_run({**CLIP_RUN, "options": options}).options == {"num_rooms": 8}
+    paper = read_run({**PAPER_RUN, "protocol": {"options": {"rooms": options}}})
+    assert paper.protocol.options == {"rooms": {"num_rooms": 8}}
+
+
 def test_missing_and_unknown_fields_are_named() -> None:
     with pytest.raises(InputError, match=r"unknown field config\.data_set"):
         read_run({**CLIP_RUN, "data_set": "rooms"})

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from logvggt_jax.config import check_longer_edge, require_counts, require_within
+from logvggt_jax.data.option_fields import given_options
 from logvggt_jax.evaluation.protocols.frame_selection import FrameSelection
 from logvggt_jax.evaluation.protocols.images import ImageRule
 
@@ -99,6 +100,8 @@ class ProtocolSettings:
         require_counts(self, "max_points")
         require_counts(self, "seed", least=0)
         require_within(self, "(0, inf)", "icp_threshold")
+        given = {name: given_options(options) for name, options in self.options.items()}
+        object.__setattr__(self, "options", given)
 
     @property
     def points(self) -> PointsMeasure:
