@@ -17,7 +17,6 @@ import platform
 import sys
 import traceback
 from collections.abc import Sequence
-from pathlib import Path
 from typing import NoReturn
 
 from logvggt_jax.interruption import INTERRUPTED, one_line_at_ctrl_c
@@ -28,6 +27,7 @@ with one_line_at_ctrl_c("train.py"):
 
     from logvggt_jax.compile import check_devices, check_nccl, enable_compilation_cache
     from logvggt_jax.errors import InputError, one_line
+    from logvggt_jax.files import user_path
     from logvggt_jax.program_flags import define_config, flags_parser
     from logvggt_jax.terminal import forgiving_streams, one_log_handler, plain_warnings
     from logvggt_jax.training.config import TrainConfig
@@ -118,11 +118,11 @@ def main(arguments: Sequence[str]) -> None:
         if _DRY_RUN.value:
             dry_run(config, described_mesh(_DESCRIBED.value) if _DESCRIBED.value else data_mesh())
         elif _PREFLIGHT.value:
-            preflight(config, Path(_WORKDIR.value), data_mesh())
+            preflight(config, user_path(_WORKDIR.value), data_mesh())
         else:
             train(
                 config,
-                Path(_WORKDIR.value),
+                user_path(_WORKDIR.value),
                 mesh=data_mesh(),
                 resume_step=_RESUME_STEP.value,
                 watchdog=_WATCHDOG.value,

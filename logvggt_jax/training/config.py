@@ -23,6 +23,7 @@ from logvggt_jax.config import (
 from logvggt_jax.data.feeding.augmentation import ColourAugmentation
 from logvggt_jax.data.feeding.holdouts import HoldOut
 from logvggt_jax.errors import InputError
+from logvggt_jax.files import user_path
 
 LOSSES = ("log_vggt", "vggt", "distillation")
 SCHEDULES = ("cosine", "linear_tail")
@@ -151,6 +152,7 @@ class SourceConfig:
 
     def __post_init__(self) -> None:
         freeze_lists(self)
+        _expand_home(self, "root")
         # None is a field that no flag has filled.
         object.__setattr__(self, "options", tuple(sorted(pair for pair in self.options if pair[1] is not None)))
         require_within(self, "(0, inf)", "weight")
@@ -183,6 +185,7 @@ class DataConfig:
     max_broken: float = 0.0
 
     def __post_init__(self) -> None:
+        _expand_home(self, "cache_dir")
         object.__setattr__(self, "hold_out", tuple(sorted(self.hold_out, key=lambda pair: pair[0])))
         if not self.sources:
             raise InputError("DataConfig.sources is empty: name at least one data set")
@@ -331,6 +334,20 @@ class TrainConfig:
         if isinstance(stages, Mapping) and list(stages) == sorted(stages):
             values = {**values, "stages": {name: stages[name] for name in sorted(stages, key=_numbers_by_value)}}
         return from_mapping(cls, values, "config")
+
+
+def _expand_home(config: SourceConfig | DataConfig, name: str) -> None:
+    """Expands `~` in a field that is a folder, as a shell leaves it behind `=`; InputError where it is empty."""
+    folder = getattr(config, name)
+    if folder is None:
+        return
+    try:
+        path = user_path(folder)
+    except InputError as error:
+        raise InputError(f"{type(config).__name__}.{name}={folder!r}: {error}") from error
+    # Other folders stay as they are written: validation tells its sets apart by them.
+    if folder.startswith("~"):
+        object.__setattr__(config, name, str(path))
 
 
 def _require_different(sources: Sequence[SourceConfig], field: str) -> None:

@@ -92,7 +92,7 @@ def train(
     if wandb is not None:
         load_wandb()
     if jax.process_index() == 0:  # which alone writes there
-        check_writable(workdir.expanduser().absolute() / "checkpoints")
+        check_writable(workdir.absolute() / "checkpoints")
     check_shared(workdir)
     check_same_settings(config, profile=profile, resume_step=resume_step)
     with contextlib.ExitStack() as stack:

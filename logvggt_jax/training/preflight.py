@@ -19,7 +19,7 @@ from logvggt_jax.compile import device_bytes
 from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.data.feeding.batches import training_batches
 from logvggt_jax.errors import InputError, one_line, printable
-from logvggt_jax.files import check_writable, user_path
+from logvggt_jax.files import check_writable
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.training.checkpoints.checkpoint_files import Position
 from logvggt_jax.training.checkpoints.run_checkpoints import RunCheckpoints
@@ -159,7 +159,7 @@ def _initial_weights(config: TrainConfig, weights: str, resumed: list[int]) -> s
 
 def _teacher(config: TrainConfig, settings: TeacherConfig, teachers: list[Teacher]) -> str:
     assert config.data.cache_dir is not None  # as the configuration checks
-    check_writable(user_path(config.data.cache_dir).absolute() / "teacher")
+    check_writable(Path(config.data.cache_dir).absolute() / "teacher")
     teachers.append(PlainVGGT(settings))
     return f"{settings.weights}, labels go to {config.data.cache_dir}"
 

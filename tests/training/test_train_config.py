@@ -13,7 +13,7 @@ from ml_collections import ConfigDict
 from logvggt_jax.data.feeding.augmentation import ColourAugmentation
 from logvggt_jax.data.feeding.holdouts import HoldOut
 from logvggt_jax.errors import InputError
-from logvggt_jax.training.config import TrainConfig, ValidationConfig
+from logvggt_jax.training.config import SourceConfig, TrainConfig, ValidationConfig
 
 
 def _mapping(config: TrainConfig) -> dict[str, Any]:
@@ -120,6 +120,8 @@ def test_missing_fields_are_named(run_config: TrainConfig) -> None:
         ("stages.first.sizes", ((28, 42), (50, 70)), r"must be \(H, W\), multiples of 14 pixels, got \(50, 70\)"),
         ("stages.first.sizes", ((0, 70),), r"must be \(H, W\), multiples of 14 pixels, got \(0, 70\)"),
         ("stages.first.steps", "50", "must be a whole number, got '50'"),
+        ("data.cache_dir", "", "='': the path is empty"),
+        ("data.sources.rooms.root", " ", "=' ': the path is empty"),
         ("data.sources.rooms.stride", (3, 2), r"must be a pair 1 <= low <= high, got \(3, 2\)"),
     ],
 )
@@ -128,6 +130,13 @@ def test_values_are_checked_under_their_names(run_config: TrainConfig, path: str
     _set(values, path, value)
     with pytest.raises(InputError, match=rf"^config\.{re.escape(path)} ?{message}"):
         TrainConfig.from_dict(values)
+
+
+def test_folders_at_home_are_found(run_config: TrainConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", "/home/one")
+    assert SourceConfig("colmap", "~/data", "all").root == "/home/one/data"
+    assert SourceConfig("colmap", "data/", "all").root == "data/"
+    assert dataclasses.replace(run_config.data, cache_dir="~/labels").cache_dir == "/home/one/labels"
 
 
 def test_the_size_of_validation_is_checked(run_config: TrainConfig) -> None:

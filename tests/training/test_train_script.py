@@ -159,6 +159,17 @@ def test_a_fault_of_ours_keeps_its_traceback(
     assert "ValueError: a bug" in finished.stderr or finished.stderr.count("\n") == 1
 
 
+def test_a_work_folder_at_home_is_one_folder(run_train: Callable, tmp_path: Path) -> None:
+    """A shell leaves `~` behind `=` as it is: half of a run's files lay in a folder of that name."""
+    given = (
+        f"import os; os.environ['HOME'] = {str(tmp_path)!r}\n"
+        "import logvggt_jax.training.loop as loop, logvggt_jax.training.preflight as preflight\n"
+        "loop.train = preflight.preflight = lambda config, workdir, *_, **__: print(workdir)\n"
+    )
+    for flags in ((), ("--preflight",)):
+        assert run_train("~/run", *flags, first=given).stdout == f"{tmp_path / 'run'}\n"
+
+
 def test_an_argument_that_is_no_flag_is_one_line(run_train: Callable, tmp_path: Path) -> None:
     finished = run_train(tmp_path, "configs/h20.py")
     assert finished.returncode == 1

@@ -44,7 +44,7 @@ class RunCheckpoints:
 
     def __init__(self, workdir: Path, config: TrainConfig) -> None:
         self.config = config
-        self.folder = workdir.expanduser().absolute() / "checkpoints"
+        self.folder = workdir.absolute() / "checkpoints"
         self.models = RunModels(self.folder.parent, config)
         self._honoured = self.folder / "resumed.json"
         self._lock: FolderLock | None = None

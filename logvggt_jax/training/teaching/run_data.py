@@ -1,12 +1,12 @@
 """The data of a run: of its own truth, or labelled by a teacher before the first step."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
 
 from logvggt_jax.data.dataset import Dataset
-from logvggt_jax.files import user_path
 from logvggt_jax.training.config import TeacherConfig, TrainConfig
 from logvggt_jax.training.feeding.sources import open_source, open_sources
 from logvggt_jax.training.feeding.truth import check_depth, check_truth
@@ -48,10 +48,8 @@ def label(
     """
     assert config.data.cache_dir is not None  # as the configuration checks
     shared: dict[str, Any] = {"progress": jax.process_index() == 0, "most": most}
-    cache, sizes = (
-        user_path(config.data.cache_dir),
-        list(dict.fromkeys(s for stage in config.stages for s in stage.sizes)),
-    )
+    cache = Path(config.data.cache_dir)
+    sizes = list(dict.fromkeys(size for stage in config.stages for size in stage.sizes))
     # Each reads what the others have labelled.
     check_shared(cache, "data.cache_dir")
     validated: list[Dataset] = []
