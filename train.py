@@ -51,8 +51,8 @@ _CONFIG = define_config("train.py", "File with the run's settings.")
 _SOURCES = flags.DEFINE_multi_string(
     "source", [], "Data to train on instead of the configuration's: NAME=FOLDER,split=…,frames=FIRST:STOP; repeatable."
 )
-_VALIDATION_SOURCE = flags.DEFINE_string(
-    "validation_source", None, "Data to validate on instead of the configuration's, in the same form; `none` for none."
+_VALIDATION_SOURCES = flags.DEFINE_multi_string(
+    "validation_source", [], "Data to validate on instead of the configuration's, in the same way; `none` for none."
 )
 _WORKDIR = flags.DEFINE_string("workdir", None, "Folder for checkpoints, the model and logs.")
 _RESUME_STEP = flags.DEFINE_integer(
@@ -95,7 +95,7 @@ def main(arguments: Sequence[str]) -> None:
     try:
         # What is compiled for devices that are not here cannot be read back.
         enable_compilation_cache("none" if _DESCRIBED.value else _CACHE.value)
-        config = TrainConfig.from_dict(with_sources(_CONFIG.value.to_dict(), _SOURCES.value, _VALIDATION_SOURCE.value))
+        config = TrainConfig.from_dict(with_sources(_CONFIG.value.to_dict(), _SOURCES.value, _VALIDATION_SOURCES.value))
         profile = ProfiledSteps.parse(_PROFILE.value) if _PROFILE.value else None
         use_cpu_cores(config, num_processes=_NUM_PROCESSES.value or 1)
         check_nccl()

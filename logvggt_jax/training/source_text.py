@@ -11,21 +11,23 @@ _NOTHING = "none"
 _FIELDS = re.compile(r"(.*?)((?:,(?:split|frames|stride|weight)=[^,]*)*)", re.DOTALL)
 
 
-def with_sources(settings: Mapping[str, Any], trained: Sequence[str], validated: str | None) -> dict[str, Any]:
+def with_sources(settings: Mapping[str, Any], trained: Sequence[str], validated: Sequence[str]) -> dict[str, Any]:
     """The settings of a run with other sources, as `parse_source` reads them, to train and to validate on.
 
-    No texts, or None, leave what is there; with `none` in the place of the latter the run has no validation. Raises
-    InputError as `parse_source`, and for a run without validation.
+    No texts leave what is there; with `none` in the place of the latter the run has no validation. Raises InputError as
+    `parse_source`, for a run without validation, and for `none` beside others.
     """
     changed = dict(settings)
     if trained:
         changed["data"] = {**settings.get("data", {}), "sources": [parse_source(text) for text in trained]}
-    if validated == _NOTHING:
+    if _NOTHING in validated:
+        if len(validated) > 1:
+            raise InputError("--validation_source is none and something: give one of them")
         changed["validation"] = None
-    elif validated is not None:
+    elif validated:
         if settings.get("validation") is None:
             raise InputError("--validation_source: this configuration validates nothing")
-        changed["validation"] = {**settings["validation"], "sources": [parse_source(validated)]}
+        changed["validation"] = {**settings["validation"], "sources": [parse_source(text) for text in validated]}
     return changed
 
 

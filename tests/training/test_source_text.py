@@ -38,15 +38,22 @@ def test_sources_take_the_place_of_the_configurations(run_config: TrainConfig) -
         "stride": 1,
         "size": (28, 42),
     }
-    changed = TrainConfig.from_dict(with_sources(settings, ["tum_recording=/a,frames=:700", "colmap=/b"], "tum=/c"))
+    changed = TrainConfig.from_dict(
+        with_sources(settings, ["tum_recording=/a,frames=:700", "colmap=/b"], ["tum=/c", "colmap=/d"])
+    )
     assert changed.data.sources == (
         SourceConfig("tum_recording", "/a", "all", frames=(None, 700)),
         SourceConfig("colmap", "/b", "all"),
     )
-    assert changed.validation is not None and changed.validation.sources == (SourceConfig("tum", "/c", "all"),)
-    assert with_sources(settings, [], None) == settings
-    assert TrainConfig.from_dict(with_sources(settings, ["colmap=/b"], "none")).validation is None
+    assert changed.validation is not None and changed.validation.sources == (
+        SourceConfig("tum", "/c", "all"),
+        SourceConfig("colmap", "/d", "all"),
+    )
+    assert with_sources(settings, [], []) == settings
+    assert TrainConfig.from_dict(with_sources(settings, ["colmap=/b"], ["none"])).validation is None
+    with pytest.raises(InputError, match="is none and something"):
+        with_sources(settings, [], ["none", "colmap=/b"])
     with pytest.raises(InputError, match=r"config\.data\.sources: colmap is named twice"):
-        TrainConfig.from_dict(with_sources(settings, ["colmap=/a", "colmap=/b"], None))
+        TrainConfig.from_dict(with_sources(settings, ["colmap=/a", "colmap=/b"], []))
     with pytest.raises(InputError, match="validates nothing"):
-        with_sources(run_config.to_dict(), [], "colmap=/a")
+        with_sources(run_config.to_dict(), [], ["colmap=/a"])
