@@ -200,7 +200,8 @@ class ValidationConfig:
     """Every `every` steps, `num_clips` fixed clips of `clip_length` frames, `stride` apart, of each of some held-out
     sets. The model of the best value of the metric `best` is kept, None keeps none.
 
-    They come from as many sequences as a set has; where those are fewer, from several places of each.
+    They come from as many sequences as a set has; where those are fewer, from several places of each. The sources have
+    no stride or weight of their own.
     """
 
     sources: tuple[SourceConfig, ...]
@@ -216,6 +217,12 @@ class ValidationConfig:
         if not self.sources:
             raise InputError("ValidationConfig.sources is empty: name at least one data set, or set validation to None")
         _require_different(self.sources, "ValidationConfig.sources")
+        for source in self.sources:
+            if source.stride is not None or source.weight != 1.0:
+                raise InputError(
+                    f"ValidationConfig.sources: {source.name} has a stride or weight of its own, which training alone "
+                    "knows: leave it out; all clips of validation are validation.stride apart, as many of each source"
+                )
         if self.best is not None:
             require_one_of(self, tuple(VALIDATION_METRICS), "best")
         require_counts(self, "every", "num_clips", "clip_length", "stride")

@@ -143,3 +143,10 @@ def test_the_size_of_validation_is_checked(run_config: TrainConfig) -> None:
     source = run_config.data.sources[0]
     with pytest.raises(InputError, match=r"^ValidationConfig\.size must be \(H, W\), multiples of 14 pixels, got"):
         ValidationConfig((source,), every=1, num_clips=1, clip_length=2, stride=1, size=(28, 50))
+
+
+@pytest.mark.parametrize("change", [{"stride": (1, 4)}, {"weight": 2.0}])
+def test_validation_takes_no_setting_that_it_would_not_heed(run_config: TrainConfig, change: dict[str, Any]) -> None:
+    source = dataclasses.replace(run_config.data.sources[0], **change)
+    with pytest.raises(InputError, match=r"^ValidationConfig\.sources: rooms has a stride or weight of its own"):
+        ValidationConfig((source,), every=1, num_clips=1, clip_length=2, stride=1, size=(28, 42))
