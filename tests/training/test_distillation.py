@@ -107,6 +107,23 @@ def test_what_was_labelled_once_is_not_labelled_again_unless_teacher_or_pictures
     assert mended.calls == 1
 
 
+@pytest.mark.parametrize("file", ["depth.npy", "confidence.npy", "extrinsics.npy", "digests.json"])
+def test_labels_that_have_changed_on_the_disk_are_made_anew(
+    rooms: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture, file: str
+) -> None:
+    logging.use_python_logging(quiet=True)
+    folders = {clip.labels for clip in labelled(rooms, tmp_path)._clips.values()}
+    damaged, earlier = sorted(folders)[:2]
+    (earlier / "digests.json").unlink()
+    path = damaged / file
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
+    teacher = PixelTeacher()
+    labelled(rooms, tmp_path, teacher)
+    assert teacher.calls == 1 and path.read_bytes() == whole
+    assert damaged.name in caplog.text and "the clip is labelled again" in caplog.text
+
+
 def test_labels_that_cannot_be_written_are_one_line_and_leave_nothing(
     rooms: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

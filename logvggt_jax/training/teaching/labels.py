@@ -1,6 +1,7 @@
 """What a teacher says of a clip, and where it is kept.
 
-    <cache>/teacher/<digest>/   of one clip: depth.npy, confidence.npy, intrinsics.npy, extrinsics.npy
+    <cache>/teacher/<digest>/   of one clip: depth.npy, confidence.npy, intrinsics.npy, extrinsics.npy, and digests.json
+                                of these four, since numpy does not notice flipped bytes
     <cache>/teacher.lock        held together by all that write labels, see `cache_use`
 
 The digest is of the clip's pictures, as the teacher saw them, and of the teacher: what has been labelled once is never
@@ -8,15 +9,20 @@ labelled again, by whatever run, and never taken for something else.
 """
 
 import hashlib
+import json
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from absl import logging
 
 from logvggt_jax.errors import InputError, OutputExists, disk_errors
-from logvggt_jax.files import atomic_folder
+from logvggt_jax.files import atomic_folder, read_json
+from logvggt_jax.weights.digests import digests, verify_digests
 
 DIGEST_BYTES = 16
+_DIGESTS = "digests.json"
+_MEND = "the clip is labelled again"
 
 
 class Labels(NamedTuple):
@@ -53,6 +59,7 @@ def write_labels(folder: Path, labels: Labels) -> None:
         with disk_errors(folder), atomic_folder(folder, replace=folder.exists()) as fresh:
             for name, values in labels._asdict().items():
                 np.save(fresh / f"{name}.npy", values)
+            (fresh / _DIGESTS).write_text(json.dumps(digests(labels._asdict())))
     except OutputExists:  # another run labelled the same clip in the meantime
         return
 
@@ -70,11 +77,27 @@ def stored_labels(folder: Path) -> Labels:
 
 
 def is_labelled(folder: Path, shape: tuple[int, ...]) -> bool:
-    """Whether `folder` keeps labels of images of this shape, (T, H, W, 3)."""
+    """Whether `folder` keeps labels of images of this shape, (T, H, W, 3), as they were written; a warning names those
+    that have changed since."""
     try:
         labels = stored_labels(folder)
     except InputError:
         return False
     frames = shape[0]
     expected = (shape[:3], shape[:3], (frames, 3, 3), (frames, 4, 4))
-    return tuple(values.shape for values in labels) == expected
+    return tuple(values.shape for values in labels) == expected and _are_whole(folder, labels)
+
+
+def _are_whole(folder: Path, labels: Labels) -> bool:
+    written = folder / _DIGESTS
+    if not written.exists():  # labels of before there were digests pass as they are
+        return True
+    try:
+        expected = read_json(written, _MEND)
+        if not isinstance(expected, dict):
+            raise InputError(f"{written}: no digests; {_MEND}")
+        verify_digests(labels._asdict(), expected, str(folder), mend=_MEND)
+    except InputError as error:
+        logging.warning("%s", error)
+        return False
+    return True
