@@ -160,7 +160,9 @@ def _initial_weights(config: TrainConfig, weights: str, resumed: list[int]) -> s
 def _teacher(config: TrainConfig, settings: TeacherConfig, teachers: list[Teacher]) -> str:
     assert config.data.cache_dir is not None  # as the configuration checks
     check_writable(Path(config.data.cache_dir).absolute() / "teacher")
-    teachers.append(PlainVGGT(settings))
+    teacher = PlainVGGT(settings)
+    teacher.load()  # also where the clips that are tried have labels already
+    teachers.append(teacher)
     return f"{settings.weights}, labels go to {config.data.cache_dir}"
 
 

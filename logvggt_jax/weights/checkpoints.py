@@ -34,7 +34,7 @@ from logvggt_jax.files import (
 )
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.weights.address import hub_address, resolve, similar
-from logvggt_jax.weights.digests import check_finite, digests, named_leaves, verify_digests
+from logvggt_jax.weights.digests import are_comparable, check_finite, digests, named_leaves, verify_digests
 from logvggt_jax.weights.files import open_state_dict
 from logvggt_jax.weights.folder import MEND, is_model_folder, read_description, run_model, write_description
 from logvggt_jax.weights.half_precision import PARAMETERS_FILE, read_parameters, rounded, write_parameters
@@ -216,6 +216,19 @@ def read_config(path: str | Path, *, dtype: str | None = None, point_head: bool 
             config = config_from_vggt(state_dict, point_head=point_head)
             check_vggt(state_dict, config)
     return config if dtype is None else dataclasses.replace(config, dtype=dtype)
+
+
+def read_digests(path: str | Path) -> dict[str, str] | None:
+    """The `digests` of the parameters that `from_pretrained` would give, where a model folder tells them; reads no
+    parameter. None for a VGGT checkpoint, and for a folder of an earlier version. `path` is local, see `resolve`.
+
+    Raises InputError as `from_pretrained`, for what can be seen without reading parameters.
+    """
+    path = Path(path)
+    if not (path.is_dir() and is_model_folder(path)):
+        return None
+    found: dict[str, str] = read_description(path)["digests"]
+    return found if found and are_comparable(found.values()) else None
 
 
 def from_pretrained(

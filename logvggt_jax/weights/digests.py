@@ -45,6 +45,11 @@ def _digests(tree: Any, earlier: Collection[str]) -> dict[str, str]:
     return {name: digest.result() for name, digest in found.items()}
 
 
+def are_comparable(stored: Collection[str]) -> bool:
+    """Whether stored digests are of the kind that `digests` gives, and not of an earlier version's."""
+    return all(digest.startswith(_FORM) for digest in stored)
+
+
 def verify_digests(tree: Any, expected: dict[str, str], where: str, *, mend: str = MEND) -> None:
     """Compares a restored tree with the digests stored when it was saved; `where` is the checkpoint's path, `mend` what
     an error ends with.

@@ -11,6 +11,9 @@ class PixelTeacher:
     def __init__(self, digest: str = "first") -> None:
         self.digest, self.calls = digest, 0
 
+    def load(self) -> None:
+        pass
+
     def label(self, images: np.ndarray) -> Labels:
         self.calls += 1
         grey = images.astype(np.float32).mean(-1) / 255

@@ -3,6 +3,7 @@
 import dataclasses
 import errno
 import functools
+import json
 import os
 import subprocess
 import sys
@@ -25,6 +26,7 @@ from logvggt_jax.data.feeding.frame_range import FrameRange
 from logvggt_jax.data.feeding.listed_frames import listed_frames
 from logvggt_jax.errors import DiskError, InputError
 from logvggt_jax.metrics.depth import depth_metrics
+from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.training import loop
 from logvggt_jax.training.config import (
     LossConfig,
@@ -41,7 +43,7 @@ from logvggt_jax.training.step.optimizer import make_optimizer
 from logvggt_jax.training.step.state import initial_state
 from logvggt_jax.training.step.train_step import make_loss_terms, make_train_step
 from logvggt_jax.training.teaching import labelling as module
-from logvggt_jax.training.teaching import run_data
+from logvggt_jax.training.teaching import run_data, teacher
 from logvggt_jax.training.teaching.labelling import taught
 from logvggt_jax.training.teaching.run_data import label
 from logvggt_jax.training.teaching.taught import TaughtDataset
@@ -259,6 +261,37 @@ def test_a_teacher_of_another_kind_is_refused(small_config: ModelConfig, tmp_pat
     write_description(tmp_path / "model", description)
     with pytest.raises(InputError, match=r"model: trained for 'windows', a teacher is plain VGGT"):
         PlainVGGT(TeacherConfig(str(tmp_path / "model"), 4))
+
+
+def test_a_teachers_weights_are_read_to_label_and_not_where_all_is_labelled(
+    small_config: ModelConfig,
+    small_variables: dict[str, Any],
+    rooms: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    weights, earlier = tmp_path / "teacher", tmp_path / "earlier"
+    save_model(weights, small_config, small_variables["params"], Provenance("vggt", 42))
+    description = json.loads((weights / "config.json").read_text())
+    del description["digest"]
+    earlier.mkdir()
+    write_description(earlier, {**description, "digests": dict.fromkeys(description["digests"], "of another form")})
+    (earlier / "params").mkdir()
+    read: list[Path] = []
+
+    def from_pretrained(path: Path) -> tuple[LogVGGT, dict[str, Any]]:
+        read.append(path)
+        return LogVGGT(small_config), small_variables
+
+    monkeypatch.setattr(teacher, "from_pretrained", from_pretrained)
+    lazy, eager = (PlainVGGT(TeacherConfig(str(folder), 4)) for folder in (weights, earlier))
+    assert lazy.digest == eager.digest and read == [earlier]
+    # Labels of another in its name: to predict takes seconds.
+    labelled(rooms, tmp_path, PixelTeacher(lazy.digest))
+    labelled(rooms, tmp_path, lazy)
+    assert read == [earlier]
+    lazy.load()
+    assert read == [earlier, weights]
 
 
 def test_objective_and_teacher_belong_together(run_config: TrainConfig, tmp_path: Path) -> None:

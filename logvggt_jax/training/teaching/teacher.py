@@ -1,16 +1,18 @@
 """A teacher: plain VGGT, whose predictions on clips of videos are what a student learns."""
 
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from logvggt_jax.errors import InputError
+from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.streaming import PredictionError, open_predictor
 from logvggt_jax.streaming.offline import OfflineSettings
 from logvggt_jax.streaming.results import device_memory
 from logvggt_jax.training.config import TeacherConfig
 from logvggt_jax.training.teaching.labels import Labels
-from logvggt_jax.weights.checkpoints import from_pretrained, read_provenance
+from logvggt_jax.weights.address import resolve
+from logvggt_jax.weights.checkpoints import from_pretrained, read_config, read_digests, read_provenance
 from logvggt_jax.weights.digests import digests, json_digest
 
 METHOD = "offline"  # of `streaming`: all frames of a clip see one another
@@ -24,14 +26,18 @@ class Teacher(Protocol):
         """Of all that decides its labels besides the pictures."""
         ...
 
+    def load(self) -> None:
+        """Reads what labelling needs, where that was not done: raises now what the first clip would."""
+        ...
+
     def label(self, images: np.ndarray) -> Labels:
         """Labels of a clip, images [T, H, W, 3] uint8."""
         ...
 
 
 class PlainVGGT:
-    """The teacher of a run, on the default device. Raises InputError for weights that are not plain VGGT's or that do
-    not fit the device's memory."""
+    """The teacher of a run, on the default device. Its weights are read when the first clip is labelled, and at once
+    where only they tell their digests. Raises InputError for weights that are not plain VGGT's."""
 
     def __init__(self, config: TeacherConfig) -> None:
         kind = read_provenance(config.weights).trained_for
@@ -41,16 +47,22 @@ class PlainVGGT:
                 "VGGT-1B as `logvggt convert` writes it, or a checkpoint of it"
             )
         self._config = config
-        with device_memory(
-            f"teacher.weights={config.weights}", "give a smaller teacher, or train on devices with more"
-        ):
-            self._model, self._variables = from_pretrained(config.weights)
-            params = digests(self._variables["params"])
-        self.digest = json_digest({"config": self._model.config.to_dict(), "method": METHOD, "params": params})
+        self._path = resolve(config.weights)
+        self._weights: tuple[LogVGGT, dict[str, Any]] | None = None
+        params, sizes = read_digests(self._path), read_config(self._path)
+        if params is None:
+            params = digests(self._loaded()[1]["params"])
+        self.digest = json_digest({"config": sizes.to_dict(), "method": METHOD, "params": params})
+
+    def load(self) -> None:
+        """As of `Teacher`. Raises InputError as `from_pretrained`, PredictionError where the weights do not fit the
+        device's memory."""
+        self._loaded()
 
     def label(self, images: np.ndarray) -> Labels:
-        """As of `Teacher`. Raises PredictionError where the clip does not fit the device's memory."""
-        predictor = open_predictor(METHOD, self._model, self._variables, OfflineSettings(max_frames=None))
+        """As of `Teacher`. Raises what `load` does, and PredictionError where the clip does not fit the device's
+        memory."""
+        predictor = open_predictor(METHOD, *self._loaded(), OfflineSettings(max_frames=None))
         try:
             frames = [*predictor.push(images), *predictor.close()]
         except PredictionError as error:
@@ -73,3 +85,11 @@ class PlainVGGT:
                     f"teacher.weights={self._config.weights}: its {name} is not finite: it teaches nothing"
                 )
         return labels
+
+    def _loaded(self) -> tuple[LogVGGT, dict[str, Any]]:
+        if self._weights is None:
+            with device_memory(
+                f"teacher.weights={self._config.weights}", "give a smaller teacher, or train on devices with more"
+            ):
+                self._weights = from_pretrained(self._path)
+        return self._weights
