@@ -44,7 +44,7 @@ class LossConfig:
 
     `translation_weight`, `rotation_weight` and `field_of_view_weight` weigh the parts of the camera loss, `gamma`
     decays earlier rounds of the camera head, `alpha` rewards confidence; in a distillation it weighs the distance to
-    the teacher's. `quantile` (vggt only) drops the largest depth errors, None keeps all.
+    the teacher's. `quantile` (vggt only), in whole hundredths, drops the largest depth errors, None keeps all.
     """
 
     name: str
@@ -62,6 +62,8 @@ class LossConfig:
         weights = ("translation_weight", "rotation_weight", "field_of_view_weight")
         require_within(self, "[0, inf)", "camera_weight", "depth_weight", *weights, "alpha")
         require_within(self, "(0, 1]", "gamma", "quantile")
+        if self.quantile is not None and abs(100 * self.quantile - round(100 * self.quantile)) > 1e-6:
+            raise InputError(f"LossConfig.quantile must be in whole hundredths, such as 0.98, got {self.quantile}")
 
 
 @dataclasses.dataclass(frozen=True)

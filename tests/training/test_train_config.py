@@ -108,6 +108,7 @@ def test_missing_fields_are_named(run_config: TrainConfig) -> None:
     [
         ("loss.name", "huber", "must be one of"),
         ("loss.gamma", 0.0, "must lie in"),
+        ("loss.quantile", 0.995, r"must be in whole hundredths, such as 0\.98, got 0\.995"),
         ("optimizer.schedule", "step", "must be one of"),
         ("optimizer.clip_norm", 0.0, r"must lie in \(0, inf\), got 0\.0"),
         ("optimizer.b1", 1.5, r"must lie in \[0, 1\), got 1\.5"),
@@ -130,6 +131,11 @@ def test_values_are_checked_under_their_names(run_config: TrainConfig, path: str
     _set(values, path, value)
     with pytest.raises(InputError, match=rf"^config\.{re.escape(path)} ?{message}"):
         TrainConfig.from_dict(values)
+
+
+def test_every_hundredth_is_a_quantile(run_config: TrainConfig) -> None:
+    for hundredths in range(1, 101):
+        dataclasses.replace(run_config.loss, quantile=hundredths / 100)
 
 
 def test_folders_at_home_are_found(run_config: TrainConfig, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -71,6 +71,17 @@ def depth_losses(
     return {name: _shard_value(jnp.where(enough, value, 0.0)) for name, value in values.items()}
 
 
+def quantile_rank(count: jax.Array, quantile: float) -> jax.Array:
+    """int32 scalar: the place, from 0, of a `quantile` in whole hundredths among `count` values, rounded half to even.
+
+    In integers, of any number of pixels: float32 cannot hold the ranks of a large batch, int32 not a hundred of them.
+    """
+    hundredths, last = round(quantile * 100), jnp.maximum(count, 1) - 1
+    rank = hundredths * (last // 100) + hundredths * (last % 100) // 100
+    rest = hundredths * (last % 100) % 100
+    return rank + ((rest > 50) | ((rest == 50) & (rank % 2 == 1)))
+
+
 def _bounded(values: jax.Array) -> jax.Array:
     """Values of any shape within ±`LIMIT`, 0 where they are not finite."""
     return jnp.clip(jnp.where(jnp.isfinite(values), values, 0.0), -LIMIT, LIMIT)
@@ -88,13 +99,8 @@ def _mean_below_quantile(values: jax.Array, valid: jax.Array, quantile: float | 
     if quantile is None:
         return jnp.where(valid, values, 0.0).sum() / jnp.maximum(count, 1)
     limited = jnp.minimum(values, LIMIT)
-    # Integers in hundredths, rounded half to even: float32 cannot hold the ranks of a large batch.
-    hundredths = round(quantile * 100) * (jnp.maximum(count, 1) - 1)
-    rank = hundredths // 100
-    rest = hundredths % 100
-    rank += (rest > 50) | ((rest == 50) & (rank % 2 == 1))
     ranked = jnp.where(valid, jax.lax.stop_gradient(limited), jnp.inf)
-    threshold = jnp.minimum(order_statistic(ranked[None], rank[None])[0], LIMIT)
+    threshold = jnp.minimum(order_statistic(ranked[None], quantile_rank(count, quantile)[None])[0], LIMIT)
     kept = valid & (limited < threshold)
     kept = jnp.where(kept.sum() > MIN_FILTERED, kept, valid)
     long = count > MIN_FILTERED

@@ -1,6 +1,8 @@
 """The losses of VGGT's released trainer against its own values."""
 
+import functools
 import json
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +44,14 @@ def test_depth_losses(golden: Golden, options: dict[str, Any], case: str) -> Non
     found = depth_losses(depth, confidence, targets.depth, targets.depth_valid, alpha=0.2, **options)
     for name, key in (("confidence", "conf"), ("regression", "reg"), ("gradient", "grad")):
         assert float(found[f"depth_{name}"].value()) == pytest.approx(losses[case][f"loss_{key}_depth"], rel=1e-5)
+
+
+@pytest.mark.parametrize("quantile", [0.98, 0.5, 0.29, 1.0])
+def test_a_quantiles_rank_is_right_for_any_number_of_pixels(quantile: float) -> None:
+    counts = np.array([0, 1, 2, 51, 101, 12_345, 21_913_100, 30_000_000, 2**31 - 1], np.int32)
+    found = jax.vmap(functools.partial(vggt_losses.quantile_rank, quantile=quantile))(counts)
+    expected = [round(Fraction(round(100 * quantile), 100) * (max(int(count), 1) - 1)) for count in counts]
+    assert found.dtype == np.int32 and found.tolist() == expected
 
 
 def test_fewer_than_a_hundred_pixels_count_as_none() -> None:
