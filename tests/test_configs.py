@@ -5,8 +5,11 @@ import importlib
 import math
 import operator
 import os
+import re
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import jax
 import pytest
@@ -26,6 +29,7 @@ from logvggt_jax.training.step.costs import abstract_clips
 from logvggt_jax.training.step.optimizer import learning_rate_schedule
 from logvggt_jax.training.step.program import abstract_parameters, make_program
 from logvggt_jax.training.step.state import TrainState
+from logvggt_jax.training.validation.validation import clip_starts
 from logvggt_jax.weights.folder import write_description
 from logvggt_jax.weights.provenance import Provenance
 
@@ -141,6 +145,18 @@ def test_finetuning_takes_sizes_and_pictures_from_the_model_it_starts_from(
     assert TrainConfig.from_dict(converted.to_dict()).model == vggt.model, "stored in float32, trained in bfloat16"
     trained, validated = own.data.sources[0], own.validation.sources[0]
     assert (trained.frames, validated.frames) == ((None, -200), (-200, None)), "what is validated is not trained on"
+
+
+def test_the_clips_of_validation_fit_the_shortest_recording_that_the_page_names(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    page = (ROOT / "docs/own-sequences.md").read_text()
+    found = re.search(r"a short recording may have room for no more than `:-(\d+)` and `-(\d+):`", page)
+    assert found is not None and found[1] == found[2]
+    settings = _config("finetune", monkeypatch).validation
+    assert settings is not None
+    recording: Any = SimpleNamespace(sequences=["walk"], num_frames=lambda _: int(found[1]))
+    assert len(clip_starts("tum_recording", recording, settings)) == settings.num_clips
 
 
 def test_finetuning_goes_on_from_its_own_folder_where_its_first_weights_are_gone(
