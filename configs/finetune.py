@@ -53,8 +53,8 @@ def tuning(model: str) -> ConfigDict:
             "batch_size": 4,
             "min_stride": 1,
             "max_stride": 8,
-            # A stage compiles those that its pictures have.
-            "sizes": (*images, *((width, height) for height, width in images)),
+            # A stage compiles those that its pictures have; of the smallest edges some are one.
+            "sizes": tuple(dict.fromkeys((*images, *((width, height) for height, width in images)))),
         }
     }
     config.optimizer.learning_rate = 5e-4 if sizes.encoder.embed_dim < SMALL else 2e-5

@@ -138,6 +138,10 @@ def test_finetuning_takes_sizes_and_pictures_from_the_model_it_starts_from(
     assert own.model == small_config and own.initial_weights == str(tmp_path)
     assert own.stages[0].sizes == ((56, 70), (42, 70), (70, 56), (70, 42))
     assert own.optimizer.learning_rate > vggt.optimizer.learning_rate
+    for edge, sizes in ((42, ((28, 42), (42, 28))), (14, ((14, 14),))):
+        write_description(tmp_path / "model", {**known, "provenance": Provenance("windows", edge).to_dict()})
+        small = importlib.import_module("configs.finetune").get_config(str(tmp_path))
+        assert TrainConfig.from_dict(small.to_dict()).stages[0].sizes == sizes
     (tmp_path / "converted").mkdir()
     known = {"config": ModelConfig().to_dict(), "digests": {}, "provenance": Provenance("vggt", 518).to_dict()}
     write_description(tmp_path / "converted", known)

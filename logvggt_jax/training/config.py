@@ -127,6 +127,8 @@ class StageConfig:
             raise InputError("StageConfig.sizes is empty, give at least one (height, width)")
         for size in self.sizes:
             check_size(size, "StageConfig.sizes")
+        if len(set(self.sizes)) < len(self.sizes):
+            raise InputError(f"StageConfig.sizes must be different (height, width), got {self.sizes}")
 
     @property
     def clip_shapes(self) -> frozenset[tuple[int, ...]]:

@@ -119,6 +119,7 @@ def test_missing_fields_are_named(run_config: TrainConfig) -> None:
         ("stages.first.min_stride", 3, "=3 exceeds max_stride=2"),
         ("stages.first.steps", 0, "must be a positive integer, got 0"),
         ("stages.first.sizes", ((28, 42), (50, 70)), r"must be \(H, W\), multiples of 14 pixels, got \(50, 70\)"),
+        ("stages.first.sizes", ((28, 42), (28, 42)), r"must be different \(height, width\), got"),
         ("stages.first.sizes", ((0, 70),), r"must be \(H, W\), multiples of 14 pixels, got \(0, 70\)"),
         ("stages.first.steps", "50", "must be a whole number, got '50'"),
         ("data.cache_dir", "", "='': the path is empty"),
