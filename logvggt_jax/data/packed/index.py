@@ -4,7 +4,8 @@ packed.json                 the data set, its splits, every sequence with its pl
                             written last: a folder without it is not complete
 plan.json                   which sequences go into which shard, for a run of `pack` that goes on
 shard-00000.array_record    one record a frame (see `records`), the frames of a sequence in a row
-shard-00000.json            of the shard's sequences: names of frames, and what else their reader knows
+shard-00000.json            of the shard's sequences: names of frames, and what else their reader knows; which frames
+                            could not be read, and why
 """
 
 import hashlib

@@ -81,8 +81,8 @@ def pack(
 
     Sequences lie whole, in order, a shard being full with `frames_per_shard` frames. Shards appear when they are
     complete, with their digests; the same command goes on after an interruption, and on a finished folder writes anew
-    what is damaged, and what has changed in the data set since (see `Reader.content_digest`). What cannot be read is
-    kept as such: reading it back fails with the same message. `workers` processes read at once.
+    what is damaged, and what has changed in the data set since (see `Reader.content_digest`) or can be read by now.
+    What cannot be read is kept as such: reading it back fails with the same message. `workers` processes read at once.
 
     Raises OutputExists where `output` holds something else, InputError where it was begun with other data or settings
     or another run is at work on it, DiskError where it cannot be written, MissingPackage where the set's files need a
