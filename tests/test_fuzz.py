@@ -123,6 +123,11 @@ def test_a_case_leaves_nothing_behind(tmp_path: Path) -> None:
     read_well(valid, tmp_path)
 
 
+def test_every_kind_has_a_name_of_its_own() -> None:
+    names = [kind.name for kind in KINDS]
+    assert len(set(names)) == len(names)  # of two with one name only one would be run
+
+
 @pytest.mark.parametrize("name", SAMPLED)
 def test_damaged_inputs_give_a_result_or_one_line_with_a_file(name: str, tmp_path: Path) -> None:
     kinds = [kind for kind in KINDS if kind.name == name]

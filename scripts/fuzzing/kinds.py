@@ -304,7 +304,7 @@ KINDS = (
         for name in _datasets()
     ),
     Kind("packed", _write_packed, _read_packed),
-    Kind("images", _write_images, functools.partial(_read_source, "")),
+    Kind("photographs", _write_images, functools.partial(_read_source, "")),
     Kind("video", _write_video, functools.partial(_read_source, "walk.mp4")),
     Kind("video by opencv", _write_video, _read_video_by_opencv),
     Kind("safetensors", _write_safetensors, functools.partial(_read_checkpoint, "model.safetensors")),
