@@ -48,9 +48,8 @@ def write_check_picture(path: Path, dataset: FolderDataset, sequences: Sequence[
             axis.set_axis_off()
         for place, (frames, index) in enumerate(zip(views, sequence.examples, strict=True)):
             _draw_frame(figure, row[2 * place : 2 * place + 2], frames, names[index])
-        row[0].text(
-            -0.04, 0.5, sequence.name, rotation=90, va="center", ha="right", transform=row[0].transAxes, fontsize=8
-        )
+        label = row[0].text(-0.04, 0.5, sequence.name, rotation=90, va="center", ha="right", fontsize=8)
+        label.set(transform=row[0].transAxes, parse_math=False)
         _draw_from_above(row[4], dataset.extrinsics(sequence.name), views)
     figure.suptitle(dataset.title, fontsize=10)
     with atomic_file(path) as temporary:
@@ -80,7 +79,7 @@ def view_from_above(extrinsics: np.ndarray) -> np.ndarray:
 def _draw_frame(figure: Any, axes: Any, frames: Frames, name: str) -> None:
     depth = np.where(frames.depth[0] > 0, frames.depth[0], np.nan)
     axes[0].imshow(frames.images[0])
-    axes[0].set_title(name, fontsize=8)
+    axes[0].set_title(name, fontsize=8, parse_math=False)
     limit = float(np.nanpercentile(depth, 99)) if np.isfinite(depth).any() else 1.0
     drawn = axes[1].imshow(depth, cmap=DEPTHS_IN_MATPLOTLIB, vmax=limit)
     axes[1].set_title("depth (m)" if frames.metric else "depth", fontsize=8)
