@@ -6,6 +6,7 @@ decides (`jpeg.py`), which takes half as long again.
 """
 
 import re
+import struct
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,6 +23,8 @@ PNG_START = b"\x89PNG\r\n\x1a\n"
 # Within entropy-coded data a real marker is FF followed by neither 00, a restart marker nor a fill byte.
 _JPEG_MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 _JPEG_END, _JPEG_SCAN = 0xD9, 0xDA
+_TIFF_ORDERS = {b"II*\0": "<", b"MM\0*": ">"}
+_TIFF_ORIENTATION = 0x112
 
 
 def read_rgb(path: str | Path) -> np.ndarray:
@@ -84,12 +87,29 @@ def _decode(path: Path) -> np.ndarray:
     if not data or (data.startswith(PNG_START) and not png_is_whole(data)):
         raise BrokenPicture(f"{path}: truncated or damaged picture of {len(data)} bytes: fetch it again")
     try:
-        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        picture = cv2.imdecode(np.frombuffer(_as_stored(data), np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         raise BrokenPicture(f"{path}: not a picture that OpenCV can decode ({error.err}): fetch it again") from error
     if picture is None:
         raise BrokenPicture(f"{path}: not a picture that OpenCV can decode: fetch it again")
     return picture
+
+
+def _as_stored(data: bytes) -> bytes | bytearray:
+    """A TIFF file that says that its rows are in order: OpenCV turns those that say otherwise, and no other format."""
+    order = _TIFF_ORDERS.get(data[:4])
+    if order is None:
+        return data
+    content = bytearray(data)
+    try:
+        (position,) = struct.unpack_from(f"{order}I", content, 4)
+        (count,) = struct.unpack_from(f"{order}H", content, position)
+        for entry in range(position + 2, position + 2 + 12 * count, 12):
+            if struct.unpack_from(f"{order}H", content, entry)[0] == _TIFF_ORIENTATION:
+                struct.pack_into(f"{order}H", content, entry + 8, 1)
+    except struct.error:  # damaged, which the decoder tells
+        return data
+    return content
 
 
 def _jpeg_is_regular(data: bytes) -> bool:

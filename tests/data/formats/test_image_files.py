@@ -24,6 +24,23 @@ def test_lossless_pictures_come_back_in_rgb(tmp_path: Path, suffix: str):
     assert np.array_equal(read_rgb(write(tmp_path / f"a.{suffix}", PICTURE[..., ::-1])), PICTURE)
 
 
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize(("suffix", "lossless"), [("jpg", {"quality": 100}), ("png", {}), ("webp", {"lossless": True})])
+def test_pixels_are_as_stored_whatever_orientation_the_camera_notes(
+    tmp_path: Path, orientation: int, suffix: str, lossless: dict
+):
+    noted = Image.Exif()
+    noted[0x112] = orientation
+    flat = np.full((40, 60, 3), 200, np.uint8)
+    flat[:20, :30] = 30
+    Image.fromarray(flat).save(tmp_path / f"a.{suffix}", exif=noted, **lossless)
+    assert np.abs(read_rgb(tmp_path / f"a.{suffix}").astype(int) - flat).max() < 8
+    Image.fromarray(PICTURE).save(tmp_path / "a.tif", tiffinfo={0x112: orientation})
+    assert np.array_equal(read_rgb(tmp_path / "a.tif"), PICTURE)
+    Image.fromarray(DEPTH).save(tmp_path / "d.tif", tiffinfo={0x112: orientation})
+    assert np.array_equal(read_depth(tmp_path / "d.tif"), DEPTH)
+
+
 @pytest.mark.parametrize("progressive", [0, 1])
 def test_jpeg_pictures_come_back_in_rgb(tmp_path: Path, progressive: int):
     smooth = cv2.GaussianBlur(PICTURE, (0, 0), 5)
