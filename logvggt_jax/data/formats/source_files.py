@@ -1,5 +1,6 @@
 """The folders and text files that a listing is made from, read with their state remembered."""
 
+import codecs
 import re
 import stat
 from collections.abc import Sequence
@@ -11,6 +12,7 @@ from logvggt_jax.data.errors import MissingFiles, missing_file
 from logvggt_jax.errors import DiskError, InputError
 
 _ABSENT = -1
+_UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
 
 class SourceFiles:
@@ -49,9 +51,10 @@ class SourceFiles:
 
     def text(self, path: Path, expected: str) -> str:
         """A text file's content, without a byte order mark; MissingFiles saying what was `expected`, InputError for
-        other bytes."""
+        other bytes than UTF-8 or, behind its mark, UTF-16, in which Windows' shell redirects."""
+        content = self.content(path, expected)
         try:
-            return self.content(path, expected).decode("utf-8-sig")
+            return content.decode("utf-16" if content[:2] in _UTF_16 else "utf-8-sig")
         except UnicodeDecodeError as error:
             raise InputError(f"{path}: not a text file ({error.reason}): fetch it again") from error
 

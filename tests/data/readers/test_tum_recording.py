@@ -128,6 +128,16 @@ def test_times_that_are_none_are_named(recording: Path, table: str, time: str):
         TUMRecording(recording.parent).num_frames(NAME)
 
 
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16-le", "utf-16-be"])
+def test_tables_may_be_written_by_windows(recording: Path, encoding: str):
+    """With its line ends, in the encodings of its editor and its shell."""
+    for path in recording.glob("*.txt"):
+        text = path.read_text().replace("\n", "\r\n")
+        mark = "" if encoding == "utf-8-sig" else "\ufeff"
+        path.write_bytes((mark + text).encode(encoding))
+    check_views(TUMRecording(recording).read(NAME, range(5)), VIEWS, **ERRORS)
+
+
 def test_a_calibration_may_begin_with_a_byte_order_mark(recording: Path):
     before = TUMRecording(recording.parent).read(NAME, [0]).intrinsics
     (recording / "calibration.txt").write_text(f"\ufeff{CALIBRATION}", encoding="utf-8")
