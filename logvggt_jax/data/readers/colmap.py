@@ -71,19 +71,20 @@ class Colmap(FolderDataset):
         image_file, images = read_images(files, model)
         images = [images[position] for position in natural_order([image.name for image in images])]
         paths = pictures_below(pictures, [image.name for image in images], image_file)
-        names = {pictures: set(files.names(pictures, self.expects)), **names_beside(files, paths, image_file)}
+        names = [path.relative_to(pictures).as_posix() for path in paths]
+        held = {pictures: set(files.names(pictures, self.expects)), **names_beside(files, paths, image_file)}
         used = {image.camera for image in images}
         known = {number: _camera(cameras, number, camera_file, image_file) for number in used}
-        there = {each / name for each, held in names.items() for name in held}
+        there = {each / name for each, inside in held.items() for name in inside}
         yield from (Dropped("no pose") for path in there - set(paths) if is_picture(path))
-        depths = _depth_files(files, folder, [image.name for image in images])
-        for image, path in zip(images, paths, strict=True):
-            depth = depths.get(image.name) if depths else path  # a picture in depth's place stands for no depth
+        depths = _depth_files(files, folder, names)
+        for image, name, path in zip(images, names, paths, strict=True):
+            depth = depths.get(name) if depths else path  # a picture in depth's place stands for no depth
             if depth is None:
                 yield Dropped("no depth")
                 continue
             intrinsics, lens = known[image.camera]
-            others = {"name": image.name, "calibration": camera_file, "lens": lens.row}
+            others = {"name": name, "calibration": camera_file, "lens": lens.row}
             yield frame(path, depth, intrinsics, image.extrinsics, **others)
 
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -36,8 +36,9 @@ def find_recordings(
 
 
 def file_below(folder: Path, name: str, named_by: Path) -> Path:
-    """The file of a name in the list `named_by`; InputError for a name that leads out of the folder."""
-    relative = PurePosixPath(name)
+    """The file of a name in the list `named_by`, with either slash between folders; InputError for a name that leads
+    out of the folder."""
+    relative = PurePosixPath(name.replace("\\", "/"))
     if relative.is_absolute() or ".." in relative.parts or not relative.name:
         raise InputError(f"{named_by}: {name!r} is no file's name below {folder}: export it again")
     return folder / relative

@@ -170,7 +170,7 @@ def listed_files(path: Path, files: SourceFiles) -> tuple[np.ndarray, list[Path]
         words = text.split(maxsplit=1)  # names may have spaces
         if len(words) != 2:
             raise InputError(f"{path}, line {line}: expected 'time file', got {text!r}: fetch the file again")
-        file = path.parent / words[1]
+        file = path.parent / words[1].replace("\\", "/")
         if file in entries:
             raise InputError(f"{path}, line {line}: {words[1]} is listed twice: fetch the file again")
         (time,) = numbers(words[0], f"{path}, line {line}", count=1)

@@ -144,10 +144,11 @@ def test_damaged_depth_maps_are_named(tmp_path: Path, content: bytes):
         Colmap(tmp_path).read(tmp_path.name, [0])
 
 
-def test_pictures_in_folders_of_their_own_are_found(tmp_path: Path):
+@pytest.mark.parametrize("slash", [b"/", b"\\"])
+def test_pictures_in_folders_of_their_own_are_found(tmp_path: Path, slash: bytes):
     write(tmp_path, VIEWS)
     model = tmp_path / NAME / "sparse/0/images.bin"
-    model.write_bytes(model.read_bytes().replace(b"view8.png", b"left/view8.png"))
+    model.write_bytes(model.read_bytes().replace(b"view8.png", b"left" + slash + b"view8.png"))
     for kind in ("images", "depth"):
         folder = tmp_path / NAME / kind
         (folder / "left").mkdir()

@@ -62,6 +62,17 @@ def test_pictures_named_without_their_suffix_are_found(recording: Path):
         open_dataset("nerfstudio", recording).num_frames(NAME)
 
 
+def test_names_with_the_slashes_of_windows_are_found(recording: Path):
+    edit(
+        recording,
+        lambda content: [e.update(file_path=e["file_path"][2:].replace("/", "\\")) for e in content["frames"]],
+    )
+    assert open_dataset("nerfstudio", recording).frame_names(NAME) == list(NAMES)
+    edit(recording, lambda content: content["frames"][0].update(file_path="..\\a.png"))
+    with pytest.raises(InputError, match="is no file's name below"):
+        open_dataset("nerfstudio", recording).num_frames(NAME)
+
+
 def test_a_picture_that_is_named_twice_is_refused(recording: Path):
     edit(recording, lambda content: content["frames"].append(content["frames"][1]))
     with pytest.raises(InputError, match=r"transforms\.json: '\./images/frame_10\.png' is named twice"):

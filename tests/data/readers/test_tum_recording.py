@@ -130,9 +130,9 @@ def test_times_that_are_none_are_named(recording: Path, table: str, time: str):
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16-le", "utf-16-be"])
 def test_tables_may_be_written_by_windows(recording: Path, encoding: str):
-    """With its line ends, in the encodings of its editor and its shell."""
+    """With its line ends and slashes, in the encodings of its editor and its shell."""
     for path in recording.glob("*.txt"):
-        text = path.read_text().replace("\n", "\r\n")
+        text = path.read_text().replace("\n", "\r\n").replace("/", "\\")
         mark = "" if encoding == "utf-8-sig" else "\ufeff"
         path.write_bytes((mark + text).encode(encoding))
     check_views(TUMRecording(recording).read(NAME, range(5)), VIEWS, **ERRORS)
