@@ -10,7 +10,7 @@ import numpy as np
 from logvggt_jax.data.checks.consistency import differences
 from logvggt_jax.data.formats.calibration import OPENGL_AXES
 from logvggt_jax.frames import Frames
-from logvggt_jax.geometry import invert
+from logvggt_jax.geometry import invert, matrix_to_quaternion, quaternion_to_matrix
 
 # A figure below is as good as any; and what a mistake must divide it by.
 _GOOD, _EXPLAINED = 0.01, 2.0
@@ -20,6 +20,7 @@ _CAMERAS = (
     "with the poses read the other way round (world-to-camera for camera-to-world, or the reverse)",
     "with y and z of the cameras' axes turned round (OpenGL's for OpenCV's, or the reverse)",
     "with the poses read the other way round and y and z of the cameras' axes turned round",
+    "with the first number of the poses' quaternions taken for w, not the last",
 )
 
 
@@ -29,10 +30,18 @@ def figures(frames: Frames) -> np.ndarray:
     first, second = frames.extrinsics.astype(np.float64)
     axes = OPENGL_AXES
     as_read = second @ invert(first)
-    cameras = [invert(second) @ first, axes @ as_read @ axes, axes @ invert(second) @ first @ axes]
+    other_way, w_first = invert(second) @ first, _w_first(second) @ invert(_w_first(first))
+    cameras = [other_way, axes @ as_read @ axes, axes @ other_way @ axes, w_first]
     scaled = np.tile(as_read, (1 + len(_FACTORS), 1, 1))
     scaled[:, :3, 3] *= np.array([0.0, *_FACTORS])[:, None]
     return differences(frames, np.stack([as_read, scaled[0], *cameras, *scaled[1:]]))
+
+
+def _w_first(extrinsics: np.ndarray) -> np.ndarray:
+    """World-to-camera [4, 4] of a camera-to-world quaternion that was stored as w x y z and read as x y z w."""
+    pose = invert(extrinsics)
+    pose[:3, :3] = quaternion_to_matrix(np.roll(matrix_to_quaternion(pose[:3, :3]), -1))
+    return invert(pose)
 
 
 def mend(found: np.ndarray) -> str | None:
@@ -48,4 +57,5 @@ def mend(found: np.ndarray) -> str | None:
     if middle[best] > middle[1] / _EXPLAINED:  # poses that jump, and are better without a way between them
         return None
     factor = _FACTORS[best - 2 - len(_CAMERAS)]
-    return f"{middle[best]:.1%} with depth {'divided' if factor > 1 else 'multiplied'} by {max(factor, 1 / factor):.2g}"
+    done = "divided" if factor > 1 else "multiplied"
+    return f"{middle[best]:.1%} with depth {done} by about {max(factor, 1 / factor):.2g}"
