@@ -1,4 +1,4 @@
-"""Mistakes of people's own recordings that depth and poses tell, however little the camera moves.
+"""Mistakes of people's own recordings that depth and poses tell, also where the camera moves little.
 
 What a wrong direction, wrong axes or another unit do to the figure of `consistency` depends on the camera's way; with a
 short one it stays below any limit that noise leaves. Told is therefore a mistake without which the figure would be a
