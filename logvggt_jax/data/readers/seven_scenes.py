@@ -28,6 +28,8 @@ _CENTRE, _SIZE = (320.0, 240.0), (480, 640)
 _MAX_DEPTH = 10000  # millimetres, valid itself
 _SEQUENCE = re.compile(r"seq-\d{2}")
 _FRAME_FILE = re.compile(r"(frame-\d{6})\.(color\.png|color\.jpg|depth\.proj\.png|depth\.png|pose\.txt)")
+# Rendered rooms have the set's names, and cameras of their own.
+_OTHER_CAMERA = "intrinsics.txt"
 _LIST_LINE = re.compile(r"[^\d]*(\d+)[^\d]*")
 _LIST_FILES = {"train": "TrainSplit.txt", "test": "TestSplit.txt"}
 
@@ -83,7 +85,13 @@ class SevenScenes(FolderDataset):
 
     def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
         kinds: dict[str, set[str]] = {}
-        for name in files.names(folder, "a sequence's frames"):
+        names = files.names(folder, "a sequence's frames")
+        if _OTHER_CAMERA in names:
+            raise InputError(
+                f"{folder}: holds {_OTHER_CAMERA}, as what `logvggt render-room` writes, and {self.title} has none but "
+                "the camera of the set: such rooms are the data set `rooms`; take the file away if it is another"
+            )
+        for name in names:
             if match := _FRAME_FILE.fullmatch(name):
                 kinds.setdefault(match[1], set()).add(match[2])
         if not kinds:

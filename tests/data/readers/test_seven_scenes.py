@@ -10,6 +10,7 @@ from logvggt_jax.data import open_dataset
 from logvggt_jax.data.checks.consistency import depth_consistency
 from logvggt_jax.data.dataset import check_frames
 from logvggt_jax.data.readers.seven_scenes import SevenScenes
+from logvggt_jax.errors import InputError
 from logvggt_jax.geometry import unproject
 
 SHIFT = np.array([-0.025, 0.0, 0.0])
@@ -154,6 +155,12 @@ def test_jpeg_colour_is_accepted(root: Path):
     write_frame(root / "den/seq-03", 4, suffix="jpg", size=(48, 64))
     frames = SevenScenes(root).read("den/seq-03", [0])
     assert np.abs(frames.images[0].astype(int) - picture(4, (48, 64))).max() < 6
+
+
+def test_a_rendered_room_whose_camera_is_not_the_sets_is_refused(root: Path):
+    np.savetxt(root / "den/seq-01/intrinsics.txt", np.eye(3))
+    with pytest.raises(InputError, match=r"den/seq-01: holds intrinsics\.txt, as what `logvggt render-room` writes"):
+        SevenScenes(root).num_frames("den/seq-01")
 
 
 def test_picture_sizes_are_found_once_and_despite_a_broken_frame(root: Path, monkeypatch: pytest.MonkeyPatch):
