@@ -21,7 +21,7 @@ from logvggt_jax.training import steps_in_flight
 from logvggt_jax.training.checkpoints.checkpoint_files import Position
 from logvggt_jax.training.checkpoints.run_checkpoints import RunCheckpoints
 from logvggt_jax.training.config import StageConfig, TrainConfig
-from logvggt_jax.training.feeding.batches import stage_batches
+from logvggt_jax.training.feeding.batches import stage_batches, with_all_broken
 from logvggt_jax.training.feeding.device_batches import DeviceBatches
 from logvggt_jax.training.parallel.agreement import (
     Vote,
@@ -309,6 +309,7 @@ class _Run:
 
     def _save(self, position: Position, *, in_place_of: int | None = None) -> None:
         with self.times.other("save"), self.watchdog.other("the save"):
+            position = position._replace(data=with_all_broken(position.data))
             self.checkpoints.save(self.state, position, in_place_of=in_place_of)
 
     def _compile(self, stage: StageConfig, sizes: Sequence[tuple[int, int]], log: MetricsLog) -> None:

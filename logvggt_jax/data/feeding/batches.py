@@ -135,7 +135,7 @@ class BatchIterator(Iterator[Batch]):
         return {"examples": self._consumed, "broken": self.broken.get_state(), **self._identity}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Continues after the examples that `state` counts.
+        """Continues after the examples that `state` counts; process 0 with its broken clips, the others with none.
 
         Raises InputError if the state is of another seed, clip or mixture, of sequences with other frames or of labels
         of another teacher, whose examples would differ.
@@ -156,7 +156,8 @@ class BatchIterator(Iterator[Batch]):
                 )
         self.close()
         self._consumed = int(state["examples"])
-        self.broken.set_state(state["broken"])
+        # Those of all processes together, from which one counts on.
+        self.broken.set_state(state["broken"] if self._process_index == 0 else BrokenClips(0.0).get_state())
 
     def check_sources(self, state: Mapping[str, Any]) -> None:
         """Raises InputError naming sequences that have other frames, or data sets that have labels of another teacher,

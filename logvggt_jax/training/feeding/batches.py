@@ -1,12 +1,15 @@
 """One stream of batches for each stage of a run."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import jax
+import numpy as np
 
 from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.data.feeding.batches import BatchIterator, training_batches
 from logvggt_jax.training.config import DataConfig, StageConfig
+from logvggt_jax.training.parallel.agreement import from_all
 
 
 def stage_batches(
@@ -32,3 +35,11 @@ def stage_batches(
         worker_count=config.worker_count,
         num_threads=config.num_threads,
     )
+
+
+def with_all_broken(state: Mapping[str, Any]) -> dict[str, Any]:
+    """A stream's state as a checkpoint keeps it: with the numbers of clips, and of broken ones, of all processes, from
+    which process 0 counts on. All processes have to ask at the same point."""
+    own = state["broken"]
+    count, clips = from_all(np.array([own["count"], own["clips"]])).sum(0)
+    return {**state, "broken": {**own, "count": int(count), "clips": int(clips)}}

@@ -400,6 +400,10 @@ def test_broken_clips_are_a_share_of_all_clips_whatever_the_number_of_processes(
         iterator.set_state(state)
         next(iterator)
         assert iterator.broken.get_state() == {"count": 60, "clips": 16_001, "messages": ["gone"]}
+    with batches(**options, process_index=3, process_count=16) as iterator:
+        iterator.set_state(state)
+        next(iterator)
+        assert iterator.broken.get_state() == {"count": 0, "clips": 1, "messages": []}, "process 0 counts on"
 
 
 def test_a_sequence_that_cannot_be_listed_changes_no_other_clip():

@@ -13,7 +13,8 @@ from logvggt_jax.data.errors import EmptySplit
 from logvggt_jax.data.feeding.holdouts import HoldOut
 from logvggt_jax.errors import InputError
 from logvggt_jax.training.config import DataConfig, SourceConfig, TrainConfig
-from logvggt_jax.training.feeding.batches import stage_batches
+from logvggt_jax.training.feeding import batches as module
+from logvggt_jax.training.feeding.batches import stage_batches, with_all_broken
 from logvggt_jax.training.feeding.sources import open_source, open_sources
 
 OPTIONS = {"height": 28, "width": 42, "num_frames": 8, "num_rooms": 8}
@@ -115,3 +116,10 @@ def test_a_damaged_data_set_is_not_a_missing_one(tmp_path: Path) -> None:
     present = SourceConfig(name="seven_scenes", root=str(tmp_path), split="all")
     with pytest.raises(FileNotFoundError, match="no sequences of 7-Scenes"):
         open_sources(data(sources=(rooms("train"), present), allow_missing=True))
+
+
+def test_a_checkpoint_counts_the_broken_clips_of_all_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    state = {"examples": 8, "broken": {"count": 1, "clips": 4, "messages": ["gone"]}}
+    assert with_all_broken(state) == state
+    monkeypatch.setattr(module, "from_all", lambda own: np.stack([own, [3, 4]]))
+    assert with_all_broken(state) == {"examples": 8, "broken": {"count": 4, "clips": 8, "messages": ["gone"]}}
