@@ -22,7 +22,7 @@ from logvggt_jax.data.feeding.broken_clips import BrokenClips
 from logvggt_jax.data.feeding.clips import BROKEN, NAME, Size
 from logvggt_jax.data.feeding.listed_frames import check_listed_frames
 from logvggt_jax.data.feeding.mixture import FRAMES, TEACHERS, mixture
-from logvggt_jax.data.feeding.sampling import sampler_for
+from logvggt_jax.data.feeding.sampling import CovisibleDataset, sampler_for
 from logvggt_jax.errors import InputError, one_line
 
 Batch = dict[str, np.ndarray]
@@ -271,6 +271,9 @@ def training_batches(
     strides = dict(strides or {})
     if not strides.keys() <= datasets.keys():
         raise InputError(f"strides must be of {', '.join(datasets)}, got those of {', '.join(strides)}")
+    for name in strides:
+        if isinstance(datasets[name], CovisibleDataset):
+            raise InputError(f"{name}: its frames have no order in time, and its clips no stride: leave stride out")
     samplers = {
         name: sampler_for(dataset, length=clip_length, stride=strides.get(name, stride), reverse=reverse)
         for name, dataset in datasets.items()

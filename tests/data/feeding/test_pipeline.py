@@ -164,6 +164,8 @@ def test_unordered_sets_are_walked():
     assert all(len({frame % 2 for frame in clip[1:]}) == 1 and len(set(clip[1:])) == 4 for clip in drawn)
     with pytest.raises(ValueError, match="photographs: none of 4 sequences has the 6 frames connected"):
         batches({"photographs": Photographs(4)}, clip_length=6)
+    with pytest.raises(InputError, match="photographs: its frames have no order in time, and its clips no stride"):
+        batches({"photographs": Photographs(4)}, strides={"photographs": (1, 4)})
 
 
 def test_a_seed_decides_everything():
