@@ -92,8 +92,12 @@ class RunTimes:
 
     @property
     def costs(self) -> dict[str, float]:
-        """Seconds that one of each kind of `other` takes: the mean since the start, else that of the start before."""
-        return self._earlier | {kind: sum(seconds) / len(seconds) for kind, seconds in self._others.items()}
+        """Seconds that one of each kind of `other` takes: the mean since the start, else that of the start before.
+
+        The first validation of a start compiles, and counts as long as it is the only one.
+        """
+        later = {kind: seconds[1:] or seconds for kind, seconds in self._others.items()}
+        return self._earlier | {kind: sum(seconds) / len(seconds) for kind, seconds in later.items()}
 
     def remaining_seconds(self, step: int, end: int | None = None) -> float:
         """Seconds until step `end` (None: the last of all), if frames, validations and saves take as long as so far.
