@@ -5,6 +5,7 @@ import errno
 import functools
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -252,6 +253,25 @@ def test_every_process_reads_its_share_and_all_know_what_one_cannot_read(
     assert first._clips == second._clips and len(first.sequences) == 6
     assert [name for name in first.sequences if name not in first.labelled().sequences] == [f"{rooms.sequences[0]}@4"]
     assert sum(process == 1 for process, _ in read) == 4 + 4 + 2
+
+
+def test_a_process_that_cannot_label_says_so_before_the_others_are_done(
+    rooms: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    logging.use_python_logging(quiet=True)
+    said: list[str] = []
+
+    def any_process(wants: bool) -> bool:  # waits for the others
+        said.append(caplog.text)
+        return wants
+
+    monkeypatch.setattr(jax, "process_count", lambda: 2)
+    monkeypatch.setattr(module, "check_agreement", lambda *_: None)
+    monkeypatch.setattr(module, "any_process", any_process)
+    (tmp_path / "teacher").write_text("in the way")
+    with pytest.raises(DiskError):
+        labelled(rooms, tmp_path)
+    assert re.search(r"rooms: .*teacher.*: .*; this process waits until the others", said[0])
 
 
 def test_a_teacher_of_another_kind_is_refused(small_config: ModelConfig, tmp_path: Path) -> None:

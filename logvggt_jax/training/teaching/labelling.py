@@ -14,7 +14,7 @@ from logvggt_jax.data.dataset import Dataset, DrawnOnDevice
 from logvggt_jax.data.feeding.broken_clips import describe
 from logvggt_jax.data.feeding.frame_range import longest
 from logvggt_jax.data.feeding.transforms import fit_each, nearest_size
-from logvggt_jax.errors import InputError
+from logvggt_jax.errors import InputError, one_line
 from logvggt_jax.training.config import TeacherConfig
 from logvggt_jax.training.parallel.agreement import any_process, check_agreement, from_all
 from logvggt_jax.training.teaching.labels import DIGEST_BYTES, is_labelled, label_digest, label_folder, write_labels
@@ -74,6 +74,10 @@ def taught(
                 found[place, 1:] = [1, *digest]
     except InputError as error:
         failure = error
+        if jax.process_count() > 1:  # which may label for hours before this one can end
+            logging.error(
+                "%s: %s; this process waits until the others have labelled their clips", name, one_line(error)
+            )
     # Whoever has failed: the others wait for its clips.
     if any_process(failure is not None):
         raise failure or InputError(f"{name}: another process cannot label its clips; its output says why")
