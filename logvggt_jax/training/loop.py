@@ -2,7 +2,7 @@
 
 import contextlib
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import jax
@@ -107,7 +107,7 @@ def train(
         # Before gigabytes of weights are read, and unwatched: to label all clips, or to list a disk, takes hours.
         datasets, validated = open_data(config)
         watched = stack.enter_context(Watchdog(watchdog))
-        run = _Run(config, workdir, program, watched, validated)
+        run = _Run(config, workdir, program, watched, validated, trained_on=datasets)
         run.profiler = stack.enter_context(Profiler(profile, workdir / "profile"))
         stack.enter_context(run.checkpoints)
         stop = stack.enter_context(StopRequest("SIGTERM", "SIGINT"))
@@ -134,7 +134,14 @@ class _Run:
     profiler: Profiler
 
     def __init__(
-        self, config: TrainConfig, workdir: Path, program: Program, watchdog: Watchdog, validated: Sequence[Dataset]
+        self,
+        config: TrainConfig,
+        workdir: Path,
+        program: Program,
+        watchdog: Watchdog,
+        validated: Sequence[Dataset],
+        *,
+        trained_on: Collection[str] | None = None,
     ) -> None:
         layout = program.layout
         self.config, self.program, self.mesh, self.watchdog = config, program, layout.mesh, watchdog
@@ -144,7 +151,7 @@ class _Run:
         self.validation = None
         if config.validation is not None:
             self.validation = Validation(LogVGGT(config.model), config.validation, layout, validated)
-        self.checkpoints = RunCheckpoints(workdir, config)
+        self.checkpoints = RunCheckpoints(workdir, config, trained_on=trained_on)
         self.peak = None
         if layout.mesh.devices.flat[0].platform != "cpu":  # whose cores share one peak
             self.peak = layout.mesh.size * matmul_flops_per_second(config.model.dtype)

@@ -468,6 +468,17 @@ def test_the_data_are_looked_for_before_the_weights_are_read(
         train(dataclasses.replace(run_config, data=data), tmp_path / "run", mesh=data_mesh(2))
 
 
+def test_the_model_names_the_data_that_it_was_trained_on_and_none_that_were_missing(
+    run_config: TrainConfig, tmp_path: Path
+) -> None:
+    absent = SourceConfig(name="scannet", root=str(tmp_path / "none"), split="train")
+    data = dataclasses.replace(run_config.data, sources=(*run_config.data.sources, absent), allow_missing=True)
+    config = dataclasses.replace(run_config, data=data, max_minutes=1e-9)
+    train(config, tmp_path / "run", mesh=data_mesh(2))
+    training = read_provenance(tmp_path / "run" / "model").training
+    assert training is not None and training.data == "rooms (train)"
+
+
 def test_the_watchdog_sleeps_while_the_data_are_opened(
     run_config: TrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -42,10 +42,11 @@ class RunCheckpoints:
     `<step>.aside`. A model folder that another run or a conversion wrote is never replaced: OutputExists.
     """
 
-    def __init__(self, workdir: Path, config: TrainConfig) -> None:
+    def __init__(self, workdir: Path, config: TrainConfig, *, trained_on: Collection[str] | None = None) -> None:
+        """Args: `trained_on`: see `RunModels`."""
         self.config = config
         self.folder = workdir.absolute() / "checkpoints"
-        self.models = RunModels(self.folder.parent, config)
+        self.models = RunModels(self.folder.parent, config, trained_on)
         self._honoured = self.folder / "resumed.json"
         self._lock: FolderLock | None = None
         self._writer = ThreadPoolExecutor(1, "checkpoints")

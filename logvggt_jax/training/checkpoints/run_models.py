@@ -6,7 +6,7 @@ import contextlib
 import functools
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -28,9 +28,10 @@ class RunModels:
       newest, best: their folders.
     """
 
-    def __init__(self, workdir: Path, config: TrainConfig) -> None:
+    def __init__(self, workdir: Path, config: TrainConfig, trained_on: Collection[str] | None = None) -> None:
+        """Args: `trained_on` are the names of the data sets that are there, None stands for all of `config`."""
         self.newest, self.best = workdir / "model", workdir / "best"
-        self._workdir, self._config = workdir, config
+        self._workdir, self._config, self._trained_on = workdir, config, trained_on
 
     @property
     def best_step(self) -> int | None:
@@ -111,9 +112,11 @@ class RunModels:
 
     def _provenance(self, step: int) -> Provenance:
         longer_edge = max(max(size) for stage in self._config.stages for size in stage.sizes)
+        named = self._config.data.sources
+        used = [source for source in named if self._trained_on is None or source.name in self._trained_on]
         record = TrainingRecord(
             configuration=self._config.to_dict(),
-            data=", ".join(f"{source.name} ({source.split})" for source in self._config.data.sources),
+            data=", ".join(f"{source.name} ({source.split})" for source in used),
             steps=step,
             device=f"{jax.device_count()} x {jax.devices()[0].device_kind}",
         )
