@@ -22,8 +22,8 @@ def get_config(initial_weights: str = "") -> ConfigDict:
 
     With Muon rotation is learned after six hundred steps of single windows; with AdamW it took three thousand.
 
-    From random numbers, or from `initial_weights`, which `from_pretrained` reads: without single windows then, mostly on
-    long clips, and on three times as many rooms, since 1,200 were learned by heart within hours.
+    From random numbers, or from `initial_weights`, which `from_pretrained` reads: without single windows then, mostly
+    on long clips, and on three times as many rooms, since 1,200 were learned by heart within hours.
     """
     config = tiny.get_config()
     config.model.encoder.embed_dim = 96
