@@ -2,9 +2,9 @@
 
     python train.py --config=configs/tiny.py --workdir=runs/tiny
 
-Any field can be changed on the command line, for example --config.optimizer.learning_rate=5e-4. The curriculum
-goes from single windows of 4 frames to clips of 12. Depth is learned within minutes; rotation stays at the
-identity for the first two thousand steps.
+Any field can be changed on the command line, for example --config.optimizer.learning_rate=5e-4, or left out with None
+where it may be (--config.validation.best=None). The curriculum goes from single windows of 4 frames to clips of 12.
+Depth is learned within minutes; rotation stays at the identity for the first two thousand steps.
 """
 
 import math

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 from absl import flags, logging
 from ml_collections import config_flags
@@ -15,6 +16,10 @@ from logvggt_jax.errors import one_line
 _NO_FILE = re.compile(r"Failed loading config file.*\[Errno \d+\] (?P<reason>[^:]+): '(?P<path>[^']*)'", re.DOTALL)
 # What a configuration file of ours has against its argument, behind the library's words.
 _OWN = re.compile(r"(?:logvggt_jax\.errors\.\w+|earlier failure to load): (?P<message>[^\n]+)\s*$")
+# A field that is left out, whatever its type: the library reads numbers and tuples alone where those stand.
+_LEFT_OUT = re.compile(r"--?config\.(?P<field>[^=]+)=None")
+# What the library says at length of a field that is not there.
+_ALL_FIELDS = re.compile(r' Other fields present: "\{.*\}"')
 # In the words of absl, once for each flag.
 _MISSING = re.compile(r"(--\w+) must have a value other than None")
 
@@ -31,18 +36,26 @@ def define_config(program: str, what: str) -> flags.FlagHolder:
 
 
 def flags_parser(program: str) -> Callable[[list[str]], list[str]]:
-    """For `app.run`: reads flags as absl does, and returns the arguments that are none; a mistake ends `program`."""
+    """For `app.run`: reads flags as absl does, and returns the arguments that are none; a mistake ends `program`.
+
+    `--config.FIELD=None` leaves a field out, of any type; it comes after what else is said of that field.
+    """
 
     def parse(arguments: list[str]) -> list[str]:
+        left_out = [found["field"] for found in map(_LEFT_OUT.fullmatch, arguments) if found]
         try:
-            rest = flags.FLAGS(arguments)
+            with _command_line(_others(sys.argv)):
+                rest = flags.FLAGS(_others(arguments))
             config = flags.FLAGS["config"].value
             is_mapping = hasattr(config, "to_dict")  # a file that cannot be loaded says so only now
+            if is_mapping:
+                config.update_from_flattened_dict(dict.fromkeys(left_out))
         except (AttributeError, KeyError) as error:
             # The library wraps one error in the other, with quotes around quotes.
             reason = error.args[0] if error.args else error
             reason = reason.args[0] if isinstance(reason, KeyError) else reason
-            sys.exit(f"{program}: --config has no such field: {' '.join(str(reason).split())}")
+            words = _ALL_FIELDS.sub("", " ".join(str(reason).split()))
+            sys.exit(f"{program}: --config has no such field: {words}")
         except (flags.Error, OSError) as error:
             sys.exit(f"{program}: {_reason(error)}")
         if not is_mapping:
@@ -53,6 +66,20 @@ def flags_parser(program: str) -> Callable[[list[str]], list[str]]:
         return list(rest)
 
     return parse
+
+
+def _others(arguments: list[str]) -> list[str]:
+    return [each for each in arguments if not _LEFT_OUT.fullmatch(each)]
+
+
+@contextlib.contextmanager
+def _command_line(arguments: list[str]) -> Iterator[None]:
+    """Has these in `sys.argv`, where the library looks for the fields that are given, whatever it is told to parse."""
+    whole, sys.argv = sys.argv, arguments
+    try:
+        yield
+    finally:
+        sys.argv = whole
 
 
 def _reason(error: Exception) -> str:

@@ -170,6 +170,21 @@ def test_a_work_folder_at_home_is_one_folder(run_train: Callable, tmp_path: Path
         assert run_train("~/run", *flags, first=given).stdout == f"{tmp_path / 'run'}\n"
 
 
+def test_a_field_of_any_type_may_be_left_out(run_train: Callable, tmp_path: Path) -> None:
+    """The library reads None where tuples stand, and nowhere else."""
+    given = (
+        "import logvggt_jax.training.loop as loop\n"
+        "loop.train = lambda config, *_, **__: print(config.validation.best, config.max_minutes, config.model.dtype)\n"
+    )
+    flags = ("--config.validation.best=None", "--config.max_minutes=None", "--config.model.dtype=bfloat16")
+    assert run_train(tmp_path, *flags, first=given).stdout == "None None bfloat16\n"
+    finished = run_train(tmp_path, "--config.optimizer.learning_rate=None", first=given)
+    assert finished.stderr == "train.py: config.optimizer.learning_rate must be a number, got None\n"
+    finished = run_train(tmp_path, "--config.validation.bst=None", first=given)
+    assert finished.stderr.startswith("train.py: --config has no such field: ") and len(finished.stderr) < 200
+    assert '"best"' in finished.stderr
+
+
 def test_an_argument_that_is_no_flag_is_one_line(run_train: Callable, tmp_path: Path) -> None:
     finished = run_train(tmp_path, "configs/h20.py")
     assert finished.returncode == 1
