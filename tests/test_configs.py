@@ -23,6 +23,7 @@ from logvggt_jax.doctor import training as doctors_step
 from logvggt_jax.errors import InputError, MissingInput
 from logvggt_jax.evaluation.datasets import open_evaluation_set
 from logvggt_jax.evaluation.settings import ClipRun, read_run
+from logvggt_jax.streaming import METHODS
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.parallel.sharding import check_batch_size, data_mesh
 from logvggt_jax.training.step.costs import abstract_clips
@@ -370,6 +371,16 @@ def test_options_of_rooms_that_are_evaluated_can_be_given_on_the_command_line(mo
             assert isinstance(run, ClipRun)
             reader = open_evaluation_set(run.dataset, None, split="test", image_size=(28, 42), options=run.options)
             assert isinstance(reader, Rooms) and reader.furnishing.lights == (lights or 0), name
+
+
+def test_what_decides_a_methods_numbers_can_be_set_on_the_command_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The others are of buffers and of what is shown on the way, or close loops, which is a run of its own."""
+    monkeypatch.syspath_prepend(str(ROOT))
+    settings = importlib.import_module("configs.eval.methods").get_config().settings
+    others = {"ahead", "first_capacity", "provisional", "loops"}
+    for name, method in METHODS.items():
+        fields = {field.name for field in dataclasses.fields(method.settings)} - others
+        assert fields == set(settings.get(name, {})), name
 
 
 def test_frozen_encoder_is_configured_by_the_model(monkeypatch: pytest.MonkeyPatch) -> None:

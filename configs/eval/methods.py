@@ -45,9 +45,10 @@ def get_config() -> ConfigDict:
         {
             "causal": {"camera_cache": "per_round"},
             "anchored-window": {"window": 5},
-            "rolling": {"budget": 12 * 25 * 4, "temperature": 0.5, "camera_cache": "per_round"},
+            "rolling": {"budget": 12 * 25 * 4, "temperature": 0.5, "anchor": 1, "camera_cache": "per_round"},
             "pruned": {"cap": 8 * 25, "bits": 4, "camera_cache": "per_round"},
-            "merged": {"ratio": 0.9, "similarity": "bfloat16"},
+            "merged": {"max_frames": 1000, "ratio": 0.9, "protected": 0.1, "similarity": "bfloat16"},
+            "offline": {"max_frames": 200},
             "chunks": {"size": 12, "overlap": 6},
         }
     )
