@@ -20,6 +20,7 @@ def poses(settings: ProtocolSettings, num_frames: int) -> Protocol:
             f"min({num_frames}, n) of a sequence's n frames (most have 100 to 200, so that 500 are all of them), "
             f"drawn with seed {settings.seed} for each sequence, fed in time order (the paper does not say).",
             "Sequences of the official test lists, or in a copy without them (split all) of all that is there, with "
-            "viewpoint quality above 0.5. Co3Dv2 is a training set as well.",
+            "viewpoint quality above 0.5. Published code leaves out ten of the 51 categories, and sequences of fewer "
+            "than 50 frames; here all count. Co3Dv2 is a training set as well.",
         ),
     )
