@@ -38,6 +38,8 @@ Memories = TypeVar("Memories")
 # Entries of caches that hold one a frame, at first: a few kilobytes a frame.
 CAMERA_CAPACITY = 256
 
+_FAILED = "this stream has failed: open another one"
+
 
 class StreamMemory(NamedTuple):
     """All that a stream carries from frame to frame.
@@ -139,9 +141,9 @@ class FrameSession:
         self._image_size = (frames.shape[1], frames.shape[2])
         results: list[FrameResult] = []
         for frame in frames:
-            self._newest = frame
             with self._device_memory():
                 self._one_frame(frame)
+                self._newest = frame
                 results += self._landed(self._ahead)
         return results
 
@@ -154,11 +156,13 @@ class FrameSession:
         return results
 
     def snapshot(self) -> tuple[list[FrameResult], dict[str, np.ndarray]]:
-        """See `Predictor.snapshot`: the caches whole, with their empty places."""
+        """See `Predictor.snapshot`: the caches whole, with their empty places. ValueError where the stream failed."""
         with self._device_memory():
             results = self._landed(0)
         if self._newest is None:
             return results, {}
+        if self._memory is None:
+            raise ValueError(_FAILED)
         leaves = jax.tree.leaves(self._memory)
         arrays = {f"memory/{i}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
         return results, {**arrays, "newest": self._newest, "encodings": self._encodings.array}
@@ -196,7 +200,7 @@ class FrameSession:
         tokens = tokens_a_frame(self._model.config, self._image_size)
         memory = self._memory
         if memory is None and self._received:
-            raise ValueError("this stream has failed: open another one")
+            raise ValueError(_FAILED)
         if memory is None:
             memory = self._keeping.start(self._model.config, tokens)
         # The session holds no buffer that is about to be given back.

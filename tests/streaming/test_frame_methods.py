@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -19,6 +20,7 @@ from logvggt_jax.streaming import (
     CausalSettings,
     FrameResult,
     MergedSettings,
+    PredictionError,
     PrunedSettings,
     RollingSettings,
     frame_session,
@@ -26,6 +28,7 @@ from logvggt_jax.streaming import (
 )
 from logvggt_jax.streaming.frame_session import FrameSession
 from logvggt_jax.streaming.rolling import KeepWithinBudget
+from logvggt_jax.streaming.state_file import save_stream
 
 FRAMES, TOKENS, LAYERS, WIDTH = 9, 5 + 2 * 3, 4, 32
 IMAGES = np.random.default_rng(0).integers(0, 256, (FRAMES, 28, 42, 3), np.uint8)
@@ -324,6 +327,7 @@ def test_a_budget_below_a_frame(anchor: int, small_config: ModelConfig, small_va
     stream = opened("rolling", small_config, small_variables, RollingSettings(budget=least - 1, anchor=anchor))
     with pytest.raises(InputError, match=rf"budget: {least - 1} tokens leave .* take at least {least}$"):
         stream.push(IMAGES[0])
+    assert stream.snapshot() == ([], {}), "a smaller frame may fit, and need not be like the one that was refused"
 
 
 @pytest.mark.parametrize("anchor", [1, *(pytest.param(anchor, marks=pytest.mark.slow) for anchor in (0, 3))])
@@ -385,3 +389,25 @@ def test_a_closed_stream_takes_no_frame(small_config: ModelConfig, small_variabl
     assert stream.close() == [] and stream.cameras().extrinsics.shape == (0, 3, 4)
     with pytest.raises(ValueError, match="closed"):
         stream.push(IMAGES[0])
+
+
+def test_a_stream_that_has_failed_says_so(
+    small_config: ModelConfig, small_variables: dict, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Its caches are gone: a state without them would take an earlier one's place."""
+
+    def full(*_: Any) -> None:
+        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory")
+
+    model, path = LogVGGT(small_config), tmp_path / "state.safetensors"
+    stream = open_predictor("causal", model, small_variables)
+    stream.push(IMAGES[:2])
+    save_stream(path, stream, model, small_variables, method="causal")
+    before = path.read_bytes()
+    monkeypatch.setattr(frame_session, "_step", full)
+    with pytest.raises(PredictionError, match=r"keeps of 2 frames .* did not fit"):
+        stream.push(IMAGES[2])
+    for use in (lambda: stream.push(IMAGES[2]), lambda: save_stream(path, stream, model, small_variables)):
+        with pytest.raises(ValueError, match="this stream has failed: open another one"):
+            use()
+    assert path.read_bytes() == before and len(stream.close()) == 0
