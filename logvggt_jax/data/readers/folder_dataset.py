@@ -22,7 +22,7 @@ from logvggt_jax.data.errors import EmptySequence, MissingFiles, UnequalSizes
 from logvggt_jax.data.formats.calibration import check_intrinsics
 from logvggt_jax.data.formats.image import read_depth
 from logvggt_jax.data.formats.lens import Lens
-from logvggt_jax.data.formats.source_files import SourceFiles, file_state, refused
+from logvggt_jax.data.formats.source_files import SourceFiles, file_glimpse, file_state, refused
 from logvggt_jax.data.readers.listing_index import ListingIndex, code_digest
 from logvggt_jax.errors import InputError
 from logvggt_jax.frames import Frames
@@ -32,6 +32,7 @@ NO_POSES = np.full((4, 4), np.nan)
 _RECENT = 64
 INDOORS = (0.05, 50.0)  # metres, `plausible_depth` of rooms, halls and tables
 _GAPS = (30, 10, 5, 2, 1)
+_UNCOMPRESSED = (".bin", ".dpt", ".pfm")  # as large as before where another depth is written
 
 
 @dataclass(frozen=True)
@@ -184,13 +185,16 @@ class FolderDataset(Reader):
 
     def content_digest(self, sequence: str) -> str:
         """As of `Reader`: of what is known of the frames before their pictures are opened, poses and calibrations
-        among it, of the number of bytes of their files, and of poses from structure from motion."""
+        among it, of the number of bytes of their files and, where depth is not compressed, of some of these, and of
+        poses from structure from motion."""
         records = self._listing(sequence).frames
         digest = hashlib.sha256()
         for record in records:
             paths = [path for path in (record.image, record.depth, record.companion) if path is not None]
             files = [(os.path.relpath(path, self.root), file_state(path)[1]) for path in paths]
             digest.update(repr((record.name, files, record.depth_scale, record.quarter_turns)).encode())
+            if record.depth.suffix in _UNCOMPRESSED:
+                digest.update(file_glimpse(record.depth))
             digest.update(np.concatenate([record.intrinsics.ravel(), record.extrinsics.ravel(), record.lens]).tobytes())
         sfm = self.sfm_extrinsics(sequence, range(len(records)))
         digest.update(b"" if sfm is None else sfm.tobytes())

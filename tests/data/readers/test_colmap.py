@@ -133,6 +133,19 @@ def test_damaged_text_is_named(tmp_path: Path, file: str, old: str, new: str, co
         Colmap(tmp_path).num_frames(tmp_path.name)
 
 
+def test_another_depth_of_the_same_size_is_other_content(tmp_path: Path):
+    """As a second run of the matching writes it: what was measured on the first is not taken for measured on it."""
+    write_pictures(tmp_path, VIEWS)
+    write_binary_model(tmp_path / "sparse/0", VIEWS)
+    write_depth_map(tmp_path, NAMES[0], VIEWS[0].depth)
+    path = tmp_path / f"stereo/depth_maps/{NAMES[0]}.geometric.bin"
+    size, before = path.stat().st_size, Colmap(tmp_path).content_digest(tmp_path.name)
+    write_depth_map(tmp_path, NAMES[0], VIEWS[0].depth)
+    assert Colmap(tmp_path).content_digest(tmp_path.name) == before
+    write_depth_map(tmp_path, NAMES[0], 1.1 * VIEWS[0].depth)
+    assert path.stat().st_size == size and Colmap(tmp_path).content_digest(tmp_path.name) != before
+
+
 @pytest.mark.parametrize("content", [b"", b"64&48&3&", b"64&48&1&" + bytes(64 * 48 * 4 - 1), b"0&48&1&", b"9" * 5000])
 def test_damaged_depth_maps_are_named(tmp_path: Path, content: bytes):
     write_pictures(tmp_path, VIEWS)
