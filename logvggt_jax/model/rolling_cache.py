@@ -78,8 +78,9 @@ class RollingMemory:
     def at(self, layer: int) -> RollingCache:
         """The cache of `layer` with its budget for this frame."""
         cache = self.layers[layer]
-        # Below the anchor, where the original stops with an index error, the anchor alone stays.
-        budget = jnp.maximum(budgets(self.scores, self.total, self.temperature)[layer], cache.anchor)
+        # Below the anchor, where the original stops with an index error, the anchor alone stays; without an anchor one
+        # token, since what attends to nothing takes in whatever lies in the empty places.
+        budget = jnp.maximum(budgets(self.scores, self.total, self.temperature)[layer], max(cache.anchor, 1))
         return cache.replace(budget=budget)  # type: ignore[attr-defined]
 
     def updated(self, layer: int, memory: LayerMemory) -> RollingMemory:

@@ -84,6 +84,8 @@ def test_budgets_follow_from_the_frame_before_and_never_fall_below_the_anchor() 
     assert int(memory.at(1).budget) == 8, "the first layer's new score counts at the next frame"
     memory = memory.updated(1, memory.at(1))
     assert [int(memory.at(i).budget) for i in range(2)] == [TOKENS, 15], "the anchor alone, where less is left"
+    unanchored = memory.replace(layers=tuple(layer.replace(anchor=0) for layer in memory.layers), temperature=1e-3)
+    assert int(unanchored.at(0).budget) == 1, "never nothing, to which nothing could attend"
     # Frames come and the poor layer keeps the first one.
     cache = memory.at(0)
     for frame in range(3):
