@@ -373,6 +373,17 @@ def test_options_of_rooms_that_are_evaluated_can_be_given_on_the_command_line(mo
             assert isinstance(reader, Rooms) and reader.furnishing.lights == (lights or 0), name
 
 
+def test_ablations_of_another_set_have_no_options_of_rooms(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.syspath_prepend(str(ROOT))
+    get_config = importlib.import_module("configs.eval.ablations").get_config
+    run = read_run(get_config("seven_scenes").to_dict())
+    assert isinstance(run, ClipRun) and (run.dataset, run.split, run.evaluation.stride) == ("seven_scenes", "all", 1)
+    with pytest.raises(InputError, match="no sequences of 7-Scenes"):  # it is the folder that is refused
+        open_evaluation_set(run.dataset, tmp_path, split=run.split, image_size=(28, 42), options=run.options)
+    with pytest.raises(InputError, match="unknown data set 'room'"):
+        get_config("room")
+
+
 def test_what_decides_a_methods_numbers_can_be_set_on_the_command_line(monkeypatch: pytest.MonkeyPatch) -> None:
     """The others are of buffers and of what is shown on the way, or close loops, which is a run of its own."""
     monkeypatch.syspath_prepend(str(ROOT))

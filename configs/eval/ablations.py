@@ -5,8 +5,8 @@
 Every variant is run twice, with the camera head's trunk over all frames and limited to the window's size: over all
 frames it is a global path of its own, which hides what the parts do. Another data set:
 
-    python eval.py --config=configs/eval/ablations.py --config.dataset=seven_scenes --config.split=all \
-        --config.evaluation.stride=1 --data_root=7scenes --checkpoint=runs/tiny/model --output=runs/ablations-7scenes
+    python eval.py --config=configs/eval/ablations.py:seven_scenes --data_root=7scenes --checkpoint=runs/tiny/model \
+        --output=runs/ablations-7scenes
 """
 
 from ml_collections import ConfigDict
@@ -15,14 +15,16 @@ from ml_collections.config_dict import placeholder
 from logvggt_jax.data.option_fields import option_fields
 
 
-def get_config() -> ConfigDict:
-    """Clips of procedural rooms, the full model and its variants; fields of `ClipRun`."""
+def get_config(dataset: str = "rooms") -> ConfigDict:
+    """Clips of procedural rooms, or of another `dataset`, the full model and its variants; fields of `ClipRun`."""
+    is_rooms = dataset == "rooms"
     config = ConfigDict()
     config.title = "Ablations"
-    config.dataset = "rooms"
-    config.split = "test"
+    config.dataset = dataset
+    config.split = "test" if is_rooms else "all"
     # Rooms of the kind that configs/tiny.py trains on, walked round seven times, each time a little aside.
-    config.options = option_fields("rooms", {"num_rooms": 24, "style": "compass", "num_frames": 600, "laps": 7})
+    walked = {"num_rooms": 24, "style": "compass", "num_frames": 600, "laps": 7}
+    config.options = option_fields(dataset, walked if is_rooms else {})
     config.baselines = True
     # Rows of the model: LoG-VGGT's windows, VGGT offline up to max_frames, and VGGT on overlapping chunks, as long as
     # the model was trained at.
@@ -54,7 +56,7 @@ def get_config() -> ConfigDict:
     # (H, W) of the images; by default 3:4 and as large as those that the model was trained at.
     evaluation.image_size = placeholder(tuple)
     evaluation.clip_lengths = (10, 100, 300)
-    evaluation.stride = 2
+    evaluation.stride = 2 if is_rooms else 1
     evaluation.clips_per_sequence = 1
     # Tables show the standard deviation of the sets' means beside the mean of all rooms.
     evaluation.sets = 3
