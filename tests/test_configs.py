@@ -384,6 +384,19 @@ def test_ablations_of_another_set_have_no_options_of_rooms(monkeypatch: pytest.M
         get_config("room")
 
 
+@pytest.mark.parametrize("name", ["rooms", "seven_scenes", "methods", "ablations", "paper"])
+def test_every_field_of_an_evaluation_can_be_changed_on_the_command_line(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(ROOT))
+    values = importlib.import_module(f"configs.eval.{name}").get_config()
+    run = read_run(values.to_dict())
+    parts = [(run, values), (run.timings, values.timings)]
+    parts.append((run.evaluation, values.evaluation) if isinstance(run, ClipRun) else (run.protocol, values.protocol))
+    for part, fields in parts:
+        assert {field.name for field in dataclasses.fields(part)} == set(fields)
+
+
 def test_what_decides_a_methods_numbers_can_be_set_on_the_command_line(monkeypatch: pytest.MonkeyPatch) -> None:
     """The others are of buffers and of what is shown on the way, or close loops, which is a run of its own."""
     monkeypatch.syspath_prepend(str(ROOT))

@@ -51,6 +51,8 @@ def get_config(dataset: str = "rooms") -> ConfigDict:
         "windows_8_4",
         "windows_16_8",
     )
+    # Sequences that are timed on this device, by their numbers of frames.
+    config.timings = ConfigDict({"lengths": (), "rounds": 3})
 
     config.evaluation = evaluation = ConfigDict()
     # (H, W) of the images; by default 3:4 and as large as those that the model was trained at.
@@ -58,6 +60,8 @@ def get_config(dataset: str = "rooms") -> ConfigDict:
     evaluation.clip_lengths = (10, 100, 300)
     evaluation.stride = 2 if is_rooms else 1
     evaluation.clips_per_sequence = 1
+    # Only that many first sequences; None takes all.
+    evaluation.max_sequences = placeholder(int)
     # Tables show the standard deviation of the sets' means beside the mean of all rooms.
     evaluation.sets = 3
     evaluation.max_points = 10_000

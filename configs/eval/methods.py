@@ -52,6 +52,8 @@ def get_config() -> ConfigDict:
             "chunks": {"size": 12, "overlap": 6},
         }
     )
+    # Names of logvggt_jax/evaluation/methods/variants.py, evaluated beside the methods.
+    config.variants = ()
     # Sequences of random pictures, timed on this device.
     config.timings = ConfigDict({"lengths": LENGTHS, "rounds": 3})
 
@@ -61,6 +63,10 @@ def get_config() -> ConfigDict:
     evaluation.clip_lengths = LENGTHS
     evaluation.stride = 2
     evaluation.clips_per_sequence = 1
+    # Only that many first sequences; None takes all.
+    evaluation.max_sequences = placeholder(int)
+    # From two sets of sequences on, tables show the standard deviation of the sets' means.
+    evaluation.sets = 1
     evaluation.max_points = 10_000
     evaluation.icp_threshold = 0.1
     evaluation.seed = 0

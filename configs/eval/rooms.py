@@ -22,6 +22,10 @@ def get_config() -> ConfigDict:
     # the model was trained at.
     config.methods = ("windows", "offline", "chunks")
     config.settings = ConfigDict({"offline": {"max_frames": 200}, "chunks": {"size": 12, "overlap": 6}})
+    # Names of logvggt_jax/evaluation/methods/variants.py, evaluated beside the methods.
+    config.variants = ()
+    # Sequences that are timed on this device, by their numbers of frames.
+    config.timings = ConfigDict({"lengths": (), "rounds": 3})
 
     config.evaluation = evaluation = ConfigDict()
     # (H, W) of the images; by default 3:4 and as large as those that the model was trained at.
@@ -29,6 +33,10 @@ def get_config() -> ConfigDict:
     evaluation.clip_lengths = (12, 32)
     evaluation.stride = 2
     evaluation.clips_per_sequence = 1
+    # Only that many first sequences; None takes all.
+    evaluation.max_sequences = placeholder(int)
+    # From two sets of sequences on, tables show the standard deviation of the sets' means.
+    evaluation.sets = 1
     evaluation.max_points = 10_000
     evaluation.icp_threshold = 0.1
     evaluation.seed = 0

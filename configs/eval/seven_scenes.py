@@ -18,11 +18,16 @@ def get_config() -> ConfigDict:
     config.dataset = "seven_scenes"
     # "test" needs the official TestSplit.txt in every scene's folder.
     config.split = "all"
+    config.options = ConfigDict()  # this set's reader has none
     config.baselines = True
     # Rows of the model: LoG-VGGT's windows, VGGT offline up to max_frames, and VGGT on overlapping chunks, as long as
     # the model was trained at.
     config.methods = ("windows", "offline", "chunks")
     config.settings = ConfigDict({"offline": {"max_frames": 200}, "chunks": {"size": 12, "overlap": 6}})
+    # Names of logvggt_jax/evaluation/methods/variants.py, evaluated beside the methods.
+    config.variants = ()
+    # Sequences that are timed on this device, by their numbers of frames.
+    config.timings = ConfigDict({"lengths": (), "rounds": 3})
 
     config.evaluation = evaluation = ConfigDict()
     # (H, W), to which frames are scaled and cropped; by default 3:4 and as large as the model was trained at.
@@ -31,6 +36,10 @@ def get_config() -> ConfigDict:
     # About 8 degrees of rotation from frame to frame, as in the procedural rooms at stride 2.
     evaluation.stride = 5
     evaluation.clips_per_sequence = 8
+    # Only that many first sequences; None takes all.
+    evaluation.max_sequences = placeholder(int)
+    # From two sets of sequences on, tables show the standard deviation of the sets' means.
+    evaluation.sets = 1
     evaluation.max_points = 20_000
     evaluation.icp_threshold = 0.1
     evaluation.seed = 0
