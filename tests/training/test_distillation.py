@@ -158,8 +158,8 @@ def test_what_killed_runs_left_in_the_cache_goes_unless_another_is_at_work(
         return [folder.exists() for folder in left]
 
     hold = (
-        "import sys; from pathlib import Path; from logvggt_jax.training.teaching.cache_use import cache_in_use\n"
-        "with cache_in_use(Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
+        "import sys; from pathlib import Path; from logvggt_jax.data.cache_use import cache_in_use\n"
+        "with cache_in_use(Path(sys.argv[1]), 'teacher', ()): print('held', flush=True); sys.stdin.read()"
     )
     with subprocess.Popen(
         [sys.executable, "-c", hold, str(tmp_path)], text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from logvggt_jax.data.cache_use import cache_in_use
 from logvggt_jax.data.dataset import Dataset, check_indices, check_sequence
 from logvggt_jax.data.rooms.same_rooms import SameRooms
 from logvggt_jax.errors import InputError, OutputExists
@@ -93,18 +94,19 @@ def render_pool(
 
     folder = Path(cache_dir).absolute() / f"rooms-{_digest(rooms)}"
     if not folder.exists():
-        check_space(folder, size, "make room, give data.cache_dir another folder or draw fewer rooms")
-        # Another process may finish the same pool meanwhile; its bytes are the same.
-        with contextlib.suppress(OutputExists), atomic_folder(folder) as unfinished:
-            maps: dict[str, np.ndarray] = {
-                name: np.lib.format.open_memmap(unfinished / f"{name}.npy", "w+", dtype, shape)
-                for name, (shape, dtype) in shapes.items()
-            }
-            _render_into(maps, rooms, workers, progress)
-            for array in maps.values():
-                array.flush()  # type: ignore[attr-defined]
-            del maps
-            (unfinished / "options.json").write_text(json.dumps(_contents(rooms), indent=2) + "\n")
+        with cache_in_use(folder.parent, "rooms", ("rooms-*.partial",)):
+            check_space(folder, size, "make room, give data.cache_dir another folder or draw fewer rooms")
+            # Another process may finish the same pool meanwhile; its bytes are the same.
+            with contextlib.suppress(OutputExists), atomic_folder(folder) as unfinished:
+                maps: dict[str, np.ndarray] = {
+                    name: np.lib.format.open_memmap(unfinished / f"{name}.npy", "w+", dtype, shape)
+                    for name, (shape, dtype) in shapes.items()
+                }
+                _render_into(maps, rooms, workers, progress)
+                for array in maps.values():
+                    array.flush()  # type: ignore[attr-defined]
+                del maps
+                (unfinished / "options.json").write_text(json.dumps(_contents(rooms), indent=2) + "\n")
     return RoomPool(rooms, _open_arrays(folder, rooms), folder)
 
 

@@ -2,7 +2,7 @@
 
     <cache>/teacher/<digest>/   of one clip: depth.npy, confidence.npy, intrinsics.npy, extrinsics.npy, and digests.json
                                 of these four, since numpy does not notice flipped bytes
-    <cache>/teacher.lock        held together by all that write labels, see `cache_use`
+    <cache>/teacher.lock        held together by all that write labels, see `cache_in_use`
 
 The digest is of the clip's pictures, as the teacher saw them, and of the teacher: what has been labelled once is never
 labelled again, by whatever run, and never taken for something else.

@@ -6,12 +6,12 @@ from typing import Any
 
 import jax
 
+from logvggt_jax.data.cache_use import cache_in_use
 from logvggt_jax.data.dataset import Dataset
 from logvggt_jax.training.config import TeacherConfig, TrainConfig
 from logvggt_jax.training.feeding.sources import open_source, open_sources
 from logvggt_jax.training.feeding.truth import check_depth, check_truth
 from logvggt_jax.training.parallel.agreement import check_shared
-from logvggt_jax.training.teaching.cache_use import cache_in_use
 from logvggt_jax.training.teaching.labelling import taught
 from logvggt_jax.training.teaching.teacher import PlainVGGT, Teacher
 
@@ -53,7 +53,7 @@ def label(
     # Each reads what the others have labelled.
     check_shared(cache, "data.cache_dir")
     validated: list[Dataset] = []
-    with cache_in_use(cache):
+    with cache_in_use(cache, "teacher", ("teacher/*.partial", "teacher/.*.old")):
         found: dict[str, Dataset] = {
             name: taught(name, dataset, teacher, settings, sizes, cache, **shared) for name, dataset in datasets.items()
         }

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from logvggt_jax.data.cache_use import cache_in_use
 from logvggt_jax.data.rooms import pool as room_pool
 from logvggt_jax.data.rooms.pool import render_pool
 from logvggt_jax.data.rooms.rooms import Rooms
@@ -52,7 +53,7 @@ def test_other_options_have_another_cache(options: dict, tmp_path: Path):
     render_pool(ROOMS, cache_dir=tmp_path, progress=False)
     other = Rooms("val", **{"height": 28, "width": 42, "num_frames": 5, "num_rooms": 3, **options})
     assert_same_frames(render_pool(other, cache_dir=tmp_path, progress=False), other)
-    assert len(list(tmp_path.iterdir())) == 2
+    assert len(list(tmp_path.glob("rooms-*"))) == 2
 
 
 def test_an_interrupted_rendering_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -64,7 +65,19 @@ def test_an_interrupted_rendering_leaves_nothing(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(room_pool, "_read_all", interrupted)
     with pytest.raises(KeyboardInterrupt):
         render_pool(ROOMS, cache_dir=tmp_path, progress=False)
-    assert list(tmp_path.iterdir()) == []
+    assert [path.name for path in tmp_path.iterdir()] == ["rooms.lock"]
+
+
+def test_what_a_killed_rendering_left_goes_unless_another_is_at_work(tmp_path: Path):
+    left = tmp_path / "rooms-0123456789abcdef.7-cd.partial"
+    left.mkdir()
+    (left / "depth.npy").write_bytes(b"half")
+    with cache_in_use(tmp_path, "rooms", ()):
+        render_pool(ROOMS, cache_dir=tmp_path, progress=False)
+        assert left.exists(), "another process may be writing it"
+    other = Rooms("val", height=28, width=42, num_frames=5, num_rooms=2)
+    render_pool(other, cache_dir=tmp_path, progress=False)
+    assert not left.exists() and len(list(tmp_path.glob("rooms-*"))) == 2
 
 
 def test_a_damaged_cache_is_named(tmp_path: Path):
@@ -85,7 +98,7 @@ def test_a_pool_on_disk_is_bounded_by_its_free_space_alone(tmp_path: Path, monke
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=10))
     with pytest.raises(DiskError, match=r"needs about .* give data\.cache_dir another folder"):
         render_pool(ROOMS, cache_dir=tmp_path / "full", progress=False)
-    assert not (tmp_path / "full").exists()
+    assert not list((tmp_path / "full").glob("rooms-*"))
 
 
 def test_worker_processes_render_the_same(monkeypatch: pytest.MonkeyPatch):
