@@ -65,7 +65,7 @@ def with_suffixes(files: SourceFiles, paths: Iterable[Path], named_by: Path) -> 
         for picture in filter(is_picture, held):
             of_name.setdefault(picture.with_suffix(""), []).append(picture)
         chosen = {path: same[0] for path, same in of_name.items() if len(same) == 1 or same[0] == path}
-        completed = [chosen.get(path, path) for path in completed]
+        completed = [path if path.suffix else chosen.get(path, path) for path in completed]
     return completed
 
 

@@ -62,6 +62,13 @@ def test_pictures_named_without_their_suffix_are_found(recording: Path):
         open_dataset("nerfstudio", recording).num_frames(NAME)
 
 
+def test_a_picture_named_with_its_suffix_is_that_one_whatever_else_has_its_name(recording: Path):
+    edit(recording, lambda content: content["frames"][0].update(file_path=content["frames"][0]["file_path"][:-4]))
+    for name in NAMES:
+        (recording / f"{name}.png").touch()  # of masks
+    assert open_dataset("nerfstudio", recording).frame_names(NAME) == list(NAMES)
+
+
 def test_names_with_the_slashes_of_windows_are_found(recording: Path):
     edit(
         recording,
