@@ -42,7 +42,14 @@ class Images(FolderDataset):
     about = About(source="film it", licence="your own", size="your own", roles=(TRAINING,))
 
     def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
-        found = find_recordings(self.root, files, self.expects, lambda folder: _pictures(folder, files))
+        def is_recording(folder: Path) -> bool:
+            names = _pictures(folder, files)
+            # Of those that are not read a few beside folders of pictures hide none of these.
+            return any(is_picture(Path(name)) for name in names) or (
+                bool(names) and (folder != self.root or not self._hidden_recordings(files))
+            )
+
+        found = find_recordings(self.root, files, self.expects, is_recording)
         if self.root in found.values() and (hidden := self._hidden_recordings(files)):
             logging.warning(
                 "%s is a sequence itself, of %s and others: folders of pictures in it are not looked into (%s)",
@@ -53,7 +60,7 @@ class Images(FolderDataset):
         return found
 
     def _hidden_recordings(self, files: SourceFiles) -> list[str]:
-        """Folders of pictures in a root that is a recording itself."""
+        """Folders of pictures in the root, which are not looked into where it is a recording itself."""
         hidden = []
         for name, folder in files.folders(self.root, "folders of pictures").items():
             with contextlib.suppress(DiskError):  # nobody asked for it

@@ -61,6 +61,17 @@ def test_jpegs_of_other_suffixes_are_read_and_heic_is_counted_as_left_out(tmp_pa
         dataset.num_frames("phone")
 
 
+def test_heic_beside_folders_of_pictures_hides_none_of_them(tmp_path: Path):
+    write_video(tmp_path / "walk")
+    (tmp_path / "cover.heic").write_bytes(b"\0\0\0\x18ftypheic")
+    assert open_dataset("images", tmp_path).sequences == ("walk",)
+    alone = tmp_path / "phone"
+    alone.mkdir()
+    (tmp_path / "cover.heic").rename(alone / "cover.heic")
+    with pytest.raises(InputError, match=r"phone: no frame .*convert it to JPEG"):
+        open_dataset("images", alone).num_frames("phone")
+
+
 def test_a_picture_that_hides_folders_of_pictures_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     told: list[str] = []
     monkeypatch.setattr(logging, "warning", lambda text, *values: told.append(text % values))
