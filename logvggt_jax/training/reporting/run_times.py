@@ -94,10 +94,14 @@ class RunTimes:
     def costs(self) -> dict[str, float]:
         """Seconds that one of each kind of `other` takes: the mean since the start, else that of the start before.
 
-        The first validation of a start compiles, and counts as long as it is the only one.
+        The first validation of a start compiles, and counts as long as nothing else is known of them.
         """
-        later = {kind: seconds[1:] or seconds for kind, seconds in self._others.items()}
-        return self._earlier | {kind: sum(seconds) / len(seconds) for kind, seconds in later.items()}
+        found = {kind: sum(seconds) / len(seconds) for kind, seconds in self._others.items()}
+        if later := self._others.get("validation", [])[1:]:
+            found["validation"] = sum(later) / len(later)
+        elif "validation" in self._earlier:
+            found["validation"] = self._earlier["validation"]
+        return self._earlier | found
 
     def remaining_seconds(self, step: int, end: int | None = None) -> float:
         """Seconds until step `end` (None: the last of all), if frames, validations and saves take as long as so far.

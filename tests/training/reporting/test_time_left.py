@@ -93,6 +93,20 @@ def test_what_the_first_validation_compiles_is_not_expected_of_later_ones(config
             clock.now += seconds
         found.append(times.remaining_seconds(100))
     assert found == [2 * 200.0, 2 * 2.0, 2 * 3.0]
+    times = RunTimes(config, costs={"validation": 3.0})
+    for seconds in (200.0, 5.0):
+        with times.other("validation"):
+            clock.now += seconds
+        found.append(times.remaining_seconds(100))
+    assert found[3:] == [2 * 3.0, 2 * 5.0], "what the start before found"
+
+
+def test_every_save_counts(config: TrainConfig, clock: Clock) -> None:
+    times = RunTimes(config)
+    for seconds in (3.0, 5.0):
+        with times.other("save"):
+            clock.now += seconds
+    assert times.costs == {"save": 4.0}
 
 
 def test_utilisation_is_of_the_peak_in_the_time_of_steps(config: TrainConfig, clock: Clock) -> None:
