@@ -312,6 +312,10 @@ def test_a_teachers_weights_are_read_to_label_and_not_where_all_is_labelled(
     assert read == [earlier]
     lazy.load()
     assert read == [earlier, weights]
+    replaced = PlainVGGT(TeacherConfig(str(weights), 4))
+    write_description(weights, {**description, "digests": dict.fromkeys(description["digests"], "xxh3-128:of others")})
+    with pytest.raises(InputError, match="other weights lie there than when this run began"):
+        replaced.load()
 
 
 def test_objective_and_teacher_belong_together(run_config: TrainConfig, tmp_path: Path) -> None:

@@ -49,14 +49,13 @@ class PlainVGGT:
         self._config = config
         self._path = resolve(config.weights)
         self._weights: tuple[LogVGGT, dict[str, Any]] | None = None
-        params, sizes = read_digests(self._path), read_config(self._path)
-        if params is None:
-            params = digests(self._loaded()[1]["params"])
+        self._told, sizes = read_digests(self._path), read_config(self._path)
+        params = digests(self._loaded()[1]["params"]) if self._told is None else self._told
         self.digest = json_digest({"config": sizes.to_dict(), "method": METHOD, "params": params})
 
     def load(self) -> None:
-        """As of `Teacher`. Raises InputError as `from_pretrained`, PredictionError where the weights do not fit the
-        device's memory."""
+        """As of `Teacher`. Raises InputError as `from_pretrained` and where other weights lie there by now,
+        PredictionError where they do not fit the device's memory."""
         self._loaded()
 
     def label(self, images: np.ndarray) -> Labels:
@@ -91,5 +90,12 @@ class PlainVGGT:
             with device_memory(
                 f"teacher.weights={self._config.weights}", "give a smaller teacher, or train on devices with more"
             ):
-                self._weights = from_pretrained(self._path)
+                weights = from_pretrained(self._path)
+            # Hours may have gone by, and their labels would be taken for those of the weights that the digest is of.
+            if read_digests(self._path) != self._told:
+                raise InputError(
+                    f"teacher.weights={self._config.weights}: other weights lie there than when this run began: give a "
+                    "copy that stays, and start it again"
+                )
+            self._weights = weights
         return self._weights
