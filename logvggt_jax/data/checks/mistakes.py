@@ -14,6 +14,8 @@ from logvggt_jax.geometry import invert, matrix_to_quaternion, quaternion_to_mat
 
 # A figure below is as good as any; and what a mistake must divide it by.
 _GOOD, _EXPLAINED = 0.01, 2.0
+# Poses that jump by a third of the way look like another unit in a third of all single pairs, in 1 of 90 three of them.
+_FEWEST = 3
 # How often depth may be as long as poses say, without 1 and what noise may be: steps that leave a tenth of the figure.
 _FACTORS = np.array([1.25**power for power in range(-31, 32) if abs(power) > 1])
 _CAMERAS = (
@@ -46,7 +48,9 @@ def _w_first(extrinsics: np.ndarray) -> np.ndarray:
 
 def mend(found: np.ndarray) -> str | None:
     """With what mend the `figures` of pairs of frames, [P, M], would be a fraction of what they are, and which; None
-    where no mend does that, for each of the pairs and for their median."""
+    where no mend does that, for each of the pairs and for their median, and of fewer than three pairs."""
+    if len(found) < _FEWEST:
+        return None
     middle = np.median(found, axis=0)
     best = 2 + int(np.argmin(middle[2:]))
     explained = found[:, best] <= np.maximum(found[:, 0] / _EXPLAINED, _GOOD / 2)

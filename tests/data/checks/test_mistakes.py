@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from layouts import colmap
+from layouts import tum_recording
 from room_views import frames_of, room_views
 from scipy.spatial.transform import Rotation
 
@@ -71,8 +71,14 @@ def test_noise_of_depth_or_poses_needs_none():
     assert told(jumping) == ""
 
 
+def test_of_one_pair_jumping_poses_look_like_another_unit_and_are_not_told():
+    alone = pairs()[0]
+    alone.extrinsics[1, :3, 3] = alone.extrinsics[0, :3, 3] + 3 * (alone.extrinsics[1] - alone.extrinsics[0])[:3, 3]
+    assert told([alone]) == "" and told([alone] * 3) != ""
+
+
 def test_the_check_says_what_would_mend_a_recording(tmp_path: Path):
-    colmap.write(tmp_path, [replace(each, depth=2 * each.depth) for each in room_views(4)])
-    (problem,) = check_copy("colmap", tmp_path).problems
+    tum_recording.write(tmp_path, [replace(each, depth=2 * each.depth) for each in room_views(5)])
+    (problem,) = check_copy("tum_recording", tmp_path).problems
     assert problem.kind == "inconsistent depth and poses" and "(it would by " in problem.message
     assert "with depth divided by about 2): " in problem.message
