@@ -141,7 +141,7 @@ class _Run:
         watchdog: Watchdog,
         validated: Sequence[Dataset],
         *,
-        trained_on: Collection[str] | None = None,
+        trained_on: Collection[str],
     ) -> None:
         layout = program.layout
         self.config, self.program, self.mesh, self.watchdog = config, program, layout.mesh, watchdog
