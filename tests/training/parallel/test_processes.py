@@ -174,6 +174,7 @@ def test_all_save_where_the_clips_of_one_process_end(batches: int, programs: Roo
     assert max((entry["step"] for entry in read_metrics(tmp_path / "metrics.jsonl")), default=0) == steps
     saved = StoredCheckpoint(tmp_path / "checkpoints" / str(steps))
     assert saved.step == steps and saved.position.data["examples"] == 2 * steps
+    assert saved.position.data["broken"]["clips"] == 2 * steps, "of both processes"
 
 
 def test_clips_of_one_process_that_make_an_update_useless_are_named_by_all(
