@@ -73,9 +73,12 @@ class Images(FolderDataset):
         if not names:
             raise MissingFiles(f"{folder}: no pictures; expected {self.expects}")
         nominal = pinhole(1.0, 1.0, 0.0, 0.0)
-        for place in natural_order([Path(name).stem for name in names]):
-            if Path(names[place]).suffix.lower() in _NOT_READ:
-                yield Dropped("HEIC or AVIF: convert it to JPEG")
+        stems = [Path(name).stem for name in names]
+        read = {stem for stem, name in zip(stems, names, strict=True) if is_picture(Path(name))}
+        for place in natural_order(stems):
+            if not is_picture(Path(names[place])):
+                if stems[place] not in read:  # else it was converted
+                    yield Dropped("HEIC or AVIF: convert it to JPEG")
                 continue
             path = folder / names[place]
             yield frame(path, path, nominal, NO_POSES, name=names[place])

@@ -51,6 +51,7 @@ def test_moments_before_the_first_are_in_their_order(tmp_path: Path):
 def test_jpegs_of_other_suffixes_are_read_and_heic_is_counted_as_left_out(tmp_path: Path):
     write_image(tmp_path / "walk/1.jpg", np.full((28, 42, 3), 9, np.uint8))
     (tmp_path / "walk/1.jpg").rename(tmp_path / "walk/1.JFIF")
+    (tmp_path / "walk/1.heic").write_bytes(b"\0\0\0\x18ftypheic")  # of which 1.JFIF was made
     (tmp_path / "walk/2.heic").write_bytes(b"\0\0\0\x18ftypheic")
     (tmp_path / "phone").mkdir()
     (tmp_path / "phone/1.HEIC").write_bytes(b"\0\0\0\x18ftypheic")
