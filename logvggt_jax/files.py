@@ -7,6 +7,7 @@ import re
 import secrets
 import shutil
 import stat
+import threading
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -18,6 +19,9 @@ from filelock import FileLock, Timeout
 
 from logvggt_jax.errors import DiskError, InputError, OutputExists, disk_errors, one_line
 
+# Held by who reads numpy's files: numpy parses an array's header with `ast`, which in Python 3.11 fails now and then
+# where several threads do so.
+NUMPY_READING = threading.Lock()
 EMPTY_PATH = "the path is empty (a variable without a value?)"
 _LONGEST_NAME, _LONGEST_SUFFIX = 255, 32  # bytes
 _LOCK, _OWNER = ".lock", ".owner"

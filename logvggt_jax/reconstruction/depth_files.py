@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import threading
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,11 +14,9 @@ import numpy as np
 from PIL import Image
 
 from logvggt_jax.errors import InputError, MissingInput, one_line
-from logvggt_jax.files import atomic_file, open_regular
+from logvggt_jax.files import NUMPY_READING, atomic_file, open_regular
 from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE
 
-# Numpy parses an array's header with `ast`, which in Python 3.11 fails now and then where several threads do so.
-_ONE_AT_A_TIME = threading.Lock()
 DEPTH_FOLDER, IMAGE_FOLDER, ORIGINAL_FOLDER = "depth", "images", "originals"
 _END_OF_JPEG = b"\xff\xd9"
 _JPEG = (
@@ -85,7 +82,7 @@ def read_depth(path: str | Path, size: tuple[int, int] | None = None) -> tuple[n
     """
     with _result_file(path) as stream:
         try:
-            with _ONE_AT_A_TIME, np.load(stream, allow_pickle=False) as arrays:
+            with NUMPY_READING, np.load(stream, allow_pickle=False) as arrays:
                 # What has no array's header comes as bytes.
                 maps = np.asarray(arrays["depth"]), np.asarray(arrays["confidence"])
         except OSError:

@@ -21,6 +21,7 @@ from logvggt_jax.data.formats.numbered_files import numbered_frames
 from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame
 from logvggt_jax.errors import InputError
+from logvggt_jax.files import NUMPY_READING
 
 _FULL_SCALE, _FAR = 65535, 1000.0  # the stored value of `_FAR` metres
 # Not what file managers and network storage leave beside them, such as .thumbnails and @eaDir.
@@ -92,7 +93,7 @@ def _cameras(files: SourceFiles, folder: Path) -> tuple[np.ndarray, np.ndarray]:
     if not zipfile.is_zipfile(path):
         raise InputError(f"{path}: truncated or damaged npz file (no zip directory): fetch it again")
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+        with path.open("rb") as file, NUMPY_READING, np.load(file, allow_pickle=False) as archive:
             names = archive.files
             # What has no array's header comes as bytes.
             found = {name: np.asarray(archive[name]) for name in ("intrinsics", "extrinsics") if name in names}
