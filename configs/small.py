@@ -13,9 +13,10 @@ Windows of four frames, the cache, GCCR and the losses are the paper's. A study 
 which is `configs/tiny.py`'s where it is not written below: compass rooms, in which pose is learned at all, half of
 them facing one wall, without which rotation stays at the identity for thousands of steps; single windows before
 clips; LayerScale 1 and a thawed encoder, since nothing is pre-trained; a camera head that starts from no motion and
-the mean field of view, with a weight of 10 in the loss. Muon learned rotation there in a fifth of AdamW's steps, and
-most of what clips of 12 frames taught came at rates of 1e-3 and below (docs/results.md): a cosine gives them these.
-Camera paths are closed after 96 frames at the mean speed, so that most of the longest clips return to where they began.
+the mean field of view, with a weight of 10 in the loss. Muon learned rotation there in a fifth of AdamW's steps, most
+of what clips of 12 frames taught came at rates of 1e-3 and below, and those of 32 frames still want 5e-4
+(docs/results.md): a cosine gives them these. Camera paths are closed after 96 frames at the mean speed, so that most of
+the longest clips return to where they began.
 """
 
 from ml_collections import ConfigDict
@@ -37,9 +38,9 @@ def get_config(initial_weights: str = "") -> ConfigDict:
     config.model.dtype = "bfloat16"
     config.stages = ConfigDict(
         {
-            "stage_1": tiny.stage(steps=8000, clip_length=4, batch_size=32, strides=(1, 6), size=SIZE),
+            "stage_1": tiny.stage(steps=6000, clip_length=4, batch_size=32, strides=(1, 6), size=SIZE),
             "stage_2": tiny.stage(steps=4000, clip_length=12, batch_size=16, strides=(1, 6), size=SIZE),
-            "stage_3": tiny.stage(steps=2000, clip_length=32, batch_size=8, strides=(1, 6), size=SIZE),
+            "stage_3": tiny.stage(steps=4000, clip_length=32, batch_size=8, strides=(1, 6), size=SIZE),
         },
         sort_keys=False,
     )
