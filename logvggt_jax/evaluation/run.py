@@ -57,15 +57,16 @@ def run_evaluation(
     run = read_run(configuration)
     output = check_output(output, overwrite=True, kind=FolderKind(RECORDS_FILE, ("*",)), in_place=True)
     check_writable(output / RECORDS_FILE)
-    provenance = read_provenance(checkpoint)
-    benchmarks, baselines = open_run(run, data_root, provenance.longer_edge)
+    asks = isinstance(run, ClipRun) and run.evaluation.image_size is None
+    longer_edge = read_provenance(checkpoint).longer_edge if asks else None
+    benchmarks, baselines = open_run(run, data_root, longer_edge)
     if isinstance(run, ClipRun):
         _check_room(run, checkpoint, _clip_size(benchmarks))
+    trained_for = read_provenance(checkpoint).trained_for
     # Gigabytes of parameters are not read for a folder that another run has.
     lock = FolderLock(output, "choose another output")
     try:
         loaded = Checkpoint.load(checkpoint)
-        trained_for = provenance.trained_for
         rows = {method: _row(method, loaded, run.settings_of(method), trained_for) for method in run.methods}
         _warn_of_unsuited(trained_for, run.methods)
         timings: Callable[[], Mapping[str, Any]] | None = None

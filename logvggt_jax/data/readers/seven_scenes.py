@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from absl import logging
 
 from logvggt_jax.data.dataset import EVALUATION, LICENCE_NOT_READ, About, check_indices
 from logvggt_jax.data.errors import MissingFiles, missing_files
@@ -87,9 +88,12 @@ class SevenScenes(FolderDataset):
         kinds: dict[str, set[str]] = {}
         names = files.names(folder, "a sequence's frames")
         if _OTHER_CAMERA in names:
-            raise InputError(
-                f"{folder}: holds {_OTHER_CAMERA}, as what `logvggt render-room` writes, and {self.title} has none but "
-                "the camera of the set: such rooms are the data set `rooms`; take the file away if it is another"
+            logging.warning(
+                "%s: holds %s, as what `logvggt render-room` writes; it is not read: frames have the camera of %s. "
+                "Rendered rooms are the data set `rooms`",
+                folder,
+                _OTHER_CAMERA,
+                self.title,
             )
         for name in names:
             if match := _FRAME_FILE.fullmatch(name):

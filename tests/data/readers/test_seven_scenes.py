@@ -5,12 +5,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from absl import logging
 
 from logvggt_jax.data import open_dataset
 from logvggt_jax.data.checks.consistency import depth_consistency
 from logvggt_jax.data.dataset import check_frames
 from logvggt_jax.data.readers.seven_scenes import SevenScenes
-from logvggt_jax.errors import InputError
 from logvggt_jax.geometry import unproject
 
 SHIFT = np.array([-0.025, 0.0, 0.0])
@@ -157,10 +157,11 @@ def test_jpeg_colour_is_accepted(root: Path):
     assert np.abs(frames.images[0].astype(int) - picture(4, (48, 64))).max() < 6
 
 
-def test_a_rendered_room_whose_camera_is_not_the_sets_is_refused(root: Path):
+def test_a_rendered_room_whose_camera_is_not_the_sets_is_told(root: Path, caplog: pytest.LogCaptureFixture):
+    logging.use_python_logging(quiet=True)
     np.savetxt(root / "den/seq-01/intrinsics.txt", np.eye(3))
-    with pytest.raises(InputError, match=r"den/seq-01: holds intrinsics\.txt, as what `logvggt render-room` writes"):
-        SevenScenes(root).num_frames("den/seq-01")
+    assert SevenScenes(root).num_frames("den/seq-01")
+    assert "den/seq-01: holds intrinsics.txt, as what `logvggt render-room` writes; it is not read" in caplog.text
 
 
 def test_picture_sizes_are_found_once_and_despite_a_broken_frame(root: Path, monkeypatch: pytest.MonkeyPatch):

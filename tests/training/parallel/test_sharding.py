@@ -406,7 +406,7 @@ def test_no_device_ever_holds_a_second_copy_when_a_run_starts_or_goes_on(
     monkeypatch.setattr(StoredCheckpoint, "verified", lambda *given: (look(), verified(*given), look())[1])
     for step in (0, 1):
         program = make_program(layered, config, jax.eval_shape(lambda: layered_params), mesh)
-        run = loop._Run(config, tmp_path, program, Watchdog(0), ())
+        run = loop._Run(config, tmp_path, program, Watchdog(0), (), trained_on=())
         with run.checkpoints as checkpoints:
             run.start(None)
             state = run.state
