@@ -10,8 +10,11 @@ from typing import Any
 import jax
 from jax.extend import core
 
+# In the names of what `jax.checkpoint` does again for a gradient.
+_RECOMPUTED = "rematted_computation"
 
-def count_flops(function: Callable[..., Any], *arguments: Any) -> float:
+
+def count_flops(function: Callable[..., Any], *arguments: Any, recomputed: bool = True) -> float:
     """Operations of one call in matrix products and convolutions, a multiply-add counted as two.
 
     All else of a network (norms, activations, softmax) is a few parts in a thousand and limited by memory, not by
@@ -22,11 +25,12 @@ def count_flops(function: Callable[..., Any], *arguments: Any) -> float:
     Args:
       function: what `jax.jit` takes. Kernels (cuDNN, Pallas) count nothing: give a model with `attention="xla"`.
       *arguments: arrays or `jax.ShapeDtypeStruct`, or pytrees of them.
+      recomputed: whether what a gradient computes a second time (`jax.checkpoint`) counts twice.
 
     Raises:
       ValueError: a loop whose number of trips is not fixed.
     """
-    return _flops(jax.make_jaxpr(function)(*arguments).jaxpr)
+    return _flops(jax.make_jaxpr(function)(*arguments).jaxpr, recomputed)
 
 
 def matmul_flops_per_second(dtype: str, *, size: int | None = None, rounds: int = 5) -> float:
@@ -47,27 +51,29 @@ def matmul_flops_per_second(dtype: str, *, size: int | None = None, rounds: int 
     return 2 * side**3 / min(seconds)
 
 
-def _flops(jaxpr: core.Jaxpr) -> float:
+def _flops(jaxpr: core.Jaxpr, recomputed: bool) -> float:
     total = 0.0
     for equation in jaxpr.eqns:
+        if not recomputed and _RECOMPUTED in str(equation.source_info.name_stack):
+            continue
         name, parameters = equation.primitive.name, equation.params
         if name == "dot_general":
             total += _product_flops(equation)
         elif name == "conv_general_dilated":
             total += _convolution_flops(equation)
         elif name == "scan":
-            total += parameters["length"] * _flops(parameters["jaxpr"].jaxpr)
+            total += parameters["length"] * _flops(parameters["jaxpr"].jaxpr, recomputed)
         elif name == "cond":
-            total += max(_flops(branch.jaxpr) for branch in parameters["branches"])
+            total += max(_flops(branch.jaxpr, recomputed) for branch in parameters["branches"])
         elif name == "shard_map":
-            total += parameters["mesh"].size * _flops(parameters["jaxpr"])
+            total += parameters["mesh"].size * _flops(parameters["jaxpr"], recomputed)
         elif name == "while":
             raise ValueError(
                 f"count_flops: the number of trips of a loop is not fixed: {equation.source_info.name_stack}"
             )
         elif name != "pallas_call":  # whose program is that of one block
             # jit, checkpoint and rules of differentiation: what they hold runs once.
-            total += sum(map(_flops, core.jaxprs_in_params(parameters)))
+            total += sum(_flops(inner, recomputed) for inner in core.jaxprs_in_params(parameters))
     return total
 
 

@@ -40,6 +40,13 @@ def test_a_checkpointed_loop_is_found() -> None:
     assert count_flops(jax.checkpoint(lambda x: repeated(x, 4)), MATRIX) == pytest.approx(4 * PRODUCT, rel=1e-3)
 
 
+def test_what_a_gradient_computes_again_can_be_left_out() -> None:
+    gradient = jax.grad(lambda x: jax.checkpoint(lambda x: jnp.sin(x @ x) @ x)(x).sum())
+    # The first product is there again in the backward pass, which takes two for each.
+    assert count_flops(gradient, MATRIX) == 7 * PRODUCT
+    assert count_flops(gradient, MATRIX, recomputed=False) == 6 * PRODUCT
+
+
 def test_a_loop_without_fixed_trips_is_an_error() -> None:
     def until_large(x: jax.Array) -> jax.Array:
         return jax.lax.while_loop(lambda y: y[0, 0] < 10, lambda y: y @ y, x)

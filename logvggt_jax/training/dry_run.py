@@ -49,7 +49,7 @@ def _say_all(config: TrainConfig, mesh: Mesh, say: Callable[[str], None]) -> Non
         for size in stage.sizes:
             clips = stage.batch_size // mesh.size
             name = f"{stage.name} {size[0]}x{size[1]}, {clips} x {stage.clip_length} frames a device"
-            operations = step_flops(config.model, (stage.batch_size, stage.clip_length, *size))
+            operations = step_flops(config, (stage.batch_size, stage.clip_length, *size))
             costs = costs_of(clips, stage.clip_length, size)
             say(f"{name}: {operations / 1e12:.4g} TFLOP in all without recomputation; {_described(costs, limit)}")
         say(f"{stage.name}: {_largest_that_fits(costs_of, mesh, stage, limit, config.accumulate)}")

@@ -329,7 +329,7 @@ class _Run:
             for number, step in enumerate(compiled_steps(self.program, self.state, stage, new, taught=taught), 1):
                 self.programs[step.clips] = step.run
                 if self.peak is not None:
-                    self.operations[step.clips] = step_flops(self.config.model, step.clips[:4])
+                    self.operations[step.clips] = step_flops(self.config, step.clips[:4])
                 height, width = step.clips[2:4]
                 log.say(
                     f"{stage.name}: step for images of {height} x {width} compiled after {step.seconds:.0f} s, "

@@ -12,13 +12,14 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from logvggt_jax.compile import out_of_device_memory
-from logvggt_jax.config import ModelConfig
 from logvggt_jax.model.initialization import variable_shapes
 from logvggt_jax.model.logvggt import LogVGGT
+from logvggt_jax.model.parameters import unstack_layers
 from logvggt_jax.operations import count_flops
 from logvggt_jax.program_text import ProgramText, bytes_of
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.parallel.sharding import split
+from logvggt_jax.training.step.freezing import frozen_leaves, frozen_patterns
 from logvggt_jax.training.step.program import abstract_parameters, make_program
 
 # What is exchanged in the background is counted where it ends, with the result's own shape.
@@ -67,14 +68,24 @@ def abstract_clips(
     }
 
 
-def step_flops(config: ModelConfig, clips: tuple[int, ...]) -> float:
-    """Operations of a step on clips [B, T, H, W] over all devices: forward and gradient, nothing computed twice."""
-    model = LogVGGT(dataclasses.replace(config, attention="xla"))
+def step_flops(config: TrainConfig, clips: tuple[int, ...]) -> float:
+    """Operations of a step on clips [B, T, H, W] over all devices: the predictions and their gradient with respect to
+    what is trained, nothing computed twice."""
+    model = LogVGGT(dataclasses.replace(config.model, attention="xla"))
+    frozen = frozen_leaves(abstract_parameters(config.model), frozen_patterns(config))
     # Layer by layer: in a loop a layer that reads the cache would stand for all.
-    variables, images = variable_shapes(config), jax.ShapeDtypeStruct((*clips, 3), jnp.uint8)
-    forward, encoder = (count_flops(function, variables, images) for function in (model.apply, model.windows.encode))
-    # The gradient of a product is two of the kind; a frozen encoder has none.
-    return 3 * forward - 2 * encoder if config.encoder.frozen else 3 * forward
+    still = unstack_layers(frozen, config.model, lambda leaf, _: leaf)
+
+    def gradient(params: Any, images: jax.Array) -> Any:
+        def predictions(params: Any) -> Any:
+            stopped = jax.tree.map(lambda x, still: jax.lax.stop_gradient(x) if still else x, params, still)
+            return model.apply({"params": stopped}, images)
+
+        found, pull_back = jax.vjp(predictions, params)
+        return pull_back(jax.tree.map(jnp.ones_like, found))
+
+    images = jax.ShapeDtypeStruct((*clips, 3), jnp.uint8)
+    return count_flops(gradient, variable_shapes(config.model)["params"], images, recomputed=False)
 
 
 def step_costs(

@@ -12,8 +12,14 @@ from typing import Any
 import jax
 
 from logvggt_jax.errors import InputError
+from logvggt_jax.training.config import TrainConfig
 
 ENCODER = "encoder/*"
+
+
+def frozen_patterns(config: TrainConfig) -> tuple[str, ...]:
+    """The patterns of a run: those that are asked for, and the encoder's where the model holds it still."""
+    return (*((ENCODER,) if config.model.encoder.frozen else ()), *config.optimizer.frozen)
 
 
 def frozen_leaves(params: Any, patterns: Sequence[str]) -> Any:

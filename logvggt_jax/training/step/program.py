@@ -14,7 +14,7 @@ from logvggt_jax.model.parameters import stack_layers
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.parallel.sharding import Layout, parameter_layout
 from logvggt_jax.training.step.finite_check import make_finite_check
-from logvggt_jax.training.step.freezing import ENCODER, frozen_leaves
+from logvggt_jax.training.step.freezing import frozen_leaves, frozen_patterns
 from logvggt_jax.training.step.optimizer import learning_rate_schedule, make_optimizer
 from logvggt_jax.training.step.state import TrainState, initial_state
 from logvggt_jax.training.step.train_step import make_loss_terms, make_train_step
@@ -44,7 +44,7 @@ class Program(NamedTuple):
 
 def make_program(model: LogVGGT, config: TrainConfig, params: Any, mesh: Mesh) -> Program:
     """The program for parameters of such shapes."""
-    frozen = (*((ENCODER,) if config.model.encoder.frozen else ()), *config.optimizer.frozen)
+    frozen = frozen_patterns(config)
     layout = parameter_layout(params, mesh, shard=config.shard_parameters)
     optimizer = make_optimizer(config.optimizer, params, frozen=frozen, norm=layout.norm)
     schedule = learning_rate_schedule(config.optimizer, config.stages)
