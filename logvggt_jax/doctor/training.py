@@ -114,7 +114,7 @@ def _measured(
     clips, length = batch["images"].shape[:2]
     yield Finding("training", f"{name}: loss", loss, ok=bool(np.isfinite(loss)))
     yield Finding("training", f"{name}: step", seconds, "s", note=f"{clips * length / seconds:.4g} frames/s")
-    operations = step_flops(subject.model.config, batch["images"].shape[:4])
+    operations = step_flops(subject.model.config, batch["images"].shape[:4], frozen=(ENCODER,))
     yield Finding("training", f"{name}: utilisation", operations / seconds / peak, note="without recomputation")
 
 

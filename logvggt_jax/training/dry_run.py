@@ -15,6 +15,7 @@ from logvggt_jax.described import attention_kernels, described_bytes, described_
 from logvggt_jax.training.config import StageConfig, TrainConfig
 from logvggt_jax.training.parallel.sharding import DATA_AXIS, check_batch_size
 from logvggt_jax.training.step.costs import StepCosts, step_costs, step_flops
+from logvggt_jax.training.step.freezing import frozen_patterns
 
 _GIB = 2**30
 # Numbers of clips that a device takes at once, tried for the largest that fits: each is a compilation of minutes.
@@ -49,7 +50,9 @@ def _say_all(config: TrainConfig, mesh: Mesh, say: Callable[[str], None]) -> Non
         for size in stage.sizes:
             clips = stage.batch_size // mesh.size
             name = f"{stage.name} {size[0]}x{size[1]}, {clips} x {stage.clip_length} frames a device"
-            operations = step_flops(config, (stage.batch_size, stage.clip_length, *size))
+            operations = step_flops(
+                config.model, (stage.batch_size, stage.clip_length, *size), frozen=frozen_patterns(config)
+            )
             costs = costs_of(clips, stage.clip_length, size)
             say(f"{name}: {operations / 1e12:.4g} TFLOP in all without recomputation; {_described(costs, limit)}")
         say(f"{stage.name}: {_largest_that_fits(costs_of, mesh, stage, limit, config.accumulate)}")

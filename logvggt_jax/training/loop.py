@@ -44,6 +44,7 @@ from logvggt_jax.training.step.compilation import compiled_steps
 from logvggt_jax.training.step.costs import step_flops
 from logvggt_jax.training.step.device_memory import memory_explained, validation_memory_explained
 from logvggt_jax.training.step.finite_check import non_finite_clips
+from logvggt_jax.training.step.freezing import frozen_patterns
 from logvggt_jax.training.step.initialization import check_weights, initial_parameters
 from logvggt_jax.training.step.program import Program, abstract_parameters, make_program
 from logvggt_jax.training.step.state import TrainState
@@ -329,7 +330,9 @@ class _Run:
             for number, step in enumerate(compiled_steps(self.program, self.state, stage, new, taught=taught), 1):
                 self.programs[step.clips] = step.run
                 if self.peak is not None:
-                    self.operations[step.clips] = step_flops(self.config, step.clips[:4])
+                    self.operations[step.clips] = step_flops(
+                        self.config.model, step.clips[:4], frozen=frozen_patterns(self.config)
+                    )
                 height, width = step.clips[2:4]
                 log.say(
                     f"{stage.name}: step for images of {height} x {width} compiled after {step.seconds:.0f} s, "

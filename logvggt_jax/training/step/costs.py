@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from logvggt_jax.compile import out_of_device_memory
+from logvggt_jax.config import ModelConfig
 from logvggt_jax.model.initialization import variable_shapes
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.model.parameters import unstack_layers
@@ -19,7 +20,7 @@ from logvggt_jax.operations import count_flops
 from logvggt_jax.program_text import ProgramText, bytes_of
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.parallel.sharding import split
-from logvggt_jax.training.step.freezing import frozen_leaves, frozen_patterns
+from logvggt_jax.training.step.freezing import frozen_leaves
 from logvggt_jax.training.step.program import abstract_parameters, make_program
 
 # What is exchanged in the background is counted where it ends, with the result's own shape.
@@ -68,13 +69,12 @@ def abstract_clips(
     }
 
 
-def step_flops(config: TrainConfig, clips: tuple[int, ...]) -> float:
+def step_flops(config: ModelConfig, clips: tuple[int, ...], *, frozen: tuple[str, ...]) -> float:
     """Operations of a step on clips [B, T, H, W] over all devices: the predictions and their gradient with respect to
-    what is trained, nothing computed twice."""
-    model = LogVGGT(dataclasses.replace(config.model, attention="xla"))
-    frozen = frozen_leaves(abstract_parameters(config.model), frozen_patterns(config))
+    what is not `frozen` (see `freezing`), nothing computed twice."""
+    model = LogVGGT(dataclasses.replace(config, attention="xla"))
     # Layer by layer: in a loop a layer that reads the cache would stand for all.
-    still = unstack_layers(frozen, config.model, lambda leaf, _: leaf)
+    still = unstack_layers(frozen_leaves(abstract_parameters(config), frozen), config, lambda leaf, _: leaf)
 
     def gradient(params: Any, images: jax.Array) -> Any:
         def predictions(params: Any) -> Any:
@@ -85,7 +85,7 @@ def step_flops(config: TrainConfig, clips: tuple[int, ...]) -> float:
         return pull_back(jax.tree.map(jnp.ones_like, found))
 
     images = jax.ShapeDtypeStruct((*clips, 3), jnp.uint8)
-    return count_flops(gradient, variable_shapes(config.model)["params"], images, recomputed=False)
+    return count_flops(gradient, variable_shapes(config)["params"], images, recomputed=False)
 
 
 def step_costs(

@@ -16,7 +16,7 @@ from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.parallel.sharding import data_mesh
 from logvggt_jax.training.step import costs as module
 from logvggt_jax.training.step.costs import StepCosts, abstract_clips, collectives, step_costs, step_flops
-from logvggt_jax.training.step.freezing import ENCODER
+from logvggt_jax.training.step.freezing import ENCODER, frozen_patterns
 
 SIZE = (28, 42)
 
@@ -29,7 +29,7 @@ def test_operations_grow_with_the_clips_and_what_is_trained(run_config: TrainCon
             model=dataclasses.replace(run_config.model, encoder=parts),
             optimizer=dataclasses.replace(run_config.optimizer, frozen=frozen),
         )
-        return step_flops(config, (clips, 4, *SIZE))
+        return step_flops(config.model, (clips, 4, *SIZE), frozen=frozen_patterns(config))
 
     model = LogVGGT(run_config.model)
     images = jax.ShapeDtypeStruct((1, 4, *SIZE, 3), jnp.uint8)
