@@ -353,11 +353,15 @@ class _Run:
     def _validate(self, step: int, log: MetricsLog) -> None:
         if self.validation is None or self.config.validation is None:
             return
-        started = time.perf_counter()
-        with self.times.other("validation"), self.watchdog.other("the validation"):
-            with validation_memory_explained(self.config.validation, self.mesh):
+        with validation_memory_explained(self.config.validation, self.mesh):
+            if not self.validation.compiled:
+                # Not a part of what the first of them takes, by which the time left is foretold.
+                with self.times.other("compilation of validation"), self.watchdog.other("the compilation"):
+                    self.validation.compile(self.state.averaged)
+            started = time.perf_counter()
+            with self.times.other("validation"), self.watchdog.other("the validation"):
                 values, pictures = self.validation(self.state.averaged)
-            best = self._keep_if_best(step, values, log)
+                best = self._keep_if_best(step, values, log)
         log.show(step, pictures)
         log.write(step, values, **{VALIDATION_SET: validation_digest(self.config)})
         log.say(

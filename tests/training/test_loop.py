@@ -33,7 +33,7 @@ from logvggt_jax.training.checkpoints.run_checkpoints import RunCheckpoints
 from logvggt_jax.training.config import VALIDATION_METRICS, SourceConfig, StageConfig, TrainConfig, ValidationConfig
 from logvggt_jax.training.loop import NonFiniteTraining, train
 from logvggt_jax.training.parallel.sharding import data_mesh
-from logvggt_jax.training.reporting.metrics_log import MetricsLog, read_metrics
+from logvggt_jax.training.reporting.metrics_log import COST, TIMES_NAME, MetricsLog, read_metrics
 from logvggt_jax.training.reporting.profile import ProfiledSteps
 from logvggt_jax.training.step.program import Program, make_program
 from logvggt_jax.training.step.state import TrainState
@@ -561,6 +561,26 @@ def test_validation_reports_held_out_clips(run_config: TrainConfig, tmp_path: Pa
         assert entry["validation/rotation_over_identity"] == pytest.approx(
             entry["validation/rotation"] / entry["validation/identity_rotation"]
         )
+    # The time left is foretold from what a validation takes once its program is there.
+    spent = read_metrics(tmp_path / TIMES_NAME)[0]
+    assert {f"{COST}compilation of validation", f"{COST}validation"} <= set(spent)
+
+
+def _judge(patch: pytest.MonkeyPatch, *found: float, metric: str = "abs_rel") -> None:
+    """Validations find these values of a metric, one after the other, and 0 of all else."""
+    values = {f"validation/{name}": 0.0 for name in (*VALIDATION_METRICS, "constant_abs_rel", "identity_rotation")}
+    judged = iter(found)
+
+    class Judge:
+        compiled = True
+
+        def __init__(self, *_: Any) -> None:
+            pass
+
+        def __call__(self, _: Any) -> Judgement:
+            return Judgement({**values, f"validation/{metric}": next(judged)}, {})
+
+    patch.setattr(loop, "Validation", Judge)
 
 
 def _validated(config: TrainConfig, *, best: str | None = None) -> TrainConfig:
@@ -579,12 +599,8 @@ def _validated(config: TrainConfig, *, best: str | None = None) -> TrainConfig:
 def test_the_best_model_by_the_named_metric_is_kept(
     metric: str, found: tuple[float, ...], kept: int, run_config: TrainConfig, tmp_path: Path
 ) -> None:
-    values = {f"validation/{name}": 0.0 for name in (*VALIDATION_METRICS, "constant_abs_rel", "identity_rotation")}
     with pytest.MonkeyPatch.context() as patch:
-        judged = iter(found)
-        patch.setattr(
-            loop, "Validation", lambda *_: lambda _: Judgement({**values, f"validation/{metric}": next(judged)}, {})
-        )
+        _judge(patch, *found, metric=metric)
         train(_validated(run_config, best=metric), tmp_path, mesh=data_mesh(2))
     training = read_provenance(tmp_path / "best").training
     assert training is not None and training.steps == kept
@@ -613,11 +629,7 @@ def test_the_best_model_is_compared_with_the_one_that_is_kept() -> None:
 def test_the_best_model_is_compared_on_the_same_clips_alone(
     run_config: TrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    values = {f"validation/{name}": 0.0 for name in (*VALIDATION_METRICS, "constant_abs_rel", "identity_rotation")}
-    judged = iter((0.1, 0.2, 0.5, 0.4, 0.6))
-    monkeypatch.setattr(
-        loop, "Validation", lambda *_: lambda _: Judgement({**values, "validation/abs_rel": next(judged)}, {})
-    )
+    _judge(monkeypatch, 0.1, 0.2, 0.5, 0.4, 0.6)
 
     def kept(config: TrainConfig) -> int | None:
         train(config, tmp_path, mesh=data_mesh(2))
@@ -669,17 +681,9 @@ def test_a_run_that_is_killed_between_its_best_model_and_the_line_about_it_shows
 
 
 def test_a_best_model_that_a_kill_kept_from_the_disk_is_made_up_for(run_config: TrainConfig, tmp_path: Path) -> None:
-    values = {f"validation/{name}": 0.0 for name in (*VALIDATION_METRICS, "constant_abs_rel", "identity_rotation")}
-
-    def judge(patch: pytest.MonkeyPatch, *errors: float) -> None:
-        judged = iter(errors)
-        patch.setattr(
-            loop, "Validation", lambda *_: lambda _: Judgement({**values, "validation/abs_rel": next(judged)}, {})
-        )
-
     config = _validated(run_config, best="abs_rel")
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyError, match="crash"):
-        judge(patch, 0.5, 0.2)
+        _judge(patch, 0.5, 0.2)
         keep = RunCheckpoints.save_best
         patch.setattr(
             RunCheckpoints, "save_best", lambda self, state: keep(self, state) if int(state.step) == 0 else None
@@ -688,7 +692,7 @@ def test_a_best_model_that_a_kill_kept_from_the_disk_is_made_up_for(run_config: 
         train(config, tmp_path, mesh=data_mesh(2))
     assert RunCheckpoints(tmp_path, config).best_step == 0
     with pytest.MonkeyPatch.context() as patch:
-        judge(patch, 0.3)  # what was validated is not validated again
+        _judge(patch, 0.3)  # what was validated is not validated again
         train(config, tmp_path, mesh=data_mesh(2))
     assert RunCheckpoints(tmp_path, config).best_step == 3
 
@@ -759,24 +763,16 @@ def test_settings_may_change_until_a_step_is_done(run_config: TrainConfig, tmp_p
 def test_a_run_that_begins_anew_keeps_no_validation_of_the_start_before(
     best: int, run_config: TrainConfig, tmp_path: Path
 ) -> None:
-    values = {f"validation/{name}": 0.0 for name in (*VALIDATION_METRICS, "constant_abs_rel", "identity_rotation")}
-
-    def judge(patch: pytest.MonkeyPatch, *errors: float) -> None:
-        judged = iter(errors)
-        patch.setattr(
-            loop, "Validation", lambda *_: lambda _: Judgement({**values, "validation/abs_rel": next(judged)}, {})
-        )
-
     config = dataclasses.replace(_validated(run_config, best="abs_rel"), save_every=100)
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyError, match="crash"):
-        judge(patch, 0.2, 0.1 if best else 0.3)
+        _judge(patch, 0.2, 0.1 if best else 0.3)
         _at_step(patch, 4, _crash)
         train(config, tmp_path, mesh=data_mesh(2))
     kept = read_provenance(tmp_path / "best").training
     assert kept is not None and kept.steps == best
     other = dataclasses.replace(_validated(run_config), loss=dataclasses.replace(run_config.loss, alpha=0.5))
     with pytest.MonkeyPatch.context() as patch:
-        judge(patch, 0.9, 0.8, 0.7)
+        _judge(patch, 0.9, 0.8, 0.7)
         train(other, tmp_path, mesh=data_mesh(2))
     errors = [entry["validation/abs_rel"] for entry in _numbers(tmp_path) if "validation/abs_rel" in entry]
     assert errors == [0.9, 0.8, 0.7]

@@ -69,7 +69,7 @@ class RunTimes:
 
     @contextlib.contextmanager
     def other(self, kind: str) -> Iterator[None]:
-        """Time of a `compilation`, `validation`, `save` or another `kind`, in which no step runs."""
+        """Time of a `compilation` of a stage, `validation`, `save` or another `kind`, in which no step runs."""
         started = time.perf_counter()
         yield
         self._others.setdefault(kind, []).append(time.perf_counter() - started)
@@ -92,16 +92,8 @@ class RunTimes:
 
     @property
     def costs(self) -> dict[str, float]:
-        """Seconds that one of each kind of `other` takes: the mean since the start, else that of the start before.
-
-        The first validation of a start compiles, and counts as long as nothing else is known of them.
-        """
-        found = {kind: sum(seconds) / len(seconds) for kind, seconds in self._others.items()}
-        if later := self._others.get("validation", [])[1:]:
-            found["validation"] = sum(later) / len(later)
-        elif "validation" in self._earlier:
-            found["validation"] = self._earlier["validation"]
-        return self._earlier | found
+        """Seconds that one of each kind of `other` takes: the mean since the start, else that of the start before."""
+        return self._earlier | {kind: sum(seconds) / len(seconds) for kind, seconds in self._others.items()}
 
     def remaining_seconds(self, step: int, end: int | None = None) -> float:
         """Seconds until step `end` (None: the last of all), if frames, validations and saves take as long as so far.

@@ -80,11 +80,21 @@ class Validation:
             return depth, extrinsics, confidence[firsts]
 
         self._predict = jax.jit(on_all_devices, out_shardings=replicated(mesh))
+        self._compiled: jax.stages.Compiled | None = None
+
+    @property
+    def compiled(self) -> bool:
+        """Whether a judgement takes no compilation any more."""
+        return self._compiled is not None
+
+    def compile(self, params: Any) -> None:
+        """Makes ready what judges parameters of such shapes and in such places."""
+        self._compiled = self._predict.lower(params, self._images).compile()
 
     def __call__(self, params: Any) -> Judgement:
-        """Judges these parameters."""
-        count = len(self._clips)
-        depth, extrinsics, confidence = jax.device_get(self._predict(params, self._images))
+        """Judges these parameters, which are such as it was compiled for if it was."""
+        count, predict = len(self._clips), self._compiled or self._predict
+        depth, extrinsics, confidence = jax.device_get(predict(params, self._images))
         results = [
             {**_clip_metrics(*each), **known}
             for *each, known in zip(depth[:count], extrinsics[:count], self._clips, self._without_learning, strict=True)

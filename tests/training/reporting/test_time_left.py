@@ -86,27 +86,13 @@ def test_a_start_that_goes_on_counts_what_the_one_before_found(config: TrainConf
     assert times.remaining_seconds(100) == 3 * 5 + 2 * 20
 
 
-def test_what_the_first_validation_compiles_is_not_expected_of_later_ones(config: TrainConfig, clock: Clock) -> None:
-    times, found = RunTimes(config), []
-    for seconds in (200.0, 2.0, 4.0):
-        with times.other("validation"):
-            clock.now += seconds
-        found.append(times.remaining_seconds(100))
-    assert found == [2 * 200.0, 2 * 2.0, 2 * 3.0]
-    times = RunTimes(config, costs={"validation": 3.0})
-    for seconds in (200.0, 5.0):
-        with times.other("validation"):
-            clock.now += seconds
-        found.append(times.remaining_seconds(100))
-    assert found[3:] == [2 * 3.0, 2 * 5.0], "what the start before found"
-
-
-def test_every_save_counts(config: TrainConfig, clock: Clock) -> None:
-    times = RunTimes(config)
+@pytest.mark.parametrize("kind", ["save", "validation"])
+def test_every_save_and_every_validation_counts(kind: str, config: TrainConfig, clock: Clock) -> None:
+    times = RunTimes(config, costs={kind: 200.0})
     for seconds in (3.0, 5.0):
-        with times.other("save"):
+        with times.other(kind):
             clock.now += seconds
-    assert times.costs == {"save": 4.0}
+    assert times.costs == {kind: 4.0}
 
 
 def test_utilisation_is_of_the_peak_in_the_time_of_steps(config: TrainConfig, clock: Clock) -> None:
