@@ -195,10 +195,9 @@ class _Run:
             if step >= end:
                 continue
             seed = self.config.seed * len(self.config.stages) + index
-            source = stage_batches(datasets, self.config.data, stage, seed=seed)
-            if position is not None and position.stage == index:
-                source.set_state(position.data)
-            elif position is not None:  # of a stage that is done, on the same sequences
+            begun = position.data if position is not None and position.stage == index else None
+            source = stage_batches(datasets, self.config.data, stage, seed=seed, state=begun)
+            if position is not None and begun is None:  # of a stage that is done, on the same sequences
                 source.check_sources(position.data)
             # Otherwise they would wait for one another in different programs.
             check_agreement(f"stage {stage.name!r}: the data", {**source.get_state(), "broken": None})

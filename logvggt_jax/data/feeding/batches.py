@@ -21,7 +21,7 @@ from logvggt_jax.data.feeding.augmentation import ColourAugmentation
 from logvggt_jax.data.feeding.broken_clips import BrokenClips
 from logvggt_jax.data.feeding.clips import BROKEN, NAME, Size
 from logvggt_jax.data.feeding.listed_frames import check_listed_frames
-from logvggt_jax.data.feeding.mixture import FRAMES, TEACHERS, mixture
+from logvggt_jax.data.feeding.mixture import FRAMES, SHAPES, TEACHERS, mixture
 from logvggt_jax.data.feeding.sampling import CovisibleDataset, sampler_for
 from logvggt_jax.errors import InputError, one_line
 
@@ -141,15 +141,15 @@ class BatchIterator(Iterator[Batch]):
         of another teacher, whose examples would differ.
         """
         expected = {"examples", "broken", *self._identity}
-        # States of before frames and teachers were listed pass without them.
-        if set(state) | ({FRAMES, TEACHERS} & expected) != expected:
+        # States of before these were listed pass without them.
+        if set(state) | ({FRAMES, TEACHERS, SHAPES} & expected) != expected:
             raise InputError(
                 f"data state has fields {sorted(state)}, expected {sorted(expected)}: "
                 "it was written by another version or is damaged"
             )
         self.check_sources(state)
         for name, value in self._identity.items():
-            if name not in (FRAMES, TEACHERS) and state[name] != value:
+            if name not in (FRAMES, TEACHERS, SHAPES) and state[name] != value:
                 raise InputError(
                     f"data state was written with {name}={state[name]}, this run has {value}: "
                     "resume with the same data settings, or start a new run"
@@ -200,6 +200,7 @@ def training_batches(
     process_count: int = 1,
     worker_count: int = 0,
     num_threads: int = 2,
+    state: Mapping[str, Any] | None = None,
 ) -> BatchIterator:
     """Endless batches of clips from a mixture of data sets.
 
@@ -234,6 +235,8 @@ def training_batches(
       process_count: processes that train together.
       worker_count: reading processes; 0 reads in threads of this process.
       num_threads: reading threads of each process; 0 reads when a clip is asked for.
+      state: of `BatchIterator.get_state`, to continue after the examples that it counts. Sequences keep the size that
+        they had, even if their pictures can be read only now, or no more.
 
     Returns:
       Iterator of {"images" uint8 [B, T, H, W, 3], "depth" float32 [B, T, H, W] z-depth (0 = invalid),
@@ -242,7 +245,8 @@ def training_batches(
       one, it gives descriptions, and has the function `draw` that makes such a batch of them.
 
     Raises:
-      InputError: an argument is out of range, or a data set has no sequence long enough. While iterating:
+      InputError: an argument is out of range, a data set has no sequence long enough, or `state` is of other clips (see
+        `BatchIterator.set_state`). While iterating:
         `TooManyBrokenClips`, or with max_broken=0 the error of bad data, named.
     """
     if not datasets:
@@ -289,8 +293,9 @@ def training_batches(
         augmentation=augmentation,
         min_valid_depth=min_valid_depth,
         replace_broken=max_broken > 0,
+        shapes=(state or {}).get(SHAPES, {}),
     )
-    return BatchIterator(
+    batches = BatchIterator(
         examples,
         identity,
         BrokenClips(max_broken),
@@ -302,6 +307,9 @@ def training_batches(
         num_threads=num_threads,
         draw=draw,
     )
+    if state is not None:
+        batches.set_state(state)
+    return batches
 
 
 def _drawing(

@@ -22,6 +22,9 @@ from logvggt_jax.errors import InputError
 
 FRAMES = "frames"  # in what examples are drawn from: `ListedFrames`
 TEACHERS = "teachers"  # likewise, where there are any: digests of what labelled the data sets, by name
+SHAPES = "shapes"  # likewise, where clips have several sizes: `Shapes`
+Shapes = Mapping[str, Mapping[str, str]]
+"""By data set and sequence the size of its clips, such as `392x518`. JSON types."""
 _SIZE_READERS = 16
 
 
@@ -36,12 +39,13 @@ def mixture(
     augmentation: ColourAugmentation | None,
     min_valid_depth: float,
     replace_broken: bool,
+    shapes: Shapes,
 ) -> tuple[grain.MapDataset, dict[str, Any], list[Size]]:
     """The endless examples of `training_batches`, JSON values that say what they are drawn from, and the sizes that
     occur among them.
 
     Examples are clips by index, `batch_size` in a row of one size; with `replace_broken` none of them fails, see
-    `clips.ReplaceBroken`.
+    `clips.ReplaceBroken`. Sequences that are in `shapes` keep the size that they had, whatever their pictures say now.
     """
     sequences = {
         name: _by_size(
@@ -49,6 +53,7 @@ def mixture(
             dataset,
             _long_enough(name, dataset, samplers[name], skip_broken=replace_broken),
             sizes,
+            shapes.get(name, {}),
             skip_broken=replace_broken,
         )
         for name, dataset in datasets.items()
@@ -107,6 +112,11 @@ def mixture(
     }
     if teachers := {name: each.labelled_by for name, each in datasets.items() if isinstance(each, ConfidentDataset)}:
         identity[TEACHERS] = teachers
+    if len(sizes) > 1:
+        identity[SHAPES] = {
+            name: {sequence: _written(size) for size, part in zip(sizes, parts, strict=True) for sequence in part}
+            for name, parts in sequences.items()
+        }
     if len(examples) > 1:
         turns = [grain.MapDataset.source([size]).repeat().map_with_index(_Turn()) for size in range(len(examples))]
         schedule = grain.MapDataset.mix(turns, weights=size_shares)
@@ -192,9 +202,15 @@ def _long_enough(name: str, dataset: Dataset, sampler: Sampler, *, skip_broken: 
 
 
 def _by_size(
-    name: str, dataset: Dataset, sequences: Sequence[str], sizes: Sequence[Size], *, skip_broken: bool
+    name: str,
+    dataset: Dataset,
+    sequences: Sequence[str],
+    sizes: Sequence[Size],
+    known: Mapping[str, str],
+    *,
+    skip_broken: bool,
 ) -> list[list[str]]:
-    """For each of `sizes` the sequences whose pictures have the nearest aspect ratio.
+    """For each of `sizes` the sequences whose pictures have the nearest aspect ratio, or had it when it became `known`.
 
     With `skip_broken` those whose pictures cannot be read have the first size, where their clips will be broken.
     """
@@ -202,10 +218,14 @@ def _by_size(
         return [list(sequences)]
 
     reasons: list[str] = []
+    by_name = {_written(size): size for size in sizes}
 
     def size_of(sequence: str) -> Size | None:
+        # One whose pictures could not be read then, or cannot be now, would make other batches.
+        if (size := by_name.get(known.get(sequence, ""))) is not None:
+            return size
         try:
-            return dataset.image_size(sequence)
+            return nearest_size(dataset.image_size(sequence), sizes)
         except Exception as error:
             if not skip_broken:
                 raise
@@ -218,11 +238,15 @@ def _by_size(
     with ThreadPoolExecutor(_SIZE_READERS) as executor:
         found = list(executor.map(size_of, sequences))
     for sequence, size in zip(sequences, found, strict=True):
-        parts[sizes[0] if size is None else nearest_size(size, sizes)].append(sequence)
+        parts[sizes[0] if size is None else size].append(sequence)
     if not any(found):
         first = f", the first because {reasons[0]}" if reasons else ""
         raise InputError(f"{name}: no picture of {len(sequences)} sequences can be read{first}; the log names all")
     return list(parts.values())
+
+
+def _written(size: Size) -> str:
+    return f"{size[0]}x{size[1]}"
 
 
 def _fingerprint(sequences: Sequence[str]) -> str:

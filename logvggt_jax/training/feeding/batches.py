@@ -13,9 +13,14 @@ from logvggt_jax.training.parallel.agreement import from_all
 
 
 def stage_batches(
-    datasets: Mapping[str, Dataset], config: DataConfig, stage: StageConfig, *, seed: int
+    datasets: Mapping[str, Dataset],
+    config: DataConfig,
+    stage: StageConfig,
+    *,
+    seed: int,
+    state: Mapping[str, Any] | None = None,
 ) -> BatchIterator:
-    """This process's share of the batches of a stage; `seed` is the stage's own."""
+    """This process's share of the batches of a stage, after those that `state` counts; `seed` is the stage's own."""
     sources = [source for source in config.sources if source.name in datasets]
     return training_batches(
         datasets,
@@ -34,6 +39,7 @@ def stage_batches(
         process_count=jax.process_count(),
         worker_count=config.worker_count,
         num_threads=config.num_threads,
+        state=state,
     )
 
 

@@ -300,6 +300,34 @@ def test_batches_of_several_sizes_resume_exactly_and_are_shared_by_processes():
         iterator.set_state(state)
 
 
+@pytest.mark.parametrize("unreadable", ["first", "later"])
+def test_a_sequence_keeps_the_size_of_its_clips_whenever_its_pictures_can_be_read(unreadable):
+    class Unread(Shaped):
+        def image_size(self, sequence: str) -> tuple[int, int]:
+            if sequence == "s3":
+                raise OSError("s3/0.png: input/output error")
+            return super().image_size(sequence)
+
+    options = {"sizes": [(14, 28), (28, 14)], "max_broken": 0.9}
+    first, later = (Unread(12), Shaped(12)) if unreadable == "first" else (Shaped(12), Unread(12))
+
+    def drawn(iterator):
+        return [(batch["images"].shape, batch["images"][:, 0, 0, 0, 0].tolist()) for batch in islice(iterator, 9)]
+
+    with batches({"shaped": first}, **options) as iterator:
+        next(iterator)
+        state = json.loads(json.dumps(iterator.get_state()))
+        following = drawn(iterator)
+    with batches({"shaped": later}, **options, state=state) as iterator:
+        assert [shape for shape, _ in drawn(iterator)] == [shape for shape, _ in following]
+    # A state of before sizes were kept goes on where nothing has changed.
+    del state["shapes"]
+    with batches({"shaped": first}, **options, state=state) as iterator:
+        assert drawn(iterator) == following
+    with pytest.raises(ValueError, match="sequences="):
+        batches({"shaped": later}, **options, state=state)
+
+
 def test_a_broken_clip_is_replaced_by_the_next_of_its_set(caplog: pytest.LogCaptureFixture):
     logging.use_python_logging(quiet=True)
     options = {"stride": (1, 1), "max_broken": 0.5}
