@@ -3,9 +3,9 @@
     python scripts/rooms_teacher.py runs/teacher
     python train.py --config=configs/distill_rooms.py:runs/teacher --workdir=runs/student
 
-After the colon stands the teacher. It takes half an hour, like `configs/tiny.py`, whose sizes, rooms, schedule and
-steps it has: what that run learns from the truth, this one learns from its teacher's predictions of 24 frames at a
-time. Strides differ a little, since the teacher sees every second frame.
+After the colon stands the teacher. docs/own-sequences.md says how long it took. Sizes, rooms, schedule and steps are
+those of `configs/tiny.py`: what that run learns from the truth, this one learns from its teacher's predictions of 24
+frames at a time. Strides differ a little, since the teacher sees every second frame.
 """
 
 from ml_collections import ConfigDict

@@ -133,6 +133,7 @@ class _Run:
     times: RunTimes
     in_flight: StepsInFlight
     profiler: Profiler
+    validation_set: str
 
     def __init__(
         self,
@@ -152,6 +153,7 @@ class _Run:
         self.validation = None
         if config.validation is not None:
             self.validation = Validation(LogVGGT(config.model), config.validation, layout, validated)
+            self.validation_set = validation_digest(config, validated)
         self.checkpoints = RunCheckpoints(workdir, config, trained_on=trained_on)
         self.peak = None
         if layout.mesh.devices.flat[0].platform != "cpu":  # whose cores share one peak
@@ -211,7 +213,7 @@ class _Run:
             if any_process(not log.silent and found is None):
                 self._validate(step, log)
             else:
-                known = found is not None and found.get(VALIDATION_SET) == validation_digest(self.config)
+                known = found is not None and found.get(VALIDATION_SET) == self.validation_set
                 self._keep_if_best(step, found if found is not None and known else {}, log)
         for index, stage, end, source in left:
             with (
@@ -362,7 +364,7 @@ class _Run:
                 values, pictures = self.validation(self.state.averaged)
                 best = self._keep_if_best(step, values, log)
         log.show(step, pictures)
-        log.write(step, values, **{VALIDATION_SET: validation_digest(self.config)})
+        log.write(step, values, **{VALIDATION_SET: self.validation_set})
         log.say(
             f"validation after step {step} ({duration(time.perf_counter() - started)}): {validation_line(values)}{best}"
         )
@@ -376,7 +378,7 @@ class _Run:
         # Process 0 has the earlier values and decides.
         if not log.silent and (held := self.checkpoints.best_step) != step:
             earlier = read_metrics(log.path)
-            better = is_best(earlier, step, name, values, held=held, digest=validation_digest(self.config))
+            better = is_best(earlier, step, name, values, held=held, digest=self.validation_set)
         if not any_process(better):
             return ""
         self.checkpoints.save_best(self.state)

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from logvggt_jax.data.dataset import ConfidentDataset, Dataset
 from logvggt_jax.training.config import VALIDATION_METRICS, TrainConfig
 from logvggt_jax.weights.digests import json_digest
 
@@ -13,17 +14,18 @@ from logvggt_jax.weights.digests import json_digest
 VALIDATION_SET = "validation_set"
 
 
-def validation_digest(config: TrainConfig) -> str:
+def validation_digest(config: TrainConfig, datasets: Sequence[Dataset] = ()) -> str:
     """Of what decides the clips of validation and their truth: its settings, but for when it is due and what is kept,
-    and the teacher's where that labels them.
+    and the teacher's where that labels them, as the `datasets` of validation then say.
 
     A set that was moved to another folder counts as another one: for some readers the folder is all that tells them
     apart.
     """
     settings = config.to_dict()
     chosen = {name: value for name, value in settings["validation"].items() if name not in ("every", "best")}
-    labelled = config.teacher is not None and config.teacher.validation
-    return json_digest([chosen, settings["teacher"] if labelled else None])
+    teachers = [dataset.labelled_by for dataset in datasets if isinstance(dataset, ConfidentDataset)]
+    # The teacher is the same wherever its weights lie.
+    return json_digest([chosen, {**settings["teacher"], "weights": teachers} if teachers else None])
 
 
 def validation_of(lines: Sequence[Mapping[str, Any]], step: int) -> Mapping[str, Any] | None:
