@@ -1,8 +1,8 @@
 """Pictures from files, with the damage that decoders let pass reported.
 
 OpenCV decodes truncated JPEG and PNG files without complaint and fills the missing part with grey; files are
-therefore walked to their end marker first. A JPEG that this walk does not find regular may still be whole: Pillow
-decides (`jpeg.py`), which takes half as long again.
+therefore walked to their end marker first. Where this walk does not find a JPEG regular, or its end might be what the
+decoder made up, Pillow decides whether it is whole (`jpeg.py`), which takes half as long again.
 """
 
 import re
@@ -16,24 +16,34 @@ import cv2
 import numpy as np
 
 from logvggt_jax.data.errors import BrokenPicture, missing_file
-from logvggt_jax.data.formats.jpeg import JPEG_START, decode_jpeg
+from logvggt_jax.data.formats.jpeg import JPEG_START, decode_jpeg, ends_flat
 from logvggt_jax.errors import InputError, one_line
 
 PNG_START = b"\x89PNG\r\n\x1a\n"
 # Within entropy-coded data a real marker is FF followed by neither 00, a restart marker nor a fill byte.
 _JPEG_MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
-_JPEG_END, _JPEG_SCAN = 0xD9, 0xDA
+_JPEG_END, _JPEG_SCAN, _JPEG_PROGRESSIVE = 0xD9, 0xDA, 0xC2
 _TIFF_ORDERS = {b"II*\0": "<", b"MM\0*": ">"}
 _TIFF_ORIENTATION = 0x112
 
 
 def read_rgb(path: str | Path) -> np.ndarray:
-    """8-bit colour picture [H, W, 3] uint8 RGB; grey is repeated, alpha is composited over white.
+    """Colour picture [H, W, 3] uint8 RGB; grey is repeated, alpha is composited over white, of PNG's 16 bits a channel
+    the upper 8 are taken.
 
     Orientation tags are ignored: calibrations belong to the pixels as stored. Raises MissingFiles, or InputError naming
-    the file: truncated, damaged or undecodable, or not 8 bits a channel.
+    the file: truncated, damaged or undecodable, of another type, or a depth map by its values.
     """
-    picture = _decode(Path(path))
+    path = Path(path)
+    data = _content(path)
+    picture = _decode(path, data)
+    if picture.dtype == np.uint16 and data.startswith(PNG_START):
+        if looks_like_depth(picture):
+            raise BrokenPicture(
+                f"{path}: expected colour, got grey with 16 bits whose values (up to {picture.max()}) look like depth: "
+                "put a colour picture in its place, or, if this is one, convert it to 8 bits"
+            )
+        picture = (picture >> 8).astype(np.uint8)
     if picture.dtype != np.uint8:
         raise BrokenPicture(f"{path}: expected 8-bit colour, got {picture.dtype}: convert it to 8 bits a channel")
     if picture.ndim == 2:
@@ -44,7 +54,13 @@ def read_rgb(path: str | Path) -> np.ndarray:
 
 
 def over_white(picture: np.ndarray) -> np.ndarray:
-    """Colours [H, W, 3] uint8 of a picture [H, W, 4] uint8 with alpha on a white ground."""
+    """Colours [H, W, 3] uint8 of a picture [H, W, 4] uint8 with alpha on a white ground.
+
+    Of screenshots and of what game engines render alpha is often 0 throughout, and meant by nobody: it is left out,
+    unless there is nothing to be seen below it.
+    """
+    if not picture[..., 3].any() and picture[..., :3].min() < picture[..., :3].max():
+        return picture[..., :3].copy()
     alpha = picture[:, :, 3:].astype(np.float32) / 255.0
     return (picture[:, :, :3] * alpha + 255.0 * (1.0 - alpha) + 0.5).astype(np.uint8)
 
@@ -55,13 +71,27 @@ def read_depth(path: str | Path) -> np.ndarray:
     Raises MissingFiles, or InputError naming the file: truncated, damaged or undecodable, or not 16-bit with one
     channel.
     """
-    picture = _decode(Path(path))
+    path = Path(path)
+    picture = _decode(path, _content(path))
     if picture.dtype != np.uint16 or picture.ndim != 2:
         raise BrokenPicture(
             f"{path}: expected 16-bit depth with one channel, got {picture.dtype} with shape {picture.shape}: "
             "replace it with the data set's original file"
         )
     return picture
+
+
+def looks_like_depth(values: np.ndarray) -> bool:
+    """Whether the pixels of a picture [H, W] or [H, W, C] uint16 are grey and look like those of a depth map.
+
+    Depth maps have values for distances in millimetres or similar: none near white, or pixels without a value (0)
+    and between them and the nearest distance nothing. Grey levels that come from 8 bits are no distances.
+    """
+    if values.ndim > 2 or not values.any() or any((values % step == 0).all() for step in (256, 257)):
+        return False
+    none, near_none = np.mean(values == 0), np.mean((values > 0) & (values < 256))
+    dark = values[values < 65535].max(initial=0) < 1 << 14
+    return bool(dark or (none > 0.01 and near_none < 0.001 * none))
 
 
 @contextmanager
@@ -77,10 +107,13 @@ def decoding_errors(path: Path) -> Iterator[None]:
         raise BrokenPicture(f"{path}: truncated or damaged picture ({one_line(error)}): fetch it again") from error
 
 
-def _decode(path: Path) -> np.ndarray:
+def _content(path: Path) -> bytes:
     if not path.is_file():
         raise missing_file(path)
-    data = path.read_bytes()
+    return path.read_bytes()
+
+
+def _decode(path: Path, data: bytes) -> np.ndarray:
     if data.startswith(JPEG_START) and not _jpeg_is_regular(data):
         with decoding_errors(path):
             return np.array(decode_jpeg(data).convert("RGB"))[..., ::-1]
@@ -92,6 +125,9 @@ def _decode(path: Path) -> np.ndarray:
         raise BrokenPicture(f"{path}: not a picture that OpenCV can decode ({error.err}): fetch it again") from error
     if picture is None:
         raise BrokenPicture(f"{path}: not a picture that OpenCV can decode: fetch it again")
+    if data.startswith(JPEG_START) and ends_flat(picture):
+        with decoding_errors(path):
+            decode_jpeg(data)
     return picture
 
 
@@ -113,7 +149,10 @@ def _as_stored(data: bytes) -> bytes | bytearray:
 
 
 def _jpeg_is_regular(data: bytes) -> bool:
-    """Whether the segments up to the end-of-image marker are all there and nothing else (ITU T.81, annex B)."""
+    """Whether the segments up to the end-of-image marker are all there and nothing else (ITU T.81, annex B).
+
+    A progressive picture counts as irregular: without its last scans it is coarse throughout, and ends like any other.
+    """
     position = len(JPEG_START)
     while position + 2 <= len(data):
         if data[position] != 0xFF:
@@ -124,6 +163,8 @@ def _jpeg_is_regular(data: bytes) -> bool:
             continue
         if kind == _JPEG_END:
             return True
+        if kind == _JPEG_PROGRESSIVE:
+            return False
         if position + 4 > len(data):
             return False
         position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")

@@ -1,12 +1,13 @@
 """JPEG pictures: the whole ones are read, however odd their file is, and the truncated ones are told.
 
 libjpeg fills what is missing with grey and complains on standard error only. Pillow feeds it piece by piece and raises
-where it asks for more than there is; that covers all but two kinds, which are decided here.
+where it asks for more than there is; that covers all but a few kinds, which are decided here.
 """
 
 import io
 import re
 
+import numpy as np
 from PIL import Image, JpegImagePlugin
 
 JPEG_START = b"\xff\xd8"
@@ -43,14 +44,23 @@ def decode_jpeg(data: bytes) -> Image.Image:
     except OSError:
         content = data.rstrip(_END[:1])
         picture = _decode(content + _END)
-        if _lacks_scans(content, picture) or picture.tobytes() != _decode(content + _OTHER_BITS + _END).tobytes():
+        if _lacks_scans(content, picture) or _asks_for_more(content, b"", picture):
             raise
         return picture
-    if _ends_flat(picture):
+    progressive = "progressive" in picture.info
+    if progressive or ends_flat(np.asarray(picture.crop(_last_unit(picture.size)))):
         end = data.rfind(_END)
-        if picture.tobytes() != _decode(data[:end] + _OTHER_BITS + data[end:]).tobytes():
-            raise OSError("the lower part of the picture is missing")
+        if (progressive and _lacks_scans(data[:end], picture)) or _asks_for_more(data[:end], data[end:], picture):
+            raise OSError("part of the picture is missing")
     return picture
+
+
+def ends_flat(pixels: np.ndarray) -> bool:
+    """Whether the last coded unit of a picture [H, W] or [H, W, C] is of one colour, as those that libjpeg makes up
+    are."""
+    left, top, right, bottom = _last_unit((pixels.shape[1], pixels.shape[0]))
+    unit = pixels[top:bottom, left:right]
+    return bool((unit == unit[0, 0]).all())
 
 
 def first_scan(data: bytes) -> int:
@@ -81,11 +91,15 @@ def _lacks_scans(data: bytes, picture: Image.Image) -> bool:
     return len(complete) < 64 * len(picture.getbands())
 
 
-def _ends_flat(picture: Image.Image) -> bool:
-    """Whether the last coded unit is of one colour, as those that libjpeg makes up are.
+def _asks_for_more(content: bytes, tail: bytes, picture: Image.Image) -> bool:
+    """Whether other bits between the `content` and `tail` of a file make another picture: it lacks pixels there."""
+    return picture.tobytes() != _decode(content + _OTHER_BITS + (tail or _END)).tobytes()
+
+
+def _last_unit(size: tuple[int, int]) -> tuple[int, int, int, int]:
+    """Left, top, right and bottom of the last coded unit of a picture of (W, H).
 
     Of its up to 16 x 16 pixels those that are smoothed with other units' are left out.
     """
-    right, bottom = picture.size
-    left, top = (length - max(1, (length - 1) % 16 - 1) for length in picture.size)
-    return len(picture.crop((left, top, right, bottom)).getcolors() or ()) == 1
+    left, top = (length - max(1, (length - 1) % 16 - 1) for length in size)
+    return left, top, *size

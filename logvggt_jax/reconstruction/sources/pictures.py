@@ -20,7 +20,7 @@ from PIL import (
 )
 
 from logvggt_jax.data.errors import BrokenPicture
-from logvggt_jax.data.formats.image import decoding_errors, over_white, png_is_whole
+from logvggt_jax.data.formats.image import decoding_errors, looks_like_depth, over_white, png_is_whole
 from logvggt_jax.data.formats.jpeg import decode_jpeg
 from logvggt_jax.errors import InputError, MissingPackage, disk_errors, one_line
 
@@ -113,18 +113,10 @@ def upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
 
 
 def refuse_depth(path: Path) -> None:
-    """Raises InputError for a grey picture with 16 bits that looks like a depth map.
-
-    Depth maps have values for distances in millimetres or similar: none near white, or pixels without a value (0)
-    and between them and the nearest distance nothing. Grey levels that come from 8 bits are no distances.
-    """
+    """Raises InputError for a grey picture with 16 bits that looks like a depth map."""
     with disk_errors(path):
         values = np.asarray(_decode(path, path.read_bytes()))
-    if not values.any() or any((values % step == 0).all() for step in (256, 257)):
-        return
-    none, near_none = np.mean(values == 0), np.mean((values > 0) & (values < 256))
-    dark = values[values < 65535].max(initial=0) < 1 << 14
-    if dark or (none > 0.01 and near_none < 0.001 * none):
+    if looks_like_depth(values):
         raise InputError(
             f"{path}: a grey picture with 16 bits whose values (up to {values.max()}) look like a depth map; give "
             "colour pictures, choose them with --pattern, or, if these are pictures, convert them to 8 bits"
@@ -205,11 +197,7 @@ def _colours(path: Path, picture: Image.Image) -> np.ndarray:
         if picture.mode == "RGB" and "transparency" not in picture.info:
             return np.array(picture)
         if picture.has_transparency_data:
-            levels = np.array(picture.convert("RGBA"))
-            # Of screenshots and of what game engines render alpha is often 0 throughout, and meant by nobody: unless
-            # there is nothing to be seen.
-            meant = levels[..., 3].any() or levels[..., :3].min() == levels[..., :3].max()
-            return over_white(levels) if meant else levels[..., :3].copy()
+            return over_white(np.array(picture.convert("RGBA")))
         return np.array(picture.convert("RGB"))
 
 

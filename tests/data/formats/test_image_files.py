@@ -63,10 +63,27 @@ def test_grey_is_repeated_and_alpha_is_composited_over_white(tmp_path: Path):
     alpha = np.dstack([PICTURE[..., ::-1], np.where(np.arange(60) < 30, 0, 255) * np.ones((40, 1))]).astype(np.uint8)
     composited = read_rgb(write(tmp_path / "alpha.png", alpha))
     assert (composited[:, :30] == 255).all() and np.array_equal(composited[:, 30:], PICTURE[:, 30:])
+    nothing = np.dstack([PICTURE[..., ::-1], np.zeros((40, 60), np.uint8)])
+    assert np.array_equal(read_rgb(write(tmp_path / "nothing.png", nothing)), PICTURE)
 
 
 def test_depth_keeps_its_sixteen_bits(tmp_path: Path):
     assert np.array_equal(read_depth(write(tmp_path / "d.png", DEPTH)), DEPTH)
+
+
+def test_sixteen_bits_of_a_png_become_the_upper_eight(tmp_path: Path):
+    deep = np.random.default_rng(0).integers(0, 65536, (40, 60, 4), np.uint16)
+    deep[0, 0], deep[..., 3] = (65535, 255, 256, 0), 65535
+    assert np.array_equal(read_rgb(write(tmp_path / "rgb.png", deep[..., 2::-1])), deep[..., :3] >> 8)
+    assert np.array_equal(read_rgb(write(tmp_path / "rgba.png", deep[..., [2, 1, 0, 3]])), deep[..., :3] >> 8)
+    assert np.array_equal(read_rgb(write(tmp_path / "grey.png", DEPTH)), (DEPTH[..., None] >> 8).repeat(3, 2))
+
+
+def test_depth_in_the_place_of_colour_is_named(tmp_path: Path):
+    with pytest.raises(ValueError, match=r"d\.png.*look like depth"):
+        read_rgb(write(tmp_path / "d.png", DEPTH // 16))
+    with pytest.raises(ValueError, match=r"t\.tif.*uint16"):
+        read_rgb(write(tmp_path / "t.tif", DEPTH))
 
 
 @pytest.mark.parametrize("keep", [0.0, 0.05, 0.3, 0.5, 0.9, 0.999])
@@ -144,6 +161,29 @@ def test_a_jpeg_without_its_end_is_refused_where_pixels_are_missing(
         read_rgb(path)
 
 
+@pytest.mark.parametrize("keep", [0.2, 0.5, 0.8])
+@pytest.mark.parametrize("lost", [0, 1], ids=["cut", "zeros"])
+@pytest.mark.parametrize("progressive", [False, True])
+def test_a_jpeg_with_its_end_is_refused_where_pixels_are_missing(
+    tmp_path: Path, keep: float, lost: int, progressive: bool
+):
+    path = tmp_path / "cut.jpg"
+    data = jpeg(path, progressive=progressive)
+    start, end = data.index(b"\xff\xda"), len(data) - 2
+    cut = start + int(keep * (end - start))
+    path.write_bytes(data[:cut] + bytes(lost * (end - cut)) + data[end:])
+    with pytest.raises(ValueError, match=r"cut\.jpg.*fetch it again"):
+        read_rgb(path)
+
+
+@pytest.mark.parametrize("progressive", [False, True])
+def test_a_jpeg_whose_corner_is_of_one_colour_is_whole(tmp_path: Path, progressive: bool):
+    flat = PICTURE.copy()
+    flat[16:, 32:] = 128
+    Image.fromarray(flat).save(tmp_path / "a.jpg", quality=95, progressive=progressive)
+    assert (read_rgb(tmp_path / "a.jpg")[-1, -1] == 128).all()
+
+
 def test_a_jpeg_for_print_becomes_rgb(tmp_path: Path):
     path = tmp_path / "cmyk.jpg"
     jpeg(path, "CMYK")
@@ -176,7 +216,5 @@ def test_what_is_no_picture_is_named(tmp_path: Path):
 
 
 def test_wrong_types_are_named(tmp_path: Path):
-    with pytest.raises(ValueError, match=r"deep\.png.*uint16"):
-        read_rgb(write(tmp_path / "deep.png", DEPTH))
     with pytest.raises(ValueError, match=r"shallow\.png.*uint8"):
         read_depth(write(tmp_path / "shallow.png", PICTURE[..., 0]))
