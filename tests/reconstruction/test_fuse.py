@@ -341,6 +341,20 @@ def test_poses_of_several_cameras_under_one_name_are_refused(
         fuse(disordered, tmp_path / "out", poses=poses, progress=False)
 
 
+def test_of_several_colmap_models_the_largest_is_taken_and_said(truth: Reconstruction, tmp_path: Path) -> None:
+    for place, count in (("0", 2), ("2", COUNT)):
+        lines = [
+            f"{i} 1 0 0 0 {' '.join(map(str, pose[:, 3]))} 1 {name}.png\n\n"
+            for i, (name, pose) in enumerate(zip(truth.names, truth.extrinsics, strict=True))
+        ]
+        (tmp_path / "sparse" / place).mkdir(parents=True)
+        (tmp_path / "sparse" / place / "images.txt").write_text("".join(lines[:count]))
+        (tmp_path / "sparse" / place / "cameras.txt").write_text("1 PINHOLE 56 42 50 50 28 21\n")
+    for folder in (tmp_path, tmp_path / "sparse"):
+        with pytest.warns(UserWarning, match=f"holds 2 models.*0: 2, 2: {COUNT}.* those of 2, the largest"):
+            assert len(read_poses(folder)) == COUNT
+
+
 def test_a_folder_without_poses_and_targets_in_the_way(
     disordered: Reconstruction, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -9,7 +9,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -101,6 +101,45 @@ class ColmapImage:
     name: str
     camera: int
     extrinsics: np.ndarray | None
+
+
+class ChosenModel(NamedTuple):
+    """The folder of a model, and what there is to say of why it is this one; None where there is no other."""
+
+    folder: Path
+    said: str | None
+
+
+def choose_model(files: SourceFiles, folder: Path) -> ChosenModel:
+    """Of the models in the folders of this one, as the mapper writes them, that with most registered pictures; the
+    folder itself, as the undistorter writes it, where there are none.
+
+    Raises MissingFiles where there is no such folder, InputError naming the file of a model that is not one.
+    """
+    models = _models(files, folder, "images") or _models(files, folder, "cameras")
+    if len(models) < 2:
+        return ChosenModel(models[0] if models else folder, None)
+    counts = [_count_images(files, model) for model in models]
+    largest = int(np.argmax(counts))
+    others = ", ".join(f"{model.name}: {count}" for model, count in zip(models, counts, strict=True))
+    return ChosenModel(
+        models[largest],
+        f"{folder} holds {len(models)} models, worlds of their own: of their pictures ({others}) those of "
+        f"{models[largest].name}, the largest, have poses",
+    )
+
+
+def _models(files: SourceFiles, folder: Path, kind: str) -> list[Path]:
+    return list(files.folders_with([f"{kind}.bin", f"{kind}.txt"], folder, "COLMAP's models").values())
+
+
+def _count_images(files: SourceFiles, model: Path) -> int:
+    path = _file_of(files, model, "images")
+    if path.suffix == ".txt":
+        return len(read_images(files, model)[1])
+    # Before millions of keypoints.
+    (count,) = _Binary(files.content(path, "the model's images"), path).take("Q")
+    return int(count)
 
 
 def read_cameras(files: SourceFiles, model: Path) -> tuple[Path, dict[int, ColmapCamera]]:

@@ -3,7 +3,7 @@
 Layout: the root is such a recording, or holds folders that are. A recording holds
 
 - `sparse/0/` (as the mapper writes it) or `sparse/` (as the undistorter does) with `cameras` and `images`, `.bin` or
-  `.txt`; of several models the one in `sparse/0` is read;
+  `.txt`; of several models (`sparse/0/`, `sparse/1/`, …) the one with most pictures is read;
 - `images/`, the pictures that the model names;
 - for depth, if any, `depth/<picture's name without suffix>.png`, 16-bit, thousandths of the model's unit of length; or
   `stereo/depth_maps/<picture's name>.geometric.bin` as COLMAP's `patch_match_stereo` writes them; 0 where invalid.
@@ -15,10 +15,17 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
+from absl import logging
 
 from logvggt_jax.data.dataset import EVALUATION, TRAINING, About
 from logvggt_jax.data.formats.calibration import in_pixels, relative
-from logvggt_jax.data.formats.colmap_model import ColmapCamera, read_cameras, read_depth_map, read_images
+from logvggt_jax.data.formats.colmap_model import (
+    ColmapCamera,
+    choose_model,
+    read_cameras,
+    read_depth_map,
+    read_images,
+)
 from logvggt_jax.data.formats.image import read_rgb
 from logvggt_jax.data.formats.lens import Lens
 from logvggt_jax.data.formats.ordering import natural_order
@@ -66,7 +73,9 @@ class Colmap(FolderDataset):
 
     def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
         sparse, pictures = folder / "sparse", folder / "images"
-        model = sparse / "0" if files.exists(sparse / "0") else sparse
+        model, said = choose_model(files, sparse)
+        if said:
+            logging.warning(said)
         camera_file, cameras = read_cameras(files, model)
         image_file, images = read_images(files, model)
         images = [images[position] for position in natural_order([image.name for image in images])]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from logvggt_jax.data.formats.calibration import OPENGL_AXES, check_intrinsics, world_to_camera
-from logvggt_jax.data.formats.colmap_model import read_cameras, read_images
+from logvggt_jax.data.formats.colmap_model import choose_model, read_cameras, read_images
 from logvggt_jax.data.formats.nerfstudio_transforms import CAMERA, TRANSFORMS_FILE, camera_of, lens_of
 from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.errors import InputError, MissingInput, disk_errors
@@ -70,14 +71,19 @@ def read_poses(path: str | Path) -> list[ExternalPose]:
 
 
 def _colmap(folder: Path) -> list[ExternalPose]:
-    models = [folder / "sparse" / "0", folder / "sparse", folder]
-    model = next((each for each in models if any((each / f"images.{kind}").exists() for kind in ("bin", "txt"))), None)
-    if model is None:
+    files = SourceFiles()
+    chosen = [choose_model(files, each) for each in (folder / "sparse", folder) if each.is_dir()]
+    found = [
+        (model, said) for model, said in chosen if any((model / f"images.{kind}").exists() for kind in ("bin", "txt"))
+    ]
+    if not found:
         raise MissingInput(
             f"{folder} holds no poses: expected {TRANSFORMS_FILE}, or COLMAP's images.bin or images.txt, there, in "
             "sparse or in sparse/0"
         )
-    files = SourceFiles()
+    model, said = found[0]
+    if said:
+        warnings.warn(said, stacklevel=2)
     (_, cameras), (file, images) = read_cameras(files, model), read_images(files, model)
     poses = []
     for image in images:

@@ -1,5 +1,7 @@
 """COLMAP's models: binary and text, every kind of depth or none, cameras that are no pinhole, unregistered pictures."""
 
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +17,7 @@ from layouts.colmap import (
     write_text_model,
 )
 from layouts.layout import VIEWS
-from room_views import INTRINSICS, check_views, write_image
+from room_views import INTRINSICS, RoomView, check_views, write_image
 
 from logvggt_jax.data.readers.colmap import Colmap
 from logvggt_jax.errors import InputError
@@ -50,6 +52,27 @@ def test_colmaps_own_workspace_comes_back_as_the_root(tmp_path: Path):
     write_depth_map(tmp_path, NAMES[1], depth)
     found = dataset.read(tmp_path.name, [1]).depth[0]
     assert not found[:3].any() and found[3:].all()
+
+
+def test_the_only_model_is_read_whatever_its_number(tmp_path: Path):
+    write(tmp_path, VIEWS)
+    (tmp_path / NAME / "sparse/0").rename(tmp_path / NAME / "sparse/1")
+    check_views(Colmap(tmp_path).read(NAME, range(4)), VIEWS, **ERRORS)
+
+
+@pytest.mark.parametrize("write_model", [write_binary_model, write_text_model])
+def test_of_several_models_the_largest_is_read_and_said(
+    tmp_path: Path, write_model: Callable[[Path, Sequence[RoomView]], None], caplog: pytest.LogCaptureFixture
+):
+    write_pictures(tmp_path, VIEWS)
+    lost = replace(VIEWS[0], pose=np.full_like(VIEWS[0].pose, np.nan))
+    write_model(tmp_path / "sparse/0", [lost, *VIEWS[1:2], lost, lost])
+    write_model(tmp_path / "sparse/1", [lost, *VIEWS[1:]])
+    write_model(tmp_path / "sparse/10", [*VIEWS[:2], lost, lost])
+    dataset = Colmap(tmp_path)
+    assert dataset.frame_names(tmp_path.name) == list(NAMES[1:])
+    assert dataset.dropped_frames(tmp_path.name) == {"no pose": 1}
+    assert "sparse holds 3 models" in caplog.text and "(0: 1, 1: 3, 10: 2) those of 1, the largest" in caplog.text
 
 
 def test_an_undistorted_folder_without_maps_yet_has_no_depth(tmp_path: Path):
