@@ -8,7 +8,9 @@ Layout: the root is such a recording, or holds folders that are. `transforms.jso
   `SIMPLE_PINHOLE`, `SIMPLE_RADIAL`, `RADIAL`, `OPENCV` and that are refused;
 - `frames`, each with a `file_path` relative to the recording (its suffix may be left out), a `transform_matrix`
   (camera-to-world, [4, 4], axes of OpenGL: x right, y up, z back) and for depth a `depth_file_path`: 16-bit,
-  thousandths of the poses' unit of length, 0 where invalid, z and not ray length.
+  thousandths of the poses' unit of length, 0 where invalid, z and not ray length;
+- `applied_scale`, if any: what the poses were multiplied by after depth was measured. Depth is multiplied by it, as
+  nerfstudio does; an `applied_transform` scales nothing.
 """
 
 import math
@@ -38,6 +40,7 @@ from logvggt_jax.data.readers.own_recordings import (
 from logvggt_jax.errors import InputError
 
 _DEPTH_UNITS = 1000.0
+_MAX_SCALE = 1e6
 
 
 class Nerfstudio(FolderDataset):
@@ -80,6 +83,7 @@ class Nerfstudio(FolderDataset):
         images = with_suffixes(files, images, path)
         names_beside(files, [file for file in (*images, *depths) if file is not None], path)
         names = [str(image.relative_to(folder)) for image in images]
+        scale = _applied_scale(content, path)
         for place in natural_order(names):
             if depths[place] is None and any(depths):
                 yield Dropped("no depth")
@@ -95,13 +99,22 @@ class Nerfstudio(FolderDataset):
             extrinsics = world_to_camera(pose, where, stored="camera_to_world")
             # A picture in depth's place stands for no depth.
             depth = depths[place] or images[place]
-            others = {"name": names[place], "calibration": path, "lens": lens.row}
+            others = {"name": names[place], "calibration": path, "lens": lens.row, "depth_scale": scale}
             yield frame(images[place], depth, intrinsics, extrinsics, **others)
 
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         image = read_rgb(record.image)
         intrinsics = in_pixels(record.intrinsics, image.shape[:2], record.image, record.calibration)
-        return without_distortion(record, image, read_depth_of(record, image, _DEPTH_UNITS), intrinsics)
+        depth = read_depth_of(record, image, _DEPTH_UNITS / record.depth_scale)
+        return without_distortion(record, image, depth, intrinsics)
+
+
+def _applied_scale(content: Mapping[str, Any], path: Path) -> float:
+    with expecting(path, "a number as applied_scale"):
+        scale = float(content.get("applied_scale", 1.0))
+    if not 1 / _MAX_SCALE <= scale <= _MAX_SCALE:
+        raise InputError(f"{path}: applied_scale={scale:g} cannot be what poses were multiplied by: edit the file")
+    return scale
 
 
 def _camera(entry: Mapping[str, Any], where: str) -> tuple[np.ndarray, Lens]:

@@ -50,6 +50,16 @@ def test_where_some_have_depth_those_without_do_not_count(recording: Path):
     assert dataset.num_frames(NAME) == 3 and dataset.dropped_frames(NAME) == {"no depth": 1}
 
 
+def test_depth_is_scaled_as_its_poses_were(recording: Path):
+    before = open_dataset("nerfstudio", recording).read(NAME, range(4)).depth
+    edit(recording, lambda content: content.update(applied_scale=0.25, applied_transform=np.eye(4)[:3].tolist()))
+    np.testing.assert_allclose(open_dataset("nerfstudio", recording).read(NAME, range(4)).depth, before / 4, rtol=1e-6)
+    for scale in ("large", 0, float("nan"), None):
+        edit(recording, lambda content, scale=scale: content.update(applied_scale=scale))
+        with pytest.raises(InputError, match=r"transforms\.json: .*applied_scale"):
+            open_dataset("nerfstudio", recording).num_frames(NAME)
+
+
 def test_pictures_named_without_their_suffix_are_found(recording: Path):
     expected = open_dataset("nerfstudio", recording).read(NAME, range(4))
     edit(recording, lambda content: [e.update(file_path=e["file_path"][: -len(".png")]) for e in content["frames"]])
