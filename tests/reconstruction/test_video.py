@@ -338,8 +338,9 @@ def test_no_frame_where_the_options_ask_for_it(tmp_path: Path, library: str) -> 
 
 @pytest.mark.parametrize("degrees", [0, 90, 180, 270])
 @pytest.mark.parametrize("mirrored", [False, True])
-def test_pictures_are_upright(tmp_path: Path, library: str, degrees: int, mirrored: bool) -> None:
-    path = write(tmp_path / "turned.mp4", [quarters()] * 2, turned=(degrees, mirrored))
+@pytest.mark.parametrize("suffix", ["mp4", "mkv"])
+def test_pictures_are_upright(tmp_path: Path, library: str, degrees: int, mirrored: bool, suffix: str) -> None:
+    path = write(tmp_path / f"turned.{suffix}", [quarters()] * 2, turned=(degrees, mirrored))
     expected = np.rot90(quarters(), degrees // 90)
     if mirrored:
         expected = expected[:, ::-1]
@@ -364,20 +365,40 @@ def test_pictures_are_upright_by_a_tag(tmp_path: Path, library: str, degrees: in
     np.testing.assert_allclose(corners(image), corners(np.rot90(quarters(), -degrees // 90)), atol=12)
 
 
-@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
-def test_photos_as_a_video_keep_what_their_camera_noted(tmp_path: Path, orientation: int) -> None:
-    def photo(_: int, packet: bytes) -> bytes:
+def upright(orientation: int) -> np.ndarray:
+    """What is shown of `quarters`, which a camera has noted to lie in this EXIF orientation."""
+    image = quarters()[:, ::-1] if orientation in (2, 4, 5, 7) else quarters()
+    return np.rot90(image, {1: 0, 2: 0, 3: 2, 4: 2, 5: 1, 6: -1, 7: -1, 8: 1}[orientation])
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_photos_as_a_video_keep_what_their_camera_noted(tmp_path: Path, orientation: int, library: str) -> None:
+    def photo(number: int, packet: bytes) -> bytes:
         exif, picture = Image.Exif(), io.BytesIO()
-        exif[0x0112] = orientation
+        exif[0x0112] = orientation if number else 1
         Image.open(io.BytesIO(packet)).save(picture, "JPEG", quality=95, exif=exif)
         return picture.getvalue()
 
-    plain = write(tmp_path / "plain.avi", [quarters()] * 2, codec="mjpeg", pixels="yuvj420p")
-    source = open_source(rewritten(tmp_path / "photos.avi", plain, photo))
-    expected = np.rot90(quarters(), {1: 0, 3: 2, 6: -1, 8: 1}[orientation])
+    plain = write(tmp_path / "plain.avi", [quarters()] * 4, codec="mjpeg", pixels="yuvj420p")
+    # The whole of it, and one of which the first photo lies otherwise.
+    source = open_source(rewritten(tmp_path / "photos.avi", plain, lambda _, packet: photo(1, packet)))
     image = next(iter(source)).image
-    assert source.image_size == image.shape[:2] == expected.shape[:2]
-    np.testing.assert_allclose(corners(image), corners(expected), atol=16)
+    assert source.image_size == image.shape[:2] == upright(orientation).shape[:2]
+    np.testing.assert_allclose(corners(image), corners(upright(orientation)), atol=16)
+    mixed = open_source(rewritten(tmp_path / "mixed.avi", plain, photo))
+    if orientation < 5:
+        _, *images = (frame.image for frame in mixed)
+        np.testing.assert_allclose(corners(images[-1]), corners(upright(orientation)), atol=16)
+    else:
+        with pytest.raises(InputError, match="frame 1 is 48 x 64 pixels but the video begins with 64 x 48"):
+            list(mixed)
+
+
+def test_damaged_camera_data_leave_a_video_alone(tmp_path: Path, library: str) -> None:
+    plain = write(tmp_path / "plain.avi", [quarters()] * 2, codec="mjpeg", pixels="yuvj420p")
+    odd = b"\xff\xd8\xff\xe1\x00\x14Exif\0\0MM\0*\xff\xff\xff\xff\0\0\0\0"
+    path = rewritten(tmp_path / "odd.avi", plain, lambda _, packet: odd + packet[2:])
+    np.testing.assert_allclose(corners(next(iter(open_source(path))).image), corners(quarters()), atol=16)
 
 
 def interlaced(count: int) -> list[np.ndarray]:
@@ -667,6 +688,18 @@ def test_a_view_all_around_is_told(tmp_path: Path, library: str) -> None:
     path.write_bytes(content)
     (note,) = open_source(path).notes
     assert "looks all around (equirectangular)" in note and "v360" in note
+
+
+def test_a_view_all_around_of_matroska_is_told(tmp_path: Path, library: str) -> None:
+    path = write(tmp_path / "around.mkv", [quarters()] * 2, turned=(90, False))
+    content = path.read_bytes()
+    turned = b"\x76\x70\x8b\x76\x75\x88" + np.array(90, ">f8").tobytes()
+    assert content.count(turned) == 1
+    # The projection's type, and what is left of the turn's eleven bytes void.
+    path.write_bytes(content.replace(turned, turned[:3] + b"\x76\x71\x81\x01\xec\x85" + bytes(5)))
+    source = open_source(path)
+    assert [note for note in source.notes if "looks all around (equirectangular)" in note]
+    np.testing.assert_allclose(corners(next(iter(source)).image), corners(quarters()), atol=12)
 
 
 def test_pixels_that_are_not_square_are_told(tmp_path: Path, library: str) -> None:

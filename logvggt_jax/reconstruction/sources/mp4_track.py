@@ -21,7 +21,7 @@ _MATRIX_AT = {0: 40, 1: 52}
 _PROJECTIONS = {b"equi": "equirectangular", b"cbmp": "a cube map", b"mshp": "a mesh"}
 
 
-class Mp4View(NamedTuple):
+class TrackView(NamedTuple):
     """What the first video track says.
 
     Attributes:
@@ -37,7 +37,7 @@ class Mp4View(NamedTuple):
     edited: bool = False
 
 
-def read_mp4_view(path: Path) -> Mp4View:
+def read_mp4_view(path: Path) -> TrackView:
     """Of files of other formats, nothing."""
     inside = list(_children(_index(path)))
     movie = next((content for kind, content in inside if kind == b"mvhd"), b"")
@@ -45,7 +45,7 @@ def read_mp4_view(path: Path) -> Mp4View:
         if kind == b"trak" and (view := _view(content, movie)):
             # Of a file in fragments the index knows the first alone.
             return view._replace(seconds=None) if any(kind == b"mvex" for kind, _ in inside) else view
-    return Mp4View()
+    return TrackView()
 
 
 def _index(path: Path) -> bytes:
@@ -72,14 +72,14 @@ def _children(content: bytes) -> Iterator[tuple[bytes, bytes]]:
         start = box.end
 
 
-def _view(track: bytes, movie: bytes) -> Mp4View | None:
+def _view(track: bytes, movie: bytes) -> TrackView | None:
     """None for a track that is no video; `movie` is the content of `mvhd`."""
     inside = dict(_children(track))
     media = dict(_children(inside.get(b"mdia", b"")))
     if media.get(b"hdlr", b"")[8:12] != b"vide":
         return None
     timing = _shown(inside.get(b"edts", b""), media, movie)
-    return Mp4View(_matrix(inside.get(b"tkhd", b"")), _projection(track), *timing)
+    return TrackView(_matrix(inside.get(b"tkhd", b"")), _projection(track), *timing)
 
 
 def _matrix(header: bytes) -> np.ndarray | None:

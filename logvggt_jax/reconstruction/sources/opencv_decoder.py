@@ -16,10 +16,11 @@ import numpy as np
 
 from logvggt_jax.errors import InputError, install_line
 from logvggt_jax.reconstruction.sources.decoding import Damage, Picture, VideoHeader
+from logvggt_jax.reconstruction.sources.matroska_track import read_matroska_view
 from logvggt_jax.reconstruction.sources.media_info import MediaHeader, media_info_is_there, read_media_header
-from logvggt_jax.reconstruction.sources.mp4_track import Mp4View, read_mp4_view
+from logvggt_jax.reconstruction.sources.mp4_track import TrackView, read_mp4_view
 from logvggt_jax.reconstruction.sources.opencv_messages import captured_stderr, quiet
-from logvggt_jax.reconstruction.sources.orientation import shown_size, turn
+from logvggt_jax.reconstruction.sources.orientation import matrix_of, shown_size, turn
 from logvggt_jax.reconstruction.sources.packet_follower import PacketFollower, TimeStamps, look_at_times
 from logvggt_jax.reconstruction.sources.sampling import likely_frames
 from logvggt_jax.reconstruction.sources.video_notes import (
@@ -54,7 +55,7 @@ class OpenCVDecoder:
         self._source, self._name, self._timeout = source, name, timeout
         self._file = None if isinstance(source, int) or timeout is not None else str(source)
         self._looked = False
-        self._view = Mp4View()
+        self._view = TrackView()
         self._media: MediaHeader | None = None
         self._matrix: np.ndarray | None = None
         self._times = TimeStamps(exist=True, as_stored=False)
@@ -86,12 +87,13 @@ class OpenCVDecoder:
             self._refuse_interlaced()
         follower = self._follower(0.0)
         notes = tuple(self._notes(capture, image.shape[:2], rate, follower))
+        matrix = self._turned(follower)
         capture.release()
         if follower is not None:
             follower.close()
         seconds = self._view.seconds or (self._media.seconds if self._media else None)
         return VideoHeader(
-            size=shown_size(image.shape[:2], self._matrix),
+            size=shown_size(image.shape[:2], matrix),
             rate=rate,
             frames=likely_frames(stated, seconds, rate),
             announced=stated if self._states_frames() else None,
@@ -156,21 +158,16 @@ class OpenCVDecoder:
             last, before = seconds, image
             stated = follower.size if follower else None
             first_size = first_size or stated
-            yield Picture(seconds, self._size(image.shape[:2], stated, first_size), partial(self._convert, image))
+            matrix = self._turned(follower)
+            size = shown_size(_stored_size(image.shape[:2], stated, first_size), matrix)
+            yield Picture(seconds, size, partial(_convert, image, matrix))
         if follower is not None:
             yield from follower.rest() if self._times.exist and not self._times.as_stored else follower.failures()
 
-    def _size(
-        self, decoded: tuple[int, int], stated: tuple[int, int] | None, first: tuple[int, int] | None
-    ) -> tuple[int, int]:
-        """(H, W) as it is shown. OpenCV brings every picture to the size of the first, whatever the packets state."""
-        if stated is not None and stated != first:
-            decoded = stated if decoded == first else stated[::-1]
-        return shown_size(decoded, self._matrix)
-
-    def _convert(self, image: np.ndarray) -> np.ndarray:
-        rgb = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-        return rgb if self._matrix is None else turn(rgb, self._matrix)
+    def _turned(self, follower: PacketFollower | None) -> np.ndarray | None:
+        """The display matrix of the picture at hand: what its camera noted comes before what the file says of all."""
+        noted = matrix_of(follower.orientation) if follower else None
+        return self._matrix if noted is None else noted
 
     def _notes(
         self, capture: cv2.VideoCapture, size: tuple[int, int], rate: float | None, follower: PacketFollower | None
@@ -214,7 +211,7 @@ class OpenCVDecoder:
             shown.append(round(1000 * capture.get(cv2.CAP_PROP_POS_MSEC)))
         capture.release()
         self._times = look_at_times(self._file, shown)
-        self._view = read_mp4_view(Path(self._file))
+        self._view = read_matroska_view(Path(self._file)) or read_mp4_view(Path(self._file))
         self._media = read_media_header(Path(self._file))
         self._matrix = self._view.matrix
         if self._matrix is None and self._media is not None and self._media.quarter_turns:
@@ -282,6 +279,20 @@ class OpenCVDecoder:
             f"{self._name} cannot be opened as a video: expected a file that OpenCV decodes (mp4, avi, mkv, webm, …) "
             f"or a folder of images; {_PYAV} for more formats, or re-encode it, for example to H.264 mp4"
         )
+
+
+def _stored_size(
+    decoded: tuple[int, int], stated: tuple[int, int] | None, first: tuple[int, int] | None
+) -> tuple[int, int]:
+    """(H, W) before it is turned. OpenCV brings every picture to the size of the first, whatever the packets state."""
+    if stated is None or stated == first:
+        return decoded
+    return stated if decoded == first else stated[::-1]
+
+
+def _convert(image: np.ndarray, matrix: np.ndarray | None) -> np.ndarray:
+    rgb = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    return rgb if matrix is None else turn(rgb, matrix)
 
 
 def _fourcc(capture: cv2.VideoCapture) -> str:

@@ -7,6 +7,7 @@ import itertools
 import re
 import struct
 import tempfile
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -15,6 +16,7 @@ import cv2
 from PIL import Image
 
 from logvggt_jax.reconstruction.sources.opencv_messages import quiet
+from logvggt_jax.reconstruction.sources.orientation import noted_orientation
 
 # Where the parameters of a stream begin, by which FFmpeg recognises it, and how many bytes of them state the size; for
 # None, those up to the next start code.
@@ -37,6 +39,7 @@ _PARAMETERS: dict[bytes, tuple[re.Pattern[bytes], int | None]] = {
     b"mpng": (re.compile(rb"\x89PNG"), 24),
 }
 _PICTURES = (b"mjpg", b"mpng")
+_OF_CAMERAS = b"mjpg"
 # Codecs that FFmpeg recognises in the container IVF only.
 _IN_IVF = (b"vp90", b"av01")
 # Codecs of which every packet shows a frame of its own, but for empty ones, which stand for no change.
@@ -61,12 +64,14 @@ class Packet(NamedTuple):
       holds_frame: it is not empty.
       key: decoding can begin with it.
       size: (H, W) before rotation, as the key frames so far state it; None where none does.
+      orientation: EXIF's, that the camera noted in a JPEG; 1 for none.
     """
 
     stamp: int
     holds_frame: bool
     key: bool
     size: tuple[int, int] | None
+    orientation: int
 
 
 class PacketReader:
@@ -100,11 +105,14 @@ class PacketReader:
             errors = 0
             stamp = round(1000 * self._capture.get(cv2.CAP_PROP_POS_MSEC))
             key = bool(self._capture.get(cv2.CAP_PROP_LRF_HAS_KEY_FRAME))
+            orientation = 1
             if key:
-                parameters, length = _parameters(content.tobytes(), self._codec)
+                data = content.tobytes()
+                orientation = noted_orientation(data) if self._codec == _OF_CAMERAS else 1
+                parameters, length = _parameters(data, self._codec)
                 if parameters[:length] != head:
                     head, size = parameters[:length], _stated_size(parameters, self._codec) or size
-            yield Packet(stamp, content.size > _EMPTY_PACKET, key, size)
+            yield Packet(stamp, content.size > _EMPTY_PACKET, key, size, orientation)
 
     def close(self) -> None:
         """Closes the file."""
@@ -129,8 +137,10 @@ def _stated_size(parameters: bytes, codec: bytes) -> tuple[int, int] | None:
         return None
     if codec in _PICTURES:
         try:
-            with Image.open(io.BytesIO(parameters)) as picture:
-                return picture.height, picture.width
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of odd camera data
+                with Image.open(io.BytesIO(parameters)) as picture:
+                    return picture.height, picture.width
         except (OSError, ValueError):
             return None
     if codec == b"vp80":

@@ -50,6 +50,7 @@ class PacketFollower:
 
     Attributes:
       size: (H, W) before rotation, as stated for the picture at hand; None where nothing states it.
+      orientation: EXIF's, that the camera noted in the picture at hand, or in the first where none is; 1 for none.
       lead: frames before the first key frame, which refer to some that are not there.
       lead_seconds: how long these would be shown.
       states_size: whether a packet so far states a size.
@@ -69,16 +70,20 @@ class PacketFollower:
         self._timed, self._edited = timed, edited
         # Whether all time stamps of frames so far were those of packets.
         self._trusted = timed and not edited
-        self._sizes: deque[tuple[int, tuple[int, int] | None]] = deque()
+        # What is stated of a picture, from which on.
+        self._stated: deque[tuple[int, tuple[int, int] | None, int]] = deque()
         self._stored = self._shown = self._unreadable = 0
         self._is_first_part = True
         self._joint: Packet | None = None
         self.size: tuple[int, int] | None = None
+        self.orientation = 1
         self.lead, self.lead_seconds = 0, 0.0
         self._lead_begins = math.inf
         self.states_size = False
         self._begin()
         self._fill(_AHEAD)
+        if self._stated:
+            self.orientation = self._stated[0][2]
 
     def precedes_key_frame(self, stamp: int) -> bool:
         """Whether a frame that is shown at this time comes before the first key frame."""
@@ -168,8 +173,8 @@ class PacketFollower:
 
     def _show(self, stamp: int) -> None:
         self._last = stamp
-        while self._sizes and self._sizes[0][0] <= self._shown:
-            self.size = self._sizes.popleft()[1]
+        while self._stated and self._stated[0][0] <= self._shown:
+            _, self.size, self.orientation = self._stated.popleft()
         self._shown += 1
 
     def _fill(self, ahead: int | None) -> None:
@@ -204,8 +209,8 @@ class PacketFollower:
             self._lead_begins = min(self._lead_begins, packet.stamp)
             return
         self.states_size = self.states_size or packet.size is not None
-        if not self._sizes or self._sizes[-1][1] != packet.size:
-            self._sizes.append((self._stored, packet.size))
+        if not self._stated or self._stated[-1][1:] != (packet.size, packet.orientation):
+            self._stated.append((self._stored, packet.size, packet.orientation))
         if packet.holds_frame:
             self._missing.expect(packet.stamp)
             self._stored += 1

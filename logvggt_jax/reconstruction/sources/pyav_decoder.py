@@ -17,7 +17,7 @@ from logvggt_jax.errors import InputError
 from logvggt_jax.reconstruction.sources.decoding import CodecChange, Damage, Picture, VideoHeader
 from logvggt_jax.reconstruction.sources.deinterlacing import Deinterlacer, is_interlaced
 from logvggt_jax.reconstruction.sources.missing_frames import MissingFrames
-from logvggt_jax.reconstruction.sources.orientation import shown_size, turn
+from logvggt_jax.reconstruction.sources.orientation import matrix_of, noted_orientation, shown_size, turn
 from logvggt_jax.reconstruction.sources.pyav_header import (
     average_rate,
     display_matrix,
@@ -47,6 +47,8 @@ _FRAME_A_PACKET = ("mpeg4", "h264", "hevc", "mjpeg", "mpeg1video", "mpeg2video",
 _EMPTY_PACKET = 8
 # Codecs of which a packet that ends too soon gives a picture that is half grey, unless any error is to be one.
 _EASILY_PLEASED = ("mjpeg",)
+# Codecs of which a packet is a picture as a camera writes it, and gives its frame at once.
+_OF_CAMERAS = ("mjpeg",)
 # Packets within which a stream that shows its frames in another order than it holds them does so.
 _MOST_UNTIL_REORDERED = 48
 
@@ -228,7 +230,9 @@ class PyAVDecoder:
                     yield Damage(None, str(error.strerror)), None
                 else:
                     missing.fail(str(error.strerror))
+            noted = matrix_of(noted_orientation(bytes(packet))) if stream.codec_context.name in _OF_CAMERAS else None
             for frame in frames:
+                frame.opaque = noted
                 if self._numbered_as_stored:
                     yield from ((damage, None) for damage in missing.failures())
                     frame.pts = missing.take_next()

@@ -48,7 +48,9 @@ def notes_on(
 
 
 def display_matrix(frame: av.VideoFrame, stream: av.video.stream.VideoStream) -> np.ndarray | None:
-    """See `orientation`; None where nothing is turned."""
+    """See `orientation`; None where nothing is turned. A frame's `opaque` is what the camera noted in its JPEG."""
+    if frame.opaque is not None:
+        return frame.opaque
     if data := _side_data(frame, "DISPLAYMATRIX"):
         return np.frombuffer(data, np.int32)[:9].reshape(3, 3)[:2, :2].astype(np.float64)
     tags = {name.lower(): value for name, value in stream.metadata.items()}
@@ -65,7 +67,8 @@ def _clockwise(degrees: int) -> np.ndarray:
 def _side_data(frame: av.VideoFrame, kind: str) -> bytes | None:
     """What a frame tells beside its picture; None where it tells none of this kind.
 
-    PyAV gives none at all of a frame that has some which is newer than PyAV, as EXIF in the pictures of a camera.
+    PyAV gives none at all of a frame that has some which is newer than PyAV, as EXIF in the pictures of a camera; nor
+    does the rotation that it gives besides tell whether they are mirrored.
     """
     try:
         data = frame.side_data.get(kind)

@@ -1,0 +1,64 @@
+"""How the pictures of a Matroska or WebM file are to be shown, as its first video track says (RFC 9559)."""
+
+from __future__ import annotations
+
+import re
+import struct
+from pathlib import Path
+
+import numpy as np
+
+from logvggt_jax.reconstruction.sources.mp4_track import TrackView
+
+_START, _CLUSTER = b"\x1a\x45\xdf\xa3", b"\x1f\x43\xb6\x75"
+# Bytes within which tracks are described.
+_HEAD = 1 << 20
+# The element Projection, short enough for a length of one byte.
+_PROJECTION = re.compile(rb"\x76\x70([\x80-\xfe])")
+_TYPE, _YAW, _PITCH, _ROLL = b"\x76\x71", b"\x76\x73", b"\x76\x74", b"\x76\x75"
+_TYPES = {1: "equirectangular", 2: "a cube map", 3: "a mesh"}
+_FLOATS = {4: ">f", 8: ">d"}
+
+
+def read_matroska_view(path: Path) -> TrackView | None:
+    """None for files of other formats."""
+    with path.open("rb") as file:
+        head = file.read(_HEAD)
+    if not head.startswith(_START):
+        return None
+    head = head.partition(_CLUSTER)[0]
+    for found in _PROJECTION.finditer(head):
+        values = _values(head[found.end() : found.end() + found[1][0] - 0x80])
+        if values:
+            projection = _TYPES.get(int(values.get(_TYPE, 0)))
+            # A pinhole's picture is turned by its roll, and mirrored where it is seen from behind.
+            turned = _matrix(values.get(_YAW, 0.0), values.get(_PITCH, 0.0), values.get(_ROLL, 0.0))
+            return TrackView(None if projection else turned, projection)
+    return TrackView()
+
+
+def _values(content: bytes) -> dict[bytes, float]:
+    """The numbers of the element Projection by the elements' names; none where it is another one, or damaged."""
+    values: dict[bytes, float] = {}
+    place = 0
+    while place + 3 <= len(content):
+        # Of a name the first byte tells the length.
+        begin = place + (1 if content[place] >= 0x80 else 2)
+        name, length = content[place:begin], content[begin] - 0x80
+        data = content[begin + 1 : begin + 1 + length]
+        if name == _TYPE and length == len(data) == 1:
+            values[name] = data[0]
+        elif name in (_YAW, _PITCH, _ROLL) and length in _FLOATS and length == len(data):
+            (values[name],) = struct.unpack(_FLOATS[length], data)
+        elif length < 0:
+            return {}
+        place = begin + 1 + length
+    return values
+
+
+def _matrix(yaw: float, pitch: float, roll: float) -> np.ndarray | None:
+    if pitch or yaw not in (0.0, 180.0, -180.0) or not -360 <= roll <= 360:
+        return None
+    mirrored = np.diag([-1, 1]) if yaw else np.eye(2, dtype=int)
+    matrix = mirrored @ np.linalg.matrix_power(np.array([[0, -1], [1, 0]]), round(roll / 90) % 4)
+    return None if np.array_equal(matrix, np.eye(2)) else matrix.astype(np.float64)
