@@ -29,6 +29,7 @@ class MediaHeader:
       interlaced: the header says of every frame that its lines show two moments in alternation.
       transfer: PQ or HLG, as HDR is coded; None for neither.
       bare: the file is a stream of a codec and nothing else, which states no times.
+      rate: frames a second of the first; None where it is not known.
     """
 
     sizes: list[tuple[int, int]]
@@ -37,6 +38,7 @@ class MediaHeader:
     interlaced: bool
     transfer: str | None
     bare: bool
+    rate: float | None
 
 
 def media_info_is_there() -> bool:
@@ -69,6 +71,7 @@ def read_media_header(path: Path) -> MediaHeader | None:
         interlaced=first.scan_type == "Interlaced",
         transfer=next((each for each in _HDR_TRANSFERS if first.transfer_characteristics == each), None),
         bare=file.format == first.format,
+        rate=_number(first.frame_rate),
     )
 
 

@@ -83,6 +83,9 @@ class OpenCVDecoder:
             raise InputError(f"{self._name} is {kind}, not a video: give a video or the folder that holds the images")
         frequency = capture.get(cv2.CAP_PROP_FPS)
         rate = frequency if math.isfinite(frequency) and frequency > 0 else None
+        if self._media is not None and self._media.bare:
+            # OpenCV tells a default, not what the codec states.
+            rate = self._media.rate or rate
         if self._media is not None and self._media.interlaced:
             self._refuse_interlaced()
         follower = self._follower(0.0)

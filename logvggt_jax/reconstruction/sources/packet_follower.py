@@ -7,6 +7,7 @@ import math
 from collections import deque
 from collections.abc import Iterator
 from fractions import Fraction
+from pathlib import Path
 from typing import NamedTuple
 
 from logvggt_jax.reconstruction.sources.decoding import Damage
@@ -18,6 +19,10 @@ _MICROSECOND = Fraction(1, 1_000_000)
 _AHEAD = 48
 # Some formats mark no key frames: after so many packets the first begins the video.
 _LONGEST_LEAD = 300
+# What files begin with that number packets as they are stored.
+_ASF = bytes.fromhex("3026b2758e66cf11")
+# What streams of MPEG-1, MPEG-2 and JPEG begin with that no container gives times; of others all time stamps are 0.
+_BARE = (b"\0\0\1\xb3", b"\xff\xd8")
 
 
 class TimeStamps(NamedTuple):
@@ -36,11 +41,18 @@ class TimeStamps(NamedTuple):
 def look_at_times(source: str, shown: list[int]) -> TimeStamps:
     """Compares the first packets with the time stamps of the first frames that come out of the decoder."""
     reader = PacketReader(source)
-    stamps = [packet.stamp for packet in itertools.islice(reader, _AHEAD) if packet is not None]
+    packets = [packet for packet in itertools.islice(reader, _AHEAD) if packet is not None]
     reader.close()
+    with Path(source).open("rb") as file:
+        head = file.read(len(_ASF))
+    stamps = [packet.stamp for packet in packets]
     # The only frame of a file is shown at its beginning.
-    exist = any(stamps) or any(shown) or len(shown) < 2
-    return TimeStamps(exist, stamps == sorted(set(stamps)) and shown != sorted(shown))
+    exist = (any(stamps) or any(shown) or len(shown) < 2) and not head.startswith(_BARE)
+    late = shown != sorted(shown)
+    if head.startswith(_ASF) and shown:
+        # Frames come with the times of the packets that follow theirs.
+        late = late or 1000 * shown[0] > next((packet.stamp for packet in packets if packet.key), math.inf)
+    return TimeStamps(exist, stamps == sorted(set(stamps)) and late)
 
 
 class PacketFollower:

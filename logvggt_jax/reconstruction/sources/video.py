@@ -16,6 +16,7 @@ import numpy as np
 
 from logvggt_jax.errors import InputError, disk_errors
 from logvggt_jax.reconstruction.sources.decoding import CodecChange, Damage, Picture, VideoDecoder, VideoHeader
+from logvggt_jax.reconstruction.sources.flv_tags import another_follows
 from logvggt_jax.reconstruction.sources.gif_blocks import breaks_off
 from logvggt_jax.reconstruction.sources.masks import Masked, Masks
 from logvggt_jax.reconstruction.sources.media_boxes import boxes
@@ -292,6 +293,8 @@ def _check_file(path: Path) -> Iterator[str]:
             if file.read(30)[8:].startswith(b"WEBPVP8X") and file.read(4) == b"ANIM":
                 raise InputError(f"{path} is an animated WebP, which cannot be decoded: convert it to mp4 or GIF")
             yield from _check_index(path, file, status.st_size)
+            if another_follows(file):
+                yield _read_in_part(path, "several")
             file.seek(0)
             if file.read(4) == b"GIF8" and breaks_off(file):
                 yield (
@@ -318,10 +321,14 @@ def _check_index(path: Path, file: BinaryIO, size: int) -> Iterator[str]:
     if any(box.kind == b"moof" for box in found) and found[-1].end != size:
         yield f"{path} lacks its end: the recording or the copy was broken off, and its last frames may be missing"
     if kinds.count(b"moov") > 1 and b"moof" not in kinds:
-        yield (
-            f"{path} holds {kinds.count(b'moov')} videos one after the other, of which the first alone is read; join "
-            "the original files with ffmpeg -f concat -i LIST.txt -c copy OUTPUT.mp4"
-        )
+        yield _read_in_part(path, str(kinds.count(b"moov")))
+
+
+def _read_in_part(path: Path, count: str) -> str:
+    return (
+        f"{path} holds {count} videos one after the other, of which the first alone is read; join the original files "
+        "with ffmpeg -f concat -i LIST.txt -c copy OUTPUT.mp4"
+    )
 
 
 def _without_password(address: str) -> str:
