@@ -1,8 +1,9 @@
 """Writes a data set's frames into shards, once; a run that is stopped goes on where it was."""
 
+import itertools
 import json
 import multiprocessing
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -82,7 +83,8 @@ def pack(
     Sequences lie whole, in order, a shard being full with `frames_per_shard` frames. Shards appear when they are
     complete, with their digests; the same command goes on after an interruption, and on a finished folder writes anew
     what is damaged, and what has changed in the data set since (see `Reader.content_digest`) or can be read by now.
-    What cannot be read is kept as such: reading it back fails with the same message. `workers` processes read at once.
+    What cannot be read is kept as such: reading it back fails with the same message. A sequence that could not be
+    listed at first is packed behind all others once it can. `workers` processes read at once.
 
     Raises OutputExists where `output` holds something else, InputError where it was begun with other data or settings
     or another run is at work on it, DiskError where it cannot be written, MissingPackage where the set's files need a
@@ -120,16 +122,18 @@ def _pack(
     progress: bool,
 ) -> PackReport:
     console = Console(stderr=True, quiet=not progress)
-    with console.status("Listing sequences"):
-        sequences, contents = _placed(reader, frames_per_shard)
-    plan = json_digest([dict(reader.identity), dict(options), split, [asdict(each) for each in sequences]])
+    plan = json_digest([dict(reader.identity), dict(options), split, frames_per_shard, list(reader.sequences)])
     path = output / PLAN
-    if path.exists() and read_json_object(path).get("digest") != plan:
+    begun = read_json_object(path) if path.exists() else {"digest": plan}
+    if begun.get("digest") != plan:
         raise InputError(
             f"{output} was begun with other data or settings (split, options, frames per shard; or the data set has "
-            "changed): choose another output, or delete this one"
+            "other sequences by now): choose another output, or delete this one"
         )
-    write_text(path, json.dumps({"digest": plan, "name": reader.name, "split": split}) + "\n")
+    with console.status("Listing sequences"):
+        sequences, contents = _placed(reader, frames_per_shard, begun.get("last"))
+    last = begun.get("last", [each.name for each in sequences if each.error is not None])
+    write_text(path, json.dumps({"digest": plan, "name": reader.name, "split": split, "last": last}) + "\n")
     for scratch in output.glob(".shard-*"):  # of runs that were killed
         scratch.unlink(missing_ok=True)
     count = max((each.shard for each in sequences), default=-1) + 1
@@ -137,7 +141,7 @@ def _pack(
     with Progress(console=console, transient=True) as bar:
         task = bar.add_task("Shards", total=count)
         for number in range(count):
-            names = [each.name for each in sequences if each.shard == number and each.error is None]
+            names = [each.name for each in _in_shard(sequences, number) if each.error is None]
             found = _whole(reader, output, number, plan, {name: contents[name] for name in names})
             if found is not None:
                 shards[number] = found
@@ -162,6 +166,9 @@ def _pack(
         shards=tuple(shards[number][0] for number in range(count)),
     )
     write_index(output, index)
+    for number in itertools.takewhile(lambda number: shard_file(output, number).exists(), itertools.count(count)):
+        for surplus in (shard_file(output, number), notes_file(output, number)):
+            surplus.unlink(missing_ok=True)
     broken = [f"{each.name}: {each.error}" for each in sequences if each.error is not None]
     broken += [message for number in range(count) for message in shards[number][1]]
     size = sum(shard.bytes for shard in index.shards)
@@ -181,12 +188,18 @@ def _splits(reader: Reader, root: str | Path, split: str, options: Mapping[str, 
     return found
 
 
-def _placed(reader: Reader, frames_per_shard: int) -> tuple[list[PackedSequence], dict[str, str]]:
-    """Every sequence with its place, and digests of the content of those that can be listed."""
-    placed: list[PackedSequence] = []
+def _placed(
+    reader: Reader, frames_per_shard: int, last: Sequence[str] | None
+) -> tuple[list[PackedSequence], dict[str, str]]:
+    """Every sequence with its place, and digests of the content of those that can be listed.
+
+    Behind the others lie the `last`: those that could not be listed at first, so that the others keep their shards
+    once they can; for None that is not known yet.
+    """
+    placed: dict[str, PackedSequence] = {}
     contents: dict[str, str] = {}
     shard = records = 0
-    for name in reader.sequences:
+    for name in sorted(reader.sequences, key=(last or ()).__contains__):
         try:
             frames, size, error = reader.num_frames(name), _size(reader, name), None
             if isinstance(reader, CovisibleDataset):
@@ -199,9 +212,14 @@ def _placed(reader: Reader, frames_per_shard: int) -> tuple[list[PackedSequence]
             frames, size, error = 0, None, describe(reason)
         if records and records + frames > frames_per_shard:
             shard, records = shard + 1, 0
-        placed.append(PackedSequence(name, shard, records, frames, size, error))
+        placed[name] = PackedSequence(name, shard, records, frames, size, error)
         records += frames
-    return placed, contents
+    return [placed[name] for name in reader.sequences], contents
+
+
+def _in_shard(sequences: Iterable[PackedSequence], number: int) -> list[PackedSequence]:
+    """Those that lie in a shard, in their order there."""
+    return sorted((each for each in sequences if each.shard == number), key=lambda each: each.first)
 
 
 def _size(reader: Reader, name: str) -> tuple[int, int] | None:
@@ -222,8 +240,9 @@ def _whole(
         notes = read_json_object(notes_file(output, number))
         shard, path = PackedShard(**notes["shard"]), shard_file(output, number)
         content = {name: value for name, value in notes.items() if name != "digest"}
-        packed = {name: notes["sequences"][name]["content"] for name in contents}
-        if notes["plan"] != plan or packed != contents or notes["digest"] != json_digest(content):
+        packed = {name: each["content"] for name, each in notes["sequences"].items()}
+        same = list(packed.items()) == list(contents.items())  # in their order, too
+        if notes["plan"] != plan or not same or notes["digest"] != json_digest(content):
             return None
         broken = [(str(name), int(index), str(message)) for name, index, message in notes["broken"]]
         if file_digest(path) != shard.sha256:
@@ -247,7 +266,7 @@ def _written(
     workers: int,
 ) -> Iterator[tuple[int, tuple[PackedShard, list[str]]]]:
     """Writes shards; their numbers and what `_whole` gives of them, as they are done."""
-    parts = {number: [each for each in sequences if each.shard == number] for number in numbers}
+    parts = {number: _in_shard(sequences, number) for number in numbers}
     if workers == 1 or len(numbers) < 2:
         for number in numbers:
             yield number, _write(reader, output, number, parts[number], contents, plan)

@@ -226,6 +226,35 @@ def test_damage_beside_the_frames_of_one_scene_keeps_no_other_from_being_packed(
         found.num_frames(layout.sequence)
 
 
+def test_a_sequence_that_is_mended_is_packed_and_the_others_keep_their_shards(tmp_path: Path) -> None:
+    layout = blendedmvs.LAYOUT
+    layout.write(tmp_path / "set", layout.views)
+    others = ["e" * 24, "f" * 24]
+    for name in others:
+        shutil.copytree(tmp_path / "set" / layout.sequence, tmp_path / "set" / name)
+    pairs = tmp_path / "set" / layout.sequence / "cams/pair.txt"
+    content = pairs.read_bytes()
+    pairs.unlink()
+    arguments = "blendedmvs", tmp_path / "set", tmp_path / "packed"
+    assert sorted(open_dataset("blendedmvs", tmp_path / "set").sequences)[0] == layout.sequence
+    report = pack(*arguments, frames_per_shard=4)
+    assert (report.written, report.kept, len(report.broken)) == (2, 0, 1)
+    pairs.write_bytes(content)
+    report = pack(*arguments, frames_per_shard=4)
+    assert (report.written, report.kept, report.broken) == (1, 2, ())
+    assert pack(*arguments, frames_per_shard=4).kept == 3
+    original, found = (open_dataset("blendedmvs", tmp_path / each) for each in ("set", "packed"))
+    assert found.sequences == original.sequences
+    for name in original.sequences:
+        same(found.read(name, range(4)), original.read(name, range(4)))
+        assert found.content_digest(name) == original.content_digest(name)
+    # It is lost again: what else there is stays.
+    pairs.unlink()
+    report = pack(*arguments, frames_per_shard=4)
+    assert (report.written, report.kept, len(report.broken)) == (0, 2, 1)
+    assert len(list((tmp_path / "packed").glob("*.array_record"))) == 2
+
+
 def test_an_index_that_was_changed_is_refused(packed: Path, tmp_path: Path) -> None:
     output = damaged_copy(packed, tmp_path / "here")
     path = output / "packed.json"
