@@ -23,6 +23,7 @@ from logvggt_jax.data.feeding.clips import BROKEN, NAME, Size
 from logvggt_jax.data.feeding.listed_frames import check_listed_frames
 from logvggt_jax.data.feeding.mixture import FRAMES, SHAPES, TEACHERS, mixture
 from logvggt_jax.data.feeding.sampling import CovisibleDataset, sampler_for
+from logvggt_jax.data.worker_processes import end_with_parent
 from logvggt_jax.errors import InputError, one_line
 
 Batch = dict[str, np.ndarray]
@@ -356,6 +357,7 @@ def _is_killed_worker(error: BaseException) -> bool:
 
 
 def _start_worker(index: int, count: int) -> None:
+    end_with_parent()
     # Workers are there to use the cores; OpenCV would start as many threads again in each of them.
     cv2.setNumThreads(1)
     # A signal to the whole group is for the process that trains: it needs clips until it has decided to stop, and

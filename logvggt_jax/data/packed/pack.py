@@ -2,9 +2,8 @@
 
 import itertools
 import json
-import multiprocessing
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -32,6 +31,7 @@ from logvggt_jax.data.packed.index import (
 )
 from logvggt_jax.data.packed.records import broken_record, frame_record
 from logvggt_jax.data.registry import READERS, open_dataset
+from logvggt_jax.data.worker_processes import worker_pool
 from logvggt_jax.errors import DiskError, InputError, MissingPackage, OutputExists, disk_errors, install_line, one_line
 from logvggt_jax.files import FolderLock, atomic_file, check_writable, holds_nothing, to_disk, user_path, write_text
 
@@ -271,16 +271,12 @@ def _written(
         for number in numbers:
             yield number, _write(reader, output, number, parts[number], contents, plan)
         return
-    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
+    with worker_pool(workers) as pool:
         futures = {
             pool.submit(_write, reader, output, number, parts[number], contents, plan): number for number in numbers
         }
-        try:
-            for future in as_completed(futures):
-                yield futures[future], future.result()
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+        for future in as_completed(futures):
+            yield futures[future], future.result()
 
 
 def _write(

@@ -3,10 +3,8 @@
 import contextlib
 import hashlib
 import json
-import multiprocessing
 import os
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from logvggt_jax.data.cache_use import cache_in_use
 from logvggt_jax.data.dataset import Dataset, check_indices, check_sequence
 from logvggt_jax.data.rooms.same_rooms import SameRooms
+from logvggt_jax.data.worker_processes import worker_pool
 from logvggt_jax.errors import InputError, OutputExists
 from logvggt_jax.files import atomic_folder, check_space
 from logvggt_jax.frames import Frames
@@ -172,14 +171,8 @@ def _rendered(rooms: Dataset, workers: int) -> Iterator[Frames]:
         for sequence in rooms.sequences:
             yield _read_all(rooms, sequence)
         return
-    # Forking a process that runs JAX's threads can deadlock.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context) as executor:
-        try:
-            yield from executor.map(_read_all, [rooms] * len(rooms.sequences), rooms.sequences, chunksize=4)
-        except BaseException:
-            executor.shutdown(cancel_futures=True)
-            raise
+    with worker_pool(workers) as pool:
+        yield from pool.map(_read_all, [rooms] * len(rooms.sequences), rooms.sequences, chunksize=4)
 
 
 def _read_all(rooms: Dataset, sequence: str) -> Frames:
