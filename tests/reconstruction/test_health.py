@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from html.parser import HTMLParser
 from pathlib import Path
 
+import cv2
 import faulty_rooms as rooms
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from logvggt_jax.frames import Frames
 from logvggt_jax.reconstruction import Reconstruction
 from logvggt_jax.reconstruction.health import report
 from logvggt_jax.reconstruction.health.measures import Measures
+from logvggt_jax.reconstruction.health.pictures import compare_pictures
 from logvggt_jax.reconstruction.health.plot import svg_plot
 from logvggt_jax.reconstruction.health.recorder import HealthRecorder
 from logvggt_jax.reconstruction.health.rules import Stretch, stretches
@@ -115,14 +117,65 @@ def test_a_jump_of_the_exposure_is_told_with_the_brightness_before_and_after() -
         assert f"brightness jumps between {low:.0%} and {high:.0%} of white" in text
 
 
-def test_what_depth_alone_tells_is_not_blamed_on_the_footage() -> None:
-    """Depth that is wrong looks as what moves does: a model's own result of a room in which nothing moves says so."""
-    measures, names = measured(rooms.clean(), rooms.signals(rooms.COUNT, ())), ["x"] * rooms.COUNT
-    for signs, certain in (((), False), (("disagreement",), False), (("correction", "disagreement"), True)):
-        found = (Stretch("moving", 3, 5, signs),)
-        assert ("or depth is wrong there" in paragraph(found, measures, names)) != certain
-        assert ("most likely" in paragraph(found, measures, names)) == certain
-        assert in_short(found, 40) == f"3 of 40 frames doubtful: moving{'' if certain else ', or wrong depth'} (3 to 5)"
+def with_floating_depth(frames: Sequence[int]) -> Frames:
+    """A still room, and depth with a large surface that floats in front of it in some frames."""
+    still = rooms.clean()
+    depth, random = np.array(still.depth), np.random.default_rng(0)
+    height, width = rooms.SIZE
+    for index in frames:
+        top, left = random.integers(height // 2), random.integers(width - height // 2)
+        depth[index, top : top + height // 2, left : left + height // 2] *= 0.4
+    return still._replace(depth=depth)
+
+
+def test_depth_that_is_wrong_for_a_while_is_not_called_movement() -> None:
+    """It hides what should be seen, as what moves does, but the pictures stay as they are."""
+    measures = measured(with_floating_depth(range(20, 25)), rooms.signals(rooms.COUNT, ()))
+    assert np.nanmax(measures.conflicts) > 0.04 > 0.6 * np.nanmax(measures.elsewhere)
+    (found,) = stretches(measures)
+    assert (found.cause, found.first) == (None, 20) and "conflicts" in found.signs
+    text = paragraph((found,), measures, ["x"] * rooms.COUNT)
+    assert "moves" not in text and "nothing that is measured of the footage says why" in text
+    moving = measured(rooms.moving_subject(standing=False), rooms.signals(rooms.COUNT, ()))
+    until = rooms.FAULT.stop + 4  # when the frame of the comparison is without it again
+    assert np.nanmax(moving.elsewhere[rooms.FAULT.start : until]) > 0.06
+    assert np.nanmax(np.delete(moving.elsewhere, range(rooms.FAULT.start, until))) < 0.06
+
+
+@pytest.mark.parametrize("degrees", [25, 60])
+def test_cameras_that_turn_where_the_picture_stays_are_not_called_fast(degrees: int) -> None:
+    frames = rooms.clean()
+    extrinsics = np.array(frames.extrinsics)
+    extrinsics[20:] = rotation_y(degrees) @ extrinsics[20:]
+    measures = measured(frames._replace(extrinsics=extrinsics), rooms.signals(rooms.COUNT, ()))
+    assert measures.overlap[20] < 0.7 and measures.shared_picture[20] > 0.9
+    found = stretches(measures)
+    assert {stretch.cause for stretch in found} == {None}
+    assert any("cameras" in stretch.signs and stretch.first <= 20 <= stretch.last for stretch in found)
+    assert "cameras turn away from what the pictures still show" in paragraph(found, measures, ["x"] * rooms.COUNT)
+
+
+def rotation_y(degrees: float) -> np.ndarray:
+    cosine, sine = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    turned = np.eye(4)
+    turned[:3, :3] = [[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]]
+    return turned
+
+
+def test_detail_that_goes_little_by_little_may_be_that_of_a_smooth_surface() -> None:
+    measures = measured(rooms.clean(), rooms.signals(rooms.COUNT, ()))
+    measures.sharpness[10:30] *= 0.75 ** np.concatenate([np.arange(1, 11), np.arange(10, 0, -1)])
+    (found,) = stretches(measures)
+    assert found.cause == "soft"
+    assert "most likely the picture is blurred, or shows smooth surfaces" in paragraph(
+        (found,), measures, ["x"] * rooms.COUNT
+    )
+
+
+def test_a_lens_is_not_said_to_zoom_by_pictures_that_show_nothing() -> None:
+    measures = measured(rooms.dark(), rooms.signals(rooms.COUNT, rooms.FAULT))
+    measures.field_of_view[list(rooms.FAULT)] *= 1.4
+    assert [stretch.cause for stretch in stretches(measures)] == ["dark"]
 
 
 def test_a_moving_subject_is_told_from_the_cameras_own_movement() -> None:
@@ -134,19 +187,10 @@ def test_a_moving_subject_is_told_from_the_cameras_own_movement() -> None:
 
 
 def test_a_result_with_errors_everywhere_is_not_called_movement() -> None:
-    """Surfaces that float in front of a still scene in every frame: where they are large, the result is doubtful."""
-    frames = rooms.clean()
-    depth, random = np.array(frames.depth), np.random.default_rng(0)
-    height, width = rooms.SIZE
-    for index, each in enumerate(depth):
-        edge = height // 2 if 20 <= index <= 24 else height // 4
-        top, left = random.integers(height - edge), random.integers(width - edge)
-        each[top : top + edge, left : left + edge] *= 0.4
-    measures = measured(frames._replace(depth=depth), rooms.signals(rooms.COUNT, ()))
+    """Surfaces that float in front of a still scene in every frame."""
+    measures = measured(with_floating_depth(range(rooms.COUNT)), rooms.signals(rooms.COUNT, ()))
     assert np.nanmedian(measures.conflicts) > 0.01
-    found = stretches(measures)
-    assert {stretch.cause for stretch in found} == {None}
-    assert all("conflicts" in stretch.signs for stretch in found)
+    assert "moving" not in {stretch.cause for stretch in stretches(measures)}
 
 
 def test_what_hides_nearly_all_of_the_view_at_its_height_is_no_movement() -> None:
@@ -176,6 +220,20 @@ def test_chunks_whose_scale_jumps_are_doubtful() -> None:
         (None, 20, 20, ("chunks",)),
         (None, 30, 30, ("chunks",)),
     ]
+
+
+def test_small_pictures_tell_what_they_share_and_what_has_moved() -> None:
+    random = np.random.default_rng(0)
+    wide = cv2.resize(random.uniform(30, 150, (10, 16)), (48, 32), interpolation=cv2.INTER_CUBIC).clip(0, 255)
+    here, aside, dim = wide[4:22, 4:28], wide[6:24, 12:36], 0.4 * wide[4:22, 4:28]
+    ball = np.array(here)
+    ball[6:11, 9:13] = 200
+    pictures = np.stack([here, aside, dim, ball, random.uniform(0, 255, here.shape), np.full(here.shape, 9)])
+    pairs = np.array([0, 0, 0, 0, 0]), np.array([1, 2, 3, 4, 5])
+    shared, elsewhere = compare_pictures(pictures.astype(np.uint8), *pairs).T
+    np.testing.assert_allclose(shared[[0, 1, 3, 4]], [8 / 9 * 2 / 3, 1, np.nan, np.nan])
+    assert np.isnan(elsewhere[0]) and np.isnan(elsewhere[4])  # they share too little, or nothing
+    assert elsewhere[1] < 0.01 and elsewhere[2] > 0.06
 
 
 def test_geometry_of_neighbours_is_exact_for_exact_frames() -> None:
@@ -241,7 +299,7 @@ def test_every_result_says_how_it_is(tmp_path: Path, reconstruct_dark: Reconstru
     assert f"{result.folder}/health.html: " in summary
     assert '<meta name="viewport"' in (result.folder / "health.html").read_text()  # else it is tiny on a phone
     page = Words((result.folder / "health.html").read_text())
-    assert health.text in page.text and "it is too dark" in page.text and page.plots == 16
+    assert health.text in page.text and "it is too dark" in page.text and page.plots == 18
 
 
 def test_a_run_that_died_says_the_same_in_the_end(tmp_path: Path, reconstruct_dark: Reconstruct) -> None:
@@ -280,7 +338,8 @@ def test_results_without_a_report_open_and_a_damaged_one_is_named(tmp_path: Path
     report.write_health(tmp_path, report.examine(unknown, result.names), result.names)
     assert result.health is not None and not result.health.doubtful.any()
     sound = json.loads((tmp_path / "health.json").read_text())
-    del sound["measures"]["likeness"]  # as the first reports are
+    for later in ("likeness", "shared_picture", "elsewhere"):  # as the first reports are
+        del sound["measures"][later]
     (tmp_path / "health.json").write_text(json.dumps(sound))
     assert result.health is not None and np.isnan(result.health.measures.likeness).all()
     for change in (

@@ -34,6 +34,9 @@ class Measures:
       overlap: share of a coarse grid of points that this frame and the one before both see.
       disagreement: median relative difference between this frame's depth and that of the one before, where both see.
       conflicts: share of points that should be seen from the camera four frames away and are not, see `neighbours`.
+      shared_picture: share of the picture that the frame before shows as well, by the shift at which both are most
+        alike; NaN where they are not alike.
+      elsewhere: share of the picture that was not near its place in the frame four before, see `compare_pictures`.
       likeness: correlation of the pictures of this frame and the one before, at the points that both see.
       overlap_change: how far apart the two copies of the frame are that two windows predict, see `FrameResult`.
       correction: how far GCCR moved the frame's camera token, see `Signals`.
@@ -54,6 +57,8 @@ class Measures:
     overlap: np.ndarray = _measure("Overlap with the frame before", "share")
     disagreement: np.ndarray = _measure("Depth against the frame before", "relative difference")
     conflicts: np.ndarray = _measure("Points that should be seen", "share")
+    shared_picture: np.ndarray = _measure("Picture shared with the frame before", "share")
+    elsewhere: np.ndarray = _measure("Picture that was not there before", "share")
     likeness: np.ndarray = _measure("Pictures of what both see", "correlation")
     overlap_change: np.ndarray = _measure("Two windows on the same frame", "relative difference")
     correction: np.ndarray = _measure("Correction by GCCR", "of the token")

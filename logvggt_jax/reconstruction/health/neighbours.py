@@ -88,18 +88,6 @@ class Views:
         return np.stack([overlap, medians(apart), conflicts, alike], axis=1)
 
 
-def picture_changes(grey: np.ndarray) -> np.ndarray:
-    """[N] of small pictures [N, r, c]: one minus the correlation of each with the one before; NaN where one is flat."""
-    flat = grey.reshape(len(grey), -1).astype(np.float64)
-    flat -= flat.mean(1, keepdims=True)
-    lengths = np.linalg.norm(flat, axis=1)
-    changes = np.full(len(grey), np.nan)
-    product = lengths[1:] * lengths[:-1]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        changes[1:] = np.where(product > 0, 1 - (flat[1:] * flat[:-1]).sum(1) / product, np.nan)
-    return changes
-
-
 def medians(values: np.ndarray) -> np.ndarray:
     """Medians [n] of the numbers in each row of [n, m]; NaN where a row has none."""
     ordered = np.sort(values, axis=1)  # NaN last

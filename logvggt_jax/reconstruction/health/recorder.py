@@ -10,7 +10,8 @@ import numpy as np
 from logvggt_jax.geometry import camera_centres, rotation_angle
 from logvggt_jax.reconstruction.health.looks import NUMBERS, Look, look, places
 from logvggt_jax.reconstruction.health.measures import CONFLICTS_APART, Measures
-from logvggt_jax.reconstruction.health.neighbours import Views, picture_changes
+from logvggt_jax.reconstruction.health.neighbours import Views
+from logvggt_jax.reconstruction.health.pictures import compare_pictures, picture_changes
 from logvggt_jax.streaming import Signals
 
 # Relative differences of depth that are no conflict: at least, and as a multiple of those between neighbours.
@@ -77,12 +78,15 @@ class HealthRecorder:
         views = Views(depth, grey, where, size, np.asarray(extrinsics, np.float64), np.asarray(intrinsics, np.float64))
         later = np.arange(1, count)
         beside = np.full((count, 4), np.nan)
-        conflicts, step, turn = np.full(count, np.nan), np.full(count, np.nan), np.full(count, np.nan)
+        conflicts, step, turn, shared, elsewhere = np.full((5, count), np.nan)
         if count > 1:
+            earlier = np.maximum(later - CONFLICTS_APART, 0)
+            shared[1:] = compare_pictures(grey, later - 1, later)[:, 0]
+            elsewhere[1:] = compare_pictures(grey, earlier, later)[:, 1]
             beside[1:] = views.compare(later - 1, later, tolerance=_TOLERANCE)
             known = beside[np.isfinite(beside[:, 1]), 1]
             tolerance = max(_TOLERANCE, min(0.5, _TIMES * float(np.median(known)))) if len(known) else _TOLERANCE
-            conflicts[1:] = views.compare(np.maximum(later - CONFLICTS_APART, 0), later, tolerance=tolerance)[:, 2]
+            conflicts[1:] = views.compare(earlier, later, tolerance=tolerance)[:, 2]
             step[1:] = np.linalg.norm(np.diff(camera_centres(extrinsics), axis=0), axis=1) / median_depth[:-1]
             turn[1:] = np.degrees(rotation_angle(extrinsics[:-1, :3, :3], extrinsics[1:, :3, :3]))
         return Measures.of(
@@ -95,6 +99,8 @@ class HealthRecorder:
                 "overlap": beside[:, 0],
                 "disagreement": beside[:, 1],
                 "conflicts": conflicts,
+                "shared_picture": shared,
+                "elsewhere": elsewhere,
                 "likeness": beside[:, 3],
                 **signals._asdict(),
             },

@@ -31,10 +31,15 @@ TEXTURE_SHARE, LEAST_TEXTURE = 0.1, 2e-4
 BLUR_SHARPNESS, BLUR_RATIO = 0.5, 0.35
 # Of frames with less coarse detail than this share of the median nobody can say whether they are blurred.
 BLUR_TEXTURE = 0.15
+# A picture is blurred from one frame to the next, by such a factor of its fine detail; what comes little by little may
+# as well be a smooth surface that fills more and more of the view.
+BLUR_STEP = 2.0
 
 # Movement. Too fast: this much of the view is new in every frame, and so many times as much as in the median frame; or
 # most of it, whatever is usual in this sequence.
 NEW_VIEW, NEW_VIEW_TIMES, MOST_NEW = 0.3, 2.5, 0.5
+# That is believed unless the pictures share this much at some shift: then the cameras are wrong.
+SAME_VIEW = 0.9
 # No overlap: nearly all of the view is new; or the picture changes as much and so many times as much as usual, while
 # the method's own signals rise.
 ALL_NEW, PICTURE_CHANGE, PICTURE_TIMES = 0.8, 0.6, 4.0
@@ -43,11 +48,12 @@ ALL_NEW, PICTURE_CHANGE, PICTURE_TIMES = 0.8, 0.6, 4.0
 OTHER_PICTURE, ALIKE = 0.4, 0.75
 # Zoom: the focal length changes by this much over so many frames, and so many times as much as usual.
 ZOOM, ZOOM_FRAMES, ZOOM_TIMES = 0.1, 8, 6.0
-# Something moves: this share of the points that should be seen from four frames away is not, and so many times as many.
+# Something moves: this share of the points that should be seen from four frames away is not, and so many times as many;
+# and in one of the frames so much of the picture was not near its place either: depth that is wrong changes no picture.
 CONFLICTS, CONFLICT_TIMES = 0.04, 4.0
-# Nobody can tell movement from an error of the result where the median frame has so many of these already, and nothing
-# that moves hides so much of the view, in any frame of a stretch.
-CLEAN_CONFLICTS, MOST_CONFLICTS = 0.01, 0.6
+ELSEWHERE = 0.06
+# Nothing that moves hides so much of the view, in any frame of a stretch.
+MOST_CONFLICTS = 0.6
 
 # Signs that the result suffers: above this number and so many times the median.
 SIGNALS, SIGNAL_TIMES = 0.1, 4.0
@@ -69,6 +75,7 @@ CAUSES = {
     "exposure": "the exposure jumps",
     "texture": "there is hardly any texture, as of a plain wall or the sky",
     "blur": "the picture is blurred",
+    "soft": "the picture is blurred, or shows smooth surfaces",
     "zoom": "the lens zooms",
     "moving": "something moves in front of the camera",
 }
@@ -78,6 +85,7 @@ SIGNS = {
     "confidence": "the model is unsure of its depth",
     "disagreement": "depth does not fit that of the frame before",
     "conflicts": "points that should be seen from four frames away are not",
+    "cameras": "cameras turn away from what the pictures still show",
     "chunks": "chunks do not fit one another",
 }
 
@@ -136,7 +144,9 @@ def _causes(m: Measures, signs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     blur = (m.sharpness < BLUR_SHARPNESS * _median(m.sharpness)) & (ratio < BLUR_RATIO * _median(ratio)) & ~poor
     blur &= m.texture > BLUR_TEXTURE * _median(m.texture)
 
-    zoom = _over(_zoom(m.field_of_view), ZOOM, ZOOM_TIMES)
+    blur, soft = _sudden(blur, m.sharpness)
+
+    zoom = _over(_zoom(np.where(poor, np.nan, m.field_of_view)), ZOOM, ZOOM_TIMES)
     new = 1 - m.overlap
     # A picture says nothing where it, or the one before, shows nothing.
     clear = ~(poor | np.concatenate([[False], poor[:-1]]))
@@ -147,8 +157,9 @@ def _causes(m: Measures, signs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     # Nor is what a model makes of such pictures a movement.
     elsewhere = clear & ~(jump & (m.picture_change < SAME_PICTURE))
     moving = _over(m.conflicts, CONFLICTS, CONFLICT_TIMES) & ~signs["conflicts"] & elsewhere
-    fast = (_over(new, NEW_VIEW, NEW_VIEW_TIMES) | (new > MOST_NEW)) & ~(new > ALL_NEW) & ~zoom & elsewhere
-    no_overlap = ((new > ALL_NEW) & elsewhere) | (cut & ~moving & ~fast)
+    far = _far(m) & ~signs["cameras"] & elsewhere
+    fast = far & ~(new > ALL_NEW) & ~zoom
+    no_overlap = (far & (new > ALL_NEW)) | (cut & ~moving & ~fast)
     fast_or_cut = fast & (m.likeness < ALIKE) & _alone(m.picture_change > OTHER_PICTURE)
     moving &= ~_across(no_overlap | fast_or_cut)
     exposure = jump & ~no_overlap & ~fast & ~moving
@@ -161,6 +172,7 @@ def _causes(m: Measures, signs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         "exposure": exposure,
         "texture": texture,
         "blur": blur,
+        "soft": soft,
         "zoom": zoom,
         "moving": moving & ~zoom & ~no_overlap,
     }
@@ -170,9 +182,12 @@ def _causes(m: Measures, signs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 def _signs(m: Measures) -> dict[str, np.ndarray]:
     scales = np.full(m.num_frames, np.nan)
     missing = _over(m.conflicts, CONFLICTS, CONFLICT_TIMES)
-    no_movement = np.full(m.num_frames, _median(m.conflicts) > CLEAN_CONFLICTS)
+    no_movement = np.zeros(m.num_frames, bool)
     for first, last in _runs(missing):  # one error makes conflicts of all sizes
-        no_movement[first : last + 1] |= (m.conflicts[first : last + 1] > MOST_CONFLICTS).any()
+        run = slice(first, last + 1)
+        no_movement[run] |= (m.conflicts[run] > MOST_CONFLICTS).any() or not _around(
+            m.elsewhere > ELSEWHERE, first, last
+        ).any()
     joints = np.flatnonzero(np.isfinite(m.chunk_scale))
     scales[joints] = np.abs(np.diff(np.log(m.chunk_scale[joints]), prepend=0.0))  # the first chunk's is one
     return {
@@ -181,6 +196,7 @@ def _signs(m: Measures) -> dict[str, np.ndarray]:
         "confidence": m.confidence - 1 < CONFIDENCE_SHARE * (_median(m.confidence) - 1),
         "disagreement": _over(m.disagreement, DISAGREEMENT, DISAGREEMENT_TIMES),
         "conflicts": missing & no_movement,
+        "cameras": _far(m) & (m.shared_picture > SAME_VIEW),
         "chunks": (scales > np.log(CHUNK_SCALE)) | (m.chunk_residual > CHUNK_RESIDUAL),
     }
 
@@ -193,6 +209,21 @@ def _median(values: np.ndarray) -> float:
 def _over(values: np.ndarray, least: float, times: float) -> np.ndarray:
     over: np.ndarray = (values > least) & (values > times * _median(values))
     return over
+
+
+def _far(m: Measures) -> np.ndarray:
+    """Frames of which the cameras say that much of the view is new."""
+    new = 1 - m.overlap
+    return _over(new, NEW_VIEW, NEW_VIEW_TIMES) | (new > MOST_NEW)
+
+
+def _sudden(blur: np.ndarray, sharpness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of blurred frames those whose stretch begins or ends from one frame to the next, and the others."""
+    steps = np.abs(np.diff(np.log(sharpness), prepend=np.nan, append=np.nan))  # before each frame, and after the last
+    sudden = np.zeros_like(blur)
+    for first, last in _runs(blur):
+        sudden[first : last + 1] = (steps[max(first - 1, 0) : last + 3] > np.log(BLUR_STEP)).any()
+    return blur & sudden, blur & ~sudden
 
 
 def _zoom(field_of_view: np.ndarray) -> np.ndarray:

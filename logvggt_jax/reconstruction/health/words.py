@@ -29,6 +29,7 @@ _EVIDENCE = {
     "exposure": ("brightness", "brightness jumps between {low:.0%} and {high:.0%} of white"),
     "texture": ("texture", "gradient energy falls to {of_median:.2g} times the median"),
     "blur": ("sharpness", "fine detail falls to {of_median:.2g} times the median"),
+    "soft": ("sharpness", "fine detail falls to {of_median:.2g} times the median"),
     "zoom": ("field_of_view", "the field of view goes from {first:.0f} to {last:.0f} degrees"),
     "moving": ("conflicts", "up to {high:.0%} of what should be seen from four frames away is not"),
 }
@@ -56,8 +57,7 @@ def in_short(found: Sequence[Stretch], count: int) -> str:
         return f"no doubtful frame among {count}"
     causes: dict[str, list[str]] = {}
     for stretch in found:
-        cause = "moving, or wrong depth" if _wrong_depth_looks_so(stretch) else stretch.cause or "unexplained"
-        causes.setdefault(cause, []).append(_numbers(stretch))
+        causes.setdefault(stretch.cause or "unexplained", []).append(_numbers(stretch))
     told = "; ".join(
         f"{cause} ({', '.join(where[:3])}{' …' if len(where) > 3 else ''})" for cause, where in causes.items()
     )
@@ -70,14 +70,7 @@ def reasons(stretch: Stretch) -> str:
     signs = f"{', '.join(others)} and {last}" if others else last
     if stretch.cause is None:
         return f"{signs}; nothing that is measured of the footage says why"
-    if _wrong_depth_looks_so(stretch):
-        return f"{CAUSES[stretch.cause]}, or depth is wrong there: {signs or 'nothing else in the result says which'}"
     return CAUSES[stretch.cause] + (f", and it shows: {signs}" if signs else ", though the result shows no sign of it")
-
-
-def _wrong_depth_looks_so(stretch: Stretch) -> bool:
-    """Whether the footage is not to blame for certain: what moves is known by depth alone."""
-    return stretch.cause == "moving" and {*stretch.signs} <= {"disagreement", "conflicts"}
 
 
 def _sentence(stretch: Stretch, measures: Measures, names: Sequence[str]) -> str:
@@ -86,8 +79,7 @@ def _sentence(stretch: Stretch, measures: Measures, names: Sequence[str]) -> str
     if stretch.cause is None:
         return f"{where}: {reasons(stretch)}."
     evidence = _evidence(stretch, measures)
-    likely = "" if _wrong_depth_looks_so(stretch) else "most likely "
-    return f"{where}: {likely}{reasons(stretch)}{f' ({evidence})' if evidence else ''}."
+    return f"{where}: most likely {reasons(stretch)}{f' ({evidence})' if evidence else ''}."
 
 
 def _evidence(stretch: Stretch, measures: Measures) -> str:
