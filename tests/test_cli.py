@@ -348,7 +348,7 @@ def test_bad_input_is_one_line_and_exit_code_2(
         ("rolling", "budget=9", ("budget", "fewer than", "take at least")),
         ("pruned", "cap=9", ("cap", "fewer than", "take at least")),
     ):
-        given = ("--method", method, "--setting", setting, "--dry-run")
+        given = ("--method", method, "--setting", setting)
         assert_fails(capsys, reconstruct(room, checkpoint, *given), *words)
     masks = ("--masks", str(empty))
     assert_fails(capsys, reconstruct(room, tmp_path / "no-model", *masks), "no mask in", str(empty))

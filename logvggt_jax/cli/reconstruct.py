@@ -38,7 +38,7 @@ def _reconstruct(options: argparse.Namespace) -> int:
     from logvggt_jax.reconstruction.method import choose_method
     from logvggt_jax.reconstruction.points.point_filter import PointFilter
     from logvggt_jax.reconstruction.reconstruct import LONGER_EDGE, reconstruct
-    from logvggt_jax.reconstruction.request import check_masks, check_request, describe, what_decides
+    from logvggt_jax.reconstruction.request import check_method, check_request, describe, what_decides
     from logvggt_jax.reconstruction.sources import open_source
     from logvggt_jax.reconstruction.work_folder import check_leftovers
     from logvggt_jax.weights import resolve
@@ -78,8 +78,8 @@ def _reconstruct(options: argparse.Namespace) -> int:
     if asked is not None:
         _settings(options, asked)  # an error of theirs is told before what is to be expected of the method
     method = choose_method(provenance, asked)
-    check_masks(source, method)
     settings = _settings(options, method)
+    check_method(source, method, settings, config, longer_edge)
     decides = what_decides(source, config, method, settings, longer_edge, point_filter, calibration)
     check_leftovers(target, decides, source, overwrite=options.overwrite)
     compiled = config if options.dry_run else None

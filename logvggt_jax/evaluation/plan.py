@@ -1,5 +1,6 @@
 """What is evaluated: benchmarks, and the clips of their data."""
 
+import contextlib
 import dataclasses
 from collections.abc import Sequence
 from typing import Any
@@ -52,6 +53,20 @@ class Clip:
         data = [protocol.dataset, dataset.identity, self.sequence, self.indices, self.content]
         claims = [method.depth, method.pose, method.points, method.static]
         return record_key(code_version(), names, data, protocol.measures(), claims, method.identity)
+
+
+def image_sizes(benchmarks: Sequence[Benchmark]) -> list[tuple[int, int]]:
+    """Different (H, W) of the images that a network sees, by the first sequence of each benchmark whose data are there.
+
+    A sequence whose pictures cannot be read tells none; that it cannot is said of its clips.
+    """
+    found: dict[tuple[int, int], None] = {}
+    for benchmark in benchmarks:
+        for sequence in benchmark.sequences[:1]:
+            assert benchmark.dataset is not None  # it has sequences
+            with contextlib.suppress(InputError, OSError):
+                found[benchmark.protocol.images.size(benchmark.dataset.image_size(sequence))] = None
+    return list(found)
 
 
 def plan_clips(

@@ -11,8 +11,7 @@ from logvggt_jax.evaluation.costs.throughput import measured_costs, measured_tim
 from logvggt_jax.evaluation.datasets import open_run
 from logvggt_jax.evaluation.methods.method import Checkpoint, Method, model_row
 from logvggt_jax.evaluation.methods.variants import variant_methods
-from logvggt_jax.evaluation.plan import Benchmark
-from logvggt_jax.evaluation.protocols.images import Fit
+from logvggt_jax.evaluation.plan import image_sizes
 from logvggt_jax.evaluation.records import RECORDS_FILE
 from logvggt_jax.evaluation.report.report import write_report
 from logvggt_jax.evaluation.runner import evaluate
@@ -60,8 +59,7 @@ def run_evaluation(
     asks = isinstance(run, ClipRun) and run.evaluation.image_size is None
     longer_edge = read_provenance(checkpoint).longer_edge if asks else None
     benchmarks, baselines = open_run(run, data_root, longer_edge)
-    if isinstance(run, ClipRun):
-        _check_room(run, checkpoint, _clip_size(benchmarks))
+    _check_room(run, checkpoint, image_sizes(benchmarks))
     trained_for = read_provenance(checkpoint).trained_for
     # Gigabytes of parameters are not read for a folder that another run has.
     lock = FolderLock(output, "choose another output")
@@ -83,7 +81,8 @@ def run_evaluation(
                     list(rows.values()),
                     run.timings,
                     output,
-                    image_size=_clip_size(benchmarks),
+                    # Clips' images are of one size, whatever the pictures have.
+                    image_size=benchmarks[0].protocol.images.size((3, 4)),
                     dtype=loaded.model.config.dtype,
                     fresh=fresh,
                 )
@@ -106,19 +105,14 @@ def run_evaluation(
     return results
 
 
-def _clip_size(benchmarks: Sequence[Benchmark]) -> tuple[int, int]:
-    """(H, W) of the images of a run over clips, all of one size."""
-    images = benchmarks[0].protocol.images
-    assert isinstance(images, Fit)  # clips'
-    return images.size
-
-
-def _check_room(run: ClipRun, checkpoint: str | Path, image_size: tuple[int, int]) -> None:
-    """Raises InputError for a method whose budget or cap is below one frame, before any parameter is read."""
+def _check_room(run: ClipRun | PaperRun, checkpoint: str | Path, sizes: Sequence[tuple[int, int]]) -> None:
+    """Raises InputError for a method whose budget or cap is below one frame of one of these sizes, before any parameter
+    is read."""
     config = read_config(resolve(checkpoint))
     for name in run.methods:
         method, settings = METHODS[name], run.settings_of(name)
-        method.check(config, image_size, method.settings() if settings is None else settings)
+        for size in sizes:
+            method.check(config, size, method.chosen(settings))
 
 
 def _row(method: str, checkpoint: Checkpoint, settings: Any, trained_for: str | None) -> Method:

@@ -30,7 +30,7 @@ from logvggt_jax.reconstruction.finishing import finish
 from logvggt_jax.reconstruction.frame_pool import FramePool
 from logvggt_jax.reconstruction.points.point_filter import PointFilter
 from logvggt_jax.reconstruction.points.selection import PointSelection
-from logvggt_jax.reconstruction.request import check_masks, check_request, what_decides
+from logvggt_jax.reconstruction.request import check_method, check_request, what_decides
 from logvggt_jax.reconstruction.result import Reconstruction
 from logvggt_jax.reconstruction.run import Run
 from logvggt_jax.reconstruction.sources import Source, open_source
@@ -102,7 +102,7 @@ def reconstruct(
         calibration=calibration,
         num_previews=num_previews,
     )
-    check_masks(source, method)
+    check_method(source, method, settings, model.config, longer_edge)
     request = {
         **what_decides(source, model.config, method, settings, longer_edge, point_filter, calibration),
         "weights": json_digest(digests(variables)),

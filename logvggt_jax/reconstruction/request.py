@@ -94,11 +94,15 @@ def what_decides(
     }
 
 
-def check_masks(source: Source, method: str) -> None:
-    """Raises InputError where the source has masks and the method takes none."""
-    if source.masks is not None and not METHODS[method].takes_masks:
+def check_method(source: Source, method: str, settings: Any, config: ModelConfig, longer_edge: int) -> None:
+    """Raises InputError where the method cannot take the source: it has masks and the method takes none, or its frames
+    at the model's size are larger than all that the method may keep."""
+    found = METHODS[method]
+    if source.masks is not None and not found.takes_masks:
         able = ", ".join(name for name, each in METHODS.items() if each.takes_masks)
         raise InputError(f"--method {method} takes no masks: choose one of {able}, or leave --masks out")
+    if source.image_size is not None:  # else it is known with the first frame
+        found.check(config, resized_size(source.image_size, longer_edge), found.chosen(settings))
 
 
 def disk_bytes(num_frames: int | None, size: tuple[int, int], point_filter: PointFilter) -> tuple[int, int]:
@@ -176,8 +180,8 @@ def device_needs(
     method: str, model: LogVGGT, settings: Any, size: tuple[int, int], num_frames: int | None
 ) -> DeviceNeeds:
     """Compiles the method's program for images of `size` (h, w); the compilation cache keeps it for the run itself."""
-    chosen = METHODS[method]
-    program = chosen.program(model, size, chosen.settings() if settings is None else settings, num_frames)
+    found = METHODS[method]
+    program = found.program(model, size, found.chosen(settings), num_frames)
     parameters = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(abstract_variables(model.config)))
     memory: Any = program.lowered.compile().memory_analysis()
     working = None

@@ -59,7 +59,7 @@ class Keeping(Protocol):
     def start(self, config: ModelConfig, tokens: int, frames: int = 1) -> StreamMemory:
         """Empty caches for frames of so many tokens, with room for at least so many frames where they keep all.
 
-        Raises InputError where they cannot hold one.
+        Raises PredictionError where they cannot hold one.
         """
         ...
 

@@ -60,7 +60,7 @@ class Predictor(Protocol):
         Raises:
           InputError: masks, and a method that takes none, see `Method.takes_masks`.
           ValueError: another shape or dtype, or the sequence is closed.
-          PredictionError: the method cannot go on, for want of memory or of an alignment.
+          PredictionError: the method cannot go on, for want of memory or of an alignment, or may not keep one frame.
         """
         ...
 
@@ -108,8 +108,8 @@ class Method(NamedTuple):
       takes_masks: whether `push` takes masks of pixels that are not to be seen.
       in_batches: whether many frames are predicted together, when all are there or a chunk is, so that the time of a
         single `push` tells nothing.
-      check: configuration of a model, (H, W) of the images and settings; raises InputError where what the method keeps
-        cannot hold one such frame.
+      check: configuration of a model, (H, W) of the images and settings; raises PredictionError where what the method
+        keeps cannot hold one such frame.
     """
 
     title: str
@@ -121,6 +121,10 @@ class Method(NamedTuple):
     takes_masks: bool = False
     in_batches: bool = False
     check: Callable[[ModelConfig, tuple[int, int], Any], None] = lambda config, image_size, settings: None
+
+    def chosen(self, settings: Any) -> Any:
+        """These settings, or the defaults where they are None."""
+        return self.settings() if settings is None else settings
 
 
 def _frame_by_frame(title: str, settings: type, keeping: Callable[[Any, int], Keeping], summary: str) -> Method:
@@ -234,7 +238,7 @@ def open_predictor(method: str, model: LogVGGT, variables: Variables, settings: 
       ValueError: settings of another method.
     """
     found = known_method(method)
-    settings = found.settings() if settings is None else settings
+    settings = found.chosen(settings)
     if not isinstance(settings, found.settings):
         raise ValueError(f"method {method!r} takes {found.settings.__name__}, got {type(settings).__name__}")
     return found.open(model, variables, settings)

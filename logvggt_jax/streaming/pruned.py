@@ -7,7 +7,6 @@ import dataclasses
 from typing import Literal
 
 from logvggt_jax.config import ModelConfig, require_counts, require_one_of, require_within
-from logvggt_jax.errors import InputError
 from logvggt_jax.model.key_value_cache import AnchoredCache, Caches, CameraMemory, empty
 from logvggt_jax.model.memory import RoundMemory
 from logvggt_jax.model.padding import doubled
@@ -19,6 +18,7 @@ from logvggt_jax.streaming.frame_session import (
     block_shape,
     with_room,
 )
+from logvggt_jax.streaming.results import PredictionError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,10 +57,10 @@ class KeepWanted:
     rounds: int
 
     def start(self, config: ModelConfig, tokens: int, frames: int = 1) -> StreamMemory:
-        """Empty caches. Raises InputError for a cap below one frame."""
+        """Empty caches. Raises PredictionError for a cap below one frame."""
         settings = self.settings
         if settings.cap < tokens:
-            raise InputError(
+            raise PredictionError(
                 f"PrunedSettings.cap: {settings.cap} tokens are fewer than the {tokens} of a frame of this size; take "
                 f"at least {tokens}, or {2 * tokens} for the first frame and the newest"
             )

@@ -17,7 +17,8 @@ from logvggt_jax.model.checks import check_pixels
 
 
 class PredictionError(InputError):
-    """A method cannot predict a sequence: too long for the memory, nothing to align."""
+    """A method cannot predict a sequence: too long for the memory, frames larger than all that it may keep, nothing to
+    align."""
 
 
 @dataclasses.dataclass(frozen=True)

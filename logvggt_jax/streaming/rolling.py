@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from logvggt_jax.config import ModelConfig, require_counts, require_one_of, require_within
-from logvggt_jax.errors import InputError
 from logvggt_jax.model.key_value_cache import GrowingCache, empty
 from logvggt_jax.model.memory import Memory
 from logvggt_jax.model.padding import doubled
@@ -29,6 +28,7 @@ from logvggt_jax.streaming.frame_session import (
     camera_with_room,
     with_room,
 )
+from logvggt_jax.streaming.results import PredictionError
 
 # Places of a layer's cache over its equal share of the budget: layers that resemble themselves less get more, in the
 # extreme e^(1 / temperature) times as much as others, for which few would make room.
@@ -74,11 +74,11 @@ class KeepWithinBudget:
         self._at_most: int | None = None
 
     def start(self, config: ModelConfig, tokens: int, frames: int = 1) -> StreamMemory:
-        """Empty caches. Raises InputError for a budget that is below the anchor, or one frame, in every layer."""
+        """Empty caches. Raises PredictionError for a budget that is below the anchor, or one frame, in every layer."""
         settings, depth = self._settings, config.aggregator.depth
         least = max(1, settings.anchor) * tokens
         if settings.budget < depth * least:
-            raise InputError(
+            raise PredictionError(
                 f"RollingSettings.budget: {settings.budget} tokens leave {settings.budget // depth} to each of {depth} "
                 f"layers, fewer than the {least} of {least // tokens} frame(s) of this size; take at least "
                 f"{depth * least}"

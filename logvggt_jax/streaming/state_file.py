@@ -114,7 +114,7 @@ def read_state(path: str | Path) -> State:
 def _facts(model: LogVGGT, variables: Variables, method: str, settings: Any) -> dict[str, Any]:
     return {
         "method": method,
-        "settings": str(known_method(method).settings() if settings is None else settings),
+        "settings": str(known_method(method).chosen(settings)),
         "model": json_digest(model.config.to_dict()),
         "parameters": json_digest([[name, *_glimpse(leaf)] for name, leaf in named_leaves(variables)]),
     }

@@ -57,6 +57,12 @@ def configuration(name: str, changes: dict[str, Any]) -> dict[str, Any]:
         ),
         ("methods", {"settings.rolling.budget": 3}, None, "RollingSettings.budget: 3 tokens leave .* take at least"),
         ("methods", {"settings.pruned.cap": 3}, None, "PrunedSettings.cap: 3 tokens are fewer than"),
+        (
+            "paper",
+            {"benchmarks": ("rooms-12",), "methods": ("windows", "pruned"), "settings.pruned": {"cap": 3}},
+            None,
+            "PrunedSettings.cap: 3 tokens are fewer than the 1041 of a frame",
+        ),
         ("rooms", {"options.height": 28}, None, "rooms: height follows from the rest of the run"),
         ("paper", {"protocol.options.room": {}}, None, "unknown data set 'room'"),
         ("paper", {"protocol.options.rooms.number": 3}, None, "rooms: unknown option 'number'"),

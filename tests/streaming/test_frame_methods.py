@@ -325,7 +325,7 @@ def test_settings_that_mean_nothing(settings: Any, message: str) -> None:
 def test_a_budget_below_a_frame(anchor: int, small_config: ModelConfig, small_variables: dict) -> None:
     least = max(1, anchor) * TOKENS * LAYERS
     stream = opened("rolling", small_config, small_variables, RollingSettings(budget=least - 1, anchor=anchor))
-    with pytest.raises(InputError, match=rf"budget: {least - 1} tokens leave .* take at least {least}$"):
+    with pytest.raises(PredictionError, match=rf"budget: {least - 1} tokens leave .* take at least {least}$"):
         stream.push(IMAGES[0])
     assert stream.snapshot() == ([], {}), "a smaller frame may fit, and need not be like the one that was refused"
 
@@ -340,7 +340,7 @@ def test_the_least_budget_runs(anchor: int, small_config: ModelConfig, small_var
 
 def test_a_cap_below_a_frame(small_config: ModelConfig, small_variables: dict) -> None:
     stream = opened("pruned", small_config, small_variables, PrunedSettings(cap=TOKENS - 1))
-    with pytest.raises(InputError, match=rf"cap: {TOKENS - 1} tokens are fewer than .* take at least {TOKENS}, or"):
+    with pytest.raises(PredictionError, match=rf"cap: {TOKENS - 1} tokens are fewer than .* take at least {TOKENS}, or"):
         stream.push(IMAGES[0])
     stream = opened("pruned", small_config, small_variables, PrunedSettings(cap=TOKENS))
     for image in IMAGES:

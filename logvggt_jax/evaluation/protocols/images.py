@@ -32,6 +32,10 @@ class ImageRule(Protocol):
 
     def __call__(self, frames: Frames) -> Frames: ...
 
+    def size(self, source: tuple[int, ...]) -> tuple[int, int]:
+        """(H, W) of the images of pictures of `source` (H, W)."""
+        ...
+
     def describe(self) -> str:
         """For the report."""
         ...
@@ -41,14 +45,20 @@ class ImageRule(Protocol):
 class Fit:
     """Cropped and resized to (H, W) with the principal point in the middle, as in training; see `transforms.fit`."""
 
-    size: tuple[int, int]
+    image_size: tuple[int, int]
     keeps_grid: ClassVar[bool] = True
 
     def __call__(self, frames: Frames) -> Frames:
-        return fit(frames, self.size)
+        return fit(frames, self.image_size)
+
+    def size(self, source: tuple[int, ...]) -> tuple[int, int]:
+        """(H, W), whatever the pictures have."""
+        del source
+        return self.image_size
 
     def describe(self) -> str:
-        return f"{self.size[1]} x {self.size[0]} pixels, cropped and resized about the principal point"
+        height, width = self.image_size
+        return f"{width} x {height} pixels, cropped and resized about the principal point"
 
 
 @dataclasses.dataclass(frozen=True)

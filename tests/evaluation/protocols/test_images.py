@@ -71,8 +71,7 @@ def test_images_are_multiples_of_fourteen_and_as_announced(rule: Any, source: tu
     made = rule(frames(*source, count=2))
     assert made.images.dtype == np.uint8
     assert made.images.shape[1] % 14 == made.images.shape[2] % 14 == 0
-    if not isinstance(rule, Fit):
-        assert made.images.shape[1:3] == rule.size(source) and max(made.images.shape[1:3]) <= 70
+    assert made.images.shape[1:3] == rule.size(source) and max(made.images.shape[1:3]) <= 70
     kept = made.depth.shape == made.images.shape[:3]
     assert kept if rule.keeps_grid else made.depth.shape == (2, *source)
 
