@@ -38,8 +38,10 @@ class TimingConfig:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "lengths", tuple(sorted(self.lengths)))
-        if any(n < 1 for n in self.lengths):
-            raise InputError(f"TimingConfig.lengths must be numbers of frames, 1 or more each, got {self.lengths}")
+        if any(n < 1 for n in self.lengths) or len(set(self.lengths)) < len(self.lengths):
+            raise InputError(
+                f"TimingConfig.lengths must be different numbers of frames, 1 or more each, got {self.lengths}"
+            )
         require_counts(self, "rounds")
 
 

@@ -30,9 +30,10 @@ class ClipSettings:
     def __post_init__(self) -> None:
         if self.image_size is not None:
             check_size(self.image_size, "ClipSettings.image_size")
-        if not self.clip_lengths or any(length < 2 for length in self.clip_lengths):
+        lengths = self.clip_lengths
+        if not lengths or min(lengths) < 2 or len(set(lengths)) < len(lengths):
             raise InputError(
-                f"ClipSettings.clip_lengths must be at least one number of 2 or more frames, got {self.clip_lengths}"
+                f"ClipSettings.clip_lengths must be different numbers of 2 or more frames, one at least, got {lengths}"
             )
         require_counts(self, "stride", "clips_per_sequence", "sets", "max_sequences", "max_points")
         require_counts(self, "seed", "figures", least=0)
