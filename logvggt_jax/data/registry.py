@@ -105,7 +105,9 @@ def checked_options(name: str, options: Mapping[str, Any]) -> dict[str, Any]:
     types = option_types(name)
     for option in options:
         if option not in types:
-            raise InputError(f"{name}: unknown option {option!r}; known are {', '.join(types) or 'none'}")
+            others = [other for other in READERS if option in option_types(other)]
+            of = f", and {option} is one of {', '.join(others)}: take a configuration of {name}" if others else ""
+            raise InputError(f"{name}: unknown option {option!r}; known are {', '.join(types) or 'none'}{of}")
     return {option: typed(types[option], value, f"{name}: {option}") for option, value in options.items()}
 
 

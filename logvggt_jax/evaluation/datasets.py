@@ -63,15 +63,17 @@ def open_evaluation_set(
     Raises InputError where `root` is missing, does not hold the data set, or is given for a set that has no folder,
     and for an option that its reader does not have or that the run decides.
     """
-    reader = READERS.get(name)
-    if reader is not None and root is None and reader.needs_root:
-        raise InputError(f"data set {name!r} is read from disk: give its folder with --data_root")
-    if reader is not None and root is not None and not reader.needs_root:
-        raise InputError(f"{name} are made, not read: leave --data_root={root} out")
-    sizes = {} if reader is None else reader.size_options(image_size)
+    sizes = READERS[name].size_options(image_size) if name in READERS else {}
     for option in ("root", "split", *sizes):
         if option in options:
             raise InputError(f"{name}: {option} follows from the rest of the run, leave it out of the set's options")
+    # A configuration that is for another data set is told before its folder is asked for.
+    checked_options(name, options)
+    reader = READERS[name]
+    if root is None and reader.needs_root:
+        raise InputError(f"data set {name!r} is read from disk: give its folder with --data_root")
+    if root is not None and not reader.needs_root:
+        raise InputError(f"{name} are made, not read: leave --data_root={root} out")
     return open_dataset(name, root, split, **sizes, **options)
 
 

@@ -55,6 +55,13 @@ def configuration(name: str, changes: dict[str, Any]) -> dict[str, Any]:
             None,
             r"rooms: speed must be a number or a list of 2 .*, got",
         ),
+        (
+            "rooms",
+            {"dataset": "seven_scenes"},
+            None,
+            "seven_scenes: unknown option 'num_rooms'; known are none, and num_rooms is one of rooms: take a "
+            "configuration of seven_scenes",
+        ),
         ("methods", {"settings.rolling.budget": 3}, None, "RollingSettings.budget: 3 tokens leave .* take at least"),
         ("methods", {"settings.pruned.cap": 3}, None, "PrunedSettings.cap: 3 tokens are fewer than"),
         (
