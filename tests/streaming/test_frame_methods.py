@@ -340,7 +340,7 @@ def test_the_least_budget_runs(anchor: int, small_config: ModelConfig, small_var
 
 def test_a_cap_below_a_frame(small_config: ModelConfig, small_variables: dict) -> None:
     stream = opened("pruned", small_config, small_variables, PrunedSettings(cap=TOKENS - 1))
-    with pytest.raises(PredictionError, match=rf"cap: {TOKENS - 1} tokens are fewer than .* take at least {TOKENS}, or"):
+    with pytest.raises(PredictionError, match=rf"cap: {TOKENS - 1} tokens are fewer than .* at least {TOKENS}, or"):
         stream.push(IMAGES[0])
     stream = opened("pruned", small_config, small_variables, PrunedSettings(cap=TOKENS))
     for image in IMAGES:
