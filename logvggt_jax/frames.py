@@ -1,4 +1,4 @@
-"""Frames of a data set, the one value that crosses package borders without JAX, and a choice among them."""
+"""Frames of a data set, the one value that crosses package borders without JAX; their number and their proportions."""
 
 from typing import NamedTuple
 
@@ -21,6 +21,12 @@ class Frames(NamedTuple):
     intrinsics: np.ndarray
     extrinsics: np.ndarray
     metric: bool
+
+
+def same_proportions(size: tuple[int, ...], other: tuple[int, ...], tolerance: float = 0.02) -> bool:
+    """Whether of two sizes (H, W) one is the other enlarged or reduced: their aspect ratios differ by no larger share
+    than the tolerance, which sizes of whole pixels need."""
+    return abs(size[1] * other[0] / (size[0] * other[1]) - 1) <= tolerance
 
 
 def evenly_spaced(count: int, most: int) -> list[int]:

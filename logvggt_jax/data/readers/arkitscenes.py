@@ -33,10 +33,10 @@ from logvggt_jax.data.formats.quarter_turns import turned_extrinsics, turned_int
 from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.data.readers.folder_dataset import INDOORS, NO_POSES, Dropped, FolderDataset, FrameRecord
 from logvggt_jax.errors import InputError
+from logvggt_jax.frames import same_proportions
 
 _FOLDS = {"train": ("Training",), "val": ("Validation",), "all": ("Training", "Validation")}
 _VIDEO = re.compile(r"\d+")
-_SHAPE_TOLERANCE = 0.02
 _MAX_TIME = 1e12  # seconds; milliseconds beyond it would leave int64
 # Intrinsics of a record whose calibration is read with its picture.
 _RAW, _DETECTION = "vga_wide", "lowres_wide"  # the folders of pictures in the two forms
@@ -183,8 +183,7 @@ def _calibration(path: Path) -> np.ndarray:
 
 def _at_size(depth: np.ndarray, size: tuple[int, int], path: Path) -> np.ndarray:
     """Millimetres uint16 [h, w] as float32 metres in a picture of `size`, by the nearest neighbour."""
-    factors = size[0] / depth.shape[0], size[1] / depth.shape[1]
-    if abs(factors[0] / factors[1] - 1) > _SHAPE_TOLERANCE:
+    if not same_proportions(depth.shape, size):
         raise UnequalSizes(
             f"{path}: depth of {depth.shape[1]} x {depth.shape[0]} does not have the shape of its picture of "
             f"{size[1]} x {size[0]}: download both again"

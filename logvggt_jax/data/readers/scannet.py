@@ -29,13 +29,13 @@ from logvggt_jax.data.formats.pose_lists import read_pose_list
 from logvggt_jax.data.formats.source_files import SourceFiles
 from logvggt_jax.data.readers.folder_dataset import INDOORS, Dropped, FolderDataset, FrameRecord, frame
 from logvggt_jax.errors import InputError
+from logvggt_jax.frames import same_proportions
 
 _SCENE = re.compile(r"scene\d{4}_\d{2}")
 _PREPARED = re.compile(r"color_(\d+)")
 # The download script's folder, whose scenes may have been exported to another.
 _DOWNLOADED = "scans"
 _PARTS = {_DOWNLOADED: None, "scans_train": "train", "scans_test": "test", "scannetv2": None}
-_ASPECT_TOLERANCE = 0.05  # 1296 x 968 and 640 x 480 differ by 0.004
 
 
 class ScanNet(FolderDataset):
@@ -109,7 +109,7 @@ class ScanNet(FolderDataset):
     def _read_frame(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         image, raw = read_rgb(record.image), read_depth(record.depth)
         (height, width), (image_height, image_width) = raw.shape, image.shape[:2]
-        if abs(image_width * height / (image_height * width) - 1) > _ASPECT_TOLERANCE:
+        if not same_proportions(raw.shape, image.shape):  # 1296 x 968 and 640 x 480 differ by 0.4 %
             raise UnequalSizes(
                 f"{record.depth}: {width} x {height} has another aspect ratio than {image_width} x {image_height} of "
                 f"{record.image}: export both again"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from logvggt_jax.frames import same_proportions
 from logvggt_jax.reconstruction.result import Reconstruction
 
 # By how much the aspect ratios of two pictures of one frame may differ.
@@ -18,13 +19,12 @@ def is_same_view(result: Reconstruction, size: tuple[int, int]) -> bool:
 
     Where frames may be cut it has to have their size: what is larger may be the picture that one is a part of.
     """
-    return size == result.image_size if may_be_cut(result) else _alike(size, result.image_size)
+    if may_be_cut(result):
+        return size == result.image_size
+    return same_proportions(size, result.image_size, _ASPECT)
 
 
 def lies_on_its_side(result: Reconstruction, size: tuple[int, int]) -> bool:
     """Whether what has `size` (H, W) has the shape of a frame that nobody has turned upright."""
-    return _alike(size[::-1], result.image_size) and not _alike(size, result.image_size)
-
-
-def _alike(size: tuple[int, int], other: tuple[int, int]) -> bool:
-    return abs(size[1] * other[0] / (size[0] * other[1]) - 1) <= _ASPECT
+    upright, turned = (same_proportions(each, result.image_size, _ASPECT) for each in (size, size[::-1]))
+    return turned and not upright

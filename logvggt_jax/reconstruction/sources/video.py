@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import secrets
 import stat
@@ -15,6 +14,7 @@ from typing import BinaryIO
 import numpy as np
 
 from logvggt_jax.errors import InputError, disk_errors
+from logvggt_jax.frames import same_proportions
 from logvggt_jax.reconstruction.sources.decoding import CodecChange, Damage, Picture, VideoDecoder, VideoHeader
 from logvggt_jax.reconstruction.sources.flv_tags import another_follows
 from logvggt_jax.reconstruction.sources.gif_blocks import breaks_off
@@ -215,7 +215,7 @@ class VideoSource(Source):
 
     def _refuse_size(self, position: int, size: tuple[int, int], first: tuple[int, int]) -> None:
         # One shape scaled to another would be squashed.
-        alike = math.isclose(size[0] * first[1], size[1] * first[0], rel_tol=0.02)
+        alike = same_proportions(size, first)
         scale = f", or scale all of it with ffmpeg -i INPUT -vf scale={first[1]}:{first[0]} OUTPUT.mp4" if alike else ""
         raise InputError(
             f"{self.name}: frame {position} is {size[1]} x {size[0]} pixels but the video begins with {first[1]} x "
