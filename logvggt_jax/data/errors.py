@@ -10,6 +10,9 @@ from typing import ClassVar
 
 from logvggt_jax.errors import InputError
 
+# What a reader raises though the copy is sound: for want of a library, or of memory.
+NOT_THE_COPY = (ImportError, MemoryError)
+
 
 class CopyError(InputError):
     """Something in a copy that is to be mended; `kind` is what a check counts it as."""

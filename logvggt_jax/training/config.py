@@ -22,6 +22,7 @@ from logvggt_jax.config import (
 )
 from logvggt_jax.data.feeding.augmentation import ColourAugmentation
 from logvggt_jax.data.feeding.holdouts import HoldOut
+from logvggt_jax.data.option_fields import given_options
 from logvggt_jax.errors import InputError
 from logvggt_jax.files import user_path
 
@@ -157,8 +158,7 @@ class SourceConfig:
     def __post_init__(self) -> None:
         freeze_lists(self)
         _expand_home(self, "root")
-        # None is a field that no flag has filled.
-        object.__setattr__(self, "options", tuple(sorted(pair for pair in self.options if pair[1] is not None)))
+        object.__setattr__(self, "options", tuple(sorted(given_options(dict(self.options)).items())))
         require_within(self, "(0, inf)", "weight")
         if self.stride is not None and not (len(self.stride) == 2 and 1 <= self.stride[0] <= self.stride[1]):
             raise InputError(f"SourceConfig.stride must be a pair 1 <= low <= high, got {self.stride}")

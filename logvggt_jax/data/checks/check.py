@@ -17,7 +17,7 @@ from logvggt_jax.data.checks.picture import check_picture_path, write_check_pict
 from logvggt_jax.data.checks.plausibility import complaints
 from logvggt_jax.data.checks.report import CheckReport, DepthRange, Problem, SequenceReport
 from logvggt_jax.data.dataset import check_frames
-from logvggt_jax.data.errors import MissingFiles
+from logvggt_jax.data.errors import NOT_THE_COPY, MissingFiles
 from logvggt_jax.data.readers.folder_dataset import FolderDataset
 from logvggt_jax.data.registry import READERS, open_dataset
 from logvggt_jax.errors import InputError, one_line
@@ -131,7 +131,7 @@ class _Problems:
 
     def add_error(self, error: Exception) -> None:
         """Files an error of a reader; one that is no fault of the copy is raised again."""
-        if isinstance(error, ImportError | MemoryError):
+        if isinstance(error, NOT_THE_COPY):
             raise error
         if isinstance(error, MissingFiles) and error.reasons:
             for path, reason in error.reasons.items():

@@ -14,6 +14,8 @@ from logvggt_jax.errors import DiskError, InputError
 _ABSENT = -1
 _UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _PLACES, _PIECE = 16, 64  # bytes
+# Not what file managers and network storage leave beside a set's folders, such as .thumbnails and @eaDir.
+PLAIN_NAME = re.compile(r"[A-Za-z0-9][\w-]*")
 
 
 class SourceFiles:

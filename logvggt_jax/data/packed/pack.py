@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from logvggt_jax.data.dataset import Reader
+from logvggt_jax.data.errors import NOT_THE_COPY
 from logvggt_jax.data.feeding.broken_clips import describe
 from logvggt_jax.data.feeding.sampling import CovisibleDataset
 from logvggt_jax.data.packed.index import (
@@ -39,8 +40,6 @@ FRAMES_PER_SHARD = 2000
 # One record in a group: a frame is read without its neighbours. Stronger compression takes twice the time for 3 %.
 _WRITER = "group_size:1,zstd:1"
 _SHOWN = 10
-# What a reader raises though the data set is sound: shards of such frames would be worth nothing.
-_NOT_THE_FILES = (ImportError, MemoryError)
 
 
 @dataclass(frozen=True)
@@ -205,7 +204,7 @@ def _placed(
             if isinstance(reader, CovisibleDataset):
                 reader.covisibility(name)
             contents[name] = reader.content_digest(name)
-        except _NOT_THE_FILES:
+        except NOT_THE_COPY:  # shards of such frames would be worth nothing
             raise
         # Whatever a decoder raises: one damaged sequence is not to keep the others from being packed.
         except Exception as reason:
@@ -225,7 +224,7 @@ def _in_shard(sequences: Iterable[PackedSequence], number: int) -> list[PackedSe
 def _size(reader: Reader, name: str) -> tuple[int, int] | None:
     try:
         return reader.image_size(name)
-    except _NOT_THE_FILES:
+    except NOT_THE_COPY:
         raise
     except Exception:  # as above; its frames are packed as broken ones
         return None
@@ -316,7 +315,7 @@ def _record(reader: Reader, sequence: str, index: int) -> tuple[bytes, str | Non
     """The record of a frame, and why it cannot be read, if it cannot."""
     try:
         return frame_record(reader.read(sequence, [index])), None
-    except _NOT_THE_FILES:
+    except NOT_THE_COPY:
         raise
     except Exception as error:  # whatever a decoder raises
         message = describe(error)

@@ -5,7 +5,6 @@ the latter's arrays `intrinsics` [T, 3, 3] (pixels) and `extrinsics` [T, 4, 4] (
 read; the point tracks beside them, a hundred times larger, are not. Depth is 16-bit, 65535 for 1000 m.
 """
 
-import re
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
@@ -18,14 +17,12 @@ from logvggt_jax.data.errors import MissingFiles, UnequalCounts
 from logvggt_jax.data.formats.calibration import world_to_camera
 from logvggt_jax.data.formats.image import read_depth, read_rgb
 from logvggt_jax.data.formats.numbered_files import numbered_frames
-from logvggt_jax.data.formats.source_files import SourceFiles
+from logvggt_jax.data.formats.source_files import PLAIN_NAME, SourceFiles
 from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame
 from logvggt_jax.errors import InputError
 from logvggt_jax.files import NUMPY_READING
 
 _FULL_SCALE, _FAR = 65535, 1000.0  # the stored value of `_FAR` metres
-# Not what file managers and network storage leave beside them, such as .thumbnails and @eaDir.
-_SEQUENCE = re.compile(r"[A-Za-z0-9][\w-]*")
 _SPLITS = ("train", "val", "test")
 # Only in the archives of later releases; v1.0 has other camera axes under the same names.
 _LATER_ARRAY = "valids"
@@ -57,7 +54,7 @@ class PointOdyssey(FolderDataset):
             f"{split}/{name}": folder
             for split in chosen
             for name, folder in files.folders(
-                self.root / split, f"the sequences of this split of {self.title}", _SEQUENCE
+                self.root / split, f"the sequences of this split of {self.title}", PLAIN_NAME
             ).items()
         }
 

@@ -7,7 +7,6 @@ float32 z-depth row by row. A `.cam` file is the same tag, nine float64 of the i
 world-to-camera matrix, OpenCV axes, rows first.
 """
 
-import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -18,12 +17,10 @@ from logvggt_jax.data.errors import BrokenPicture
 from logvggt_jax.data.formats.calibration import world_to_camera
 from logvggt_jax.data.formats.image import read_rgb
 from logvggt_jax.data.formats.numbered_files import numbered_frames
-from logvggt_jax.data.formats.source_files import SourceFiles, read_regular
+from logvggt_jax.data.formats.source_files import PLAIN_NAME, SourceFiles, read_regular
 from logvggt_jax.data.readers.folder_dataset import Dropped, FolderDataset, FrameRecord, frame
 from logvggt_jax.errors import InputError
 
-# Not what file managers and network storage leave beside them, such as .thumbnails and @eaDir.
-_SEQUENCE = re.compile(r"[A-Za-z0-9][\w-]*")
 _TAG = np.array(202021.25, "<f4").tobytes()
 _SKY = 1000.0  # metres; the film's sky is a huge number
 _CAMERA_BYTES = 4 + 21 * 8
@@ -50,7 +47,7 @@ class Sintel(FolderDataset):
     )
 
     def _find_sequences(self, files: SourceFiles) -> Mapping[str, Path]:
-        return files.folders(self.root / "training" / "final", "the pictures of the pass 'final'", _SEQUENCE)
+        return files.folders(self.root / "training" / "final", "the pictures of the pass 'final'", PLAIN_NAME)
 
     def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
         training = self.root / "training"

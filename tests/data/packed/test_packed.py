@@ -203,10 +203,18 @@ def test_a_file_that_was_mended_without_a_byte_more_or_less_is_written_anew(tmp_
     same(found.read(layout.sequence, range(4)), original.read(layout.sequence, range(4)))
 
 
-def test_a_missing_package_ends_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_package_or_too_little_memory_ends_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     mvs_synth.LAYOUT.write(tmp_path / "set", mvs_synth.LAYOUT.views)
     with monkeypatch.context() as patch, pytest.raises(MissingPackage, match="OpenEXR"):
         patch.setitem(sys.modules, "OpenEXR", None)
+        pack("mvs_synth", tmp_path / "set", tmp_path / "packed")
+    assert not (tmp_path / "packed/packed.json").exists()
+
+    def full(*_: object) -> None:
+        raise MemoryError
+
+    with monkeypatch.context() as patch, pytest.raises(MemoryError):
+        patch.setattr(module, "frame_record", full)
         pack("mvs_synth", tmp_path / "set", tmp_path / "packed")
     assert not (tmp_path / "packed/packed.json").exists()
     assert pack("mvs_synth", tmp_path / "set", tmp_path / "packed").broken == ()
