@@ -775,6 +775,48 @@ def test_frames_that_may_lack_what_a_damaged_one_showed_are_counted(tmp_path: Pa
     assert source.notes[-1].endswith(f"next key frame, which may lack what it showed: {after.index(True)}")
 
 
+@pytest.mark.parametrize("suffix", ["mp4", "ts"])
+@pytest.mark.parametrize(
+    "parameters",
+    [
+        "bframes=0",
+        "bframes=2:b-adapt=0",
+        "bframes=3:b-adapt=0:b-pyramid=normal",
+        "keyint=12:open-gop=1:bframes=2:b-adapt=0",
+        "keyint=12:intra-refresh=1",
+        "slices=4",
+    ],
+)
+def test_frames_that_a_copy_lost_are_told_where_others_refer_to_them(
+    tmp_path: Path, library: str, suffix: str, parameters: str
+) -> None:
+    images = [busy(i) for i in range(40)]
+    path = write(tmp_path / f"whole.{suffix}", images, options={"x264-params": f"scenecut=0:{parameters}"})
+    whole = open_source(path)
+    expected = {round(frame.timestamp, 2): frame.image for frame in whole}
+    assert len(expected) == 40 and whole.notes == []
+    lost = 13  # a frame to which others refer, in each of these
+    source = open_source(rewritten(tmp_path / f"gap.{suffix}", path, lambda n, packet: None if n == lost else packet))
+    frames = list(source)
+    wrong = [
+        number
+        for number, frame in enumerate(frames)
+        if np.abs(expected[round(frame.timestamp, 2)].astype(int) - frame.image).mean() > 1
+    ]
+    told, counted = source.notes
+    assert len(frames) == 39 and wrong and source.skipped == []
+    assert f"lacks frames before frame-{wrong[0]:06d}" in told and "to which later ones refer" in told
+    assert "is missing and the next key frame, which may lack what it showed" in counted
+    assert "intra-refresh" in parameters or int(counted.rsplit(" ", 1)[1]) >= len(wrong)
+
+
+def test_frames_to_which_no_other_refers_are_lost_without_harm(tmp_path: Path, library: str) -> None:
+    path = write(tmp_path / "a.mp4", [busy(i) for i in range(20)], options={"bf": "2", "b-adapt": "0"})
+    # The second of the two that lie between frames which others refer to.
+    source = open_source(rewritten(tmp_path / "b.mp4", path, lambda n, packet: None if n == 6 else packet))
+    assert len(list(source)) == 19 and not [note for note in source.notes if "lacks frames" in note]
+
+
 def test_damage_to_a_stream_without_times_is_named_where_it_is(tmp_path: Path, library: str) -> None:
     path = write(tmp_path / "raw.h264", [busy(i) for i in range(12)], options={"bf": "0", "x264-params": "threads=1"})
     content = bytearray(path.read_bytes())

@@ -44,6 +44,7 @@ class Picture(NamedTuple):
       damaged: the decoder had to guess parts of it.
       lasts: seconds for which it is shown; None where the file does not say.
       alone: it refers to no other frame; None where the library does not say.
+      follows_loss: frames between the key frame before it and it, which may refer to them, are not in the stream.
     """
 
     seconds: float | None
@@ -52,6 +53,7 @@ class Picture(NamedTuple):
     damaged: bool = False
     lasts: float | None = None
     alone: bool | None = None
+    follows_loss: bool = False
 
 
 class Damage(NamedTuple):

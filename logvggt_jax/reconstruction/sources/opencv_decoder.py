@@ -163,7 +163,9 @@ class OpenCVDecoder:
             first_size = first_size or stated
             matrix = self._turned(follower)
             size = shown_size(_stored_size(image.shape[:2], stated, first_size), matrix)
-            yield Picture(seconds, size, partial(_convert, image, matrix))
+            alone, follows_loss = (follower.key, follower.follows_loss) if follower else (None, False)
+            convert = partial(_convert, image, matrix)
+            yield Picture(seconds, size, convert, alone=alone, follows_loss=follows_loss)
         if follower is not None:
             yield from follower.rest() if self._times.exist and not self._times.as_stored else follower.failures()
 

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import cv2
 from PIL import Image
 
+from logvggt_jax.reconstruction.sources.h264_frame_numbers import FrameNumbers
 from logvggt_jax.reconstruction.sources.opencv_messages import quiet
 from logvggt_jax.reconstruction.sources.orientation import noted_orientation
 
@@ -38,6 +39,7 @@ _PARAMETERS: dict[bytes, tuple[re.Pattern[bytes], int | None]] = {
     b"mjpg": (re.compile(rb"\xff\xd8"), 1 << 16),
     b"mpng": (re.compile(rb"\x89PNG"), 24),
 }
+_H264_NAMES = (b"h264", b"avc1")
 _PICTURES = (b"mjpg", b"mpng")
 _OF_CAMERAS = b"mjpg"
 # Codecs that FFmpeg recognises in the container IVF only.
@@ -65,6 +67,7 @@ class Packet(NamedTuple):
       key: decoding can begin with it.
       size: (H, W) before rotation, as the key frames so far state it; None where none does.
       orientation: EXIF's, that the camera noted in a JPEG; 1 for none.
+      follows_loss: see `Picture`.
     """
 
     stamp: int
@@ -72,6 +75,7 @@ class Packet(NamedTuple):
     key: bool
     size: tuple[int, int] | None
     orientation: int
+    follows_loss: bool
 
 
 class PacketReader:
@@ -95,6 +99,7 @@ class PacketReader:
     def __iter__(self) -> Iterator[Packet | None]:
         """None stands for one that cannot be read."""
         size, head, errors = None, b"", 0
+        numbers = FrameNumbers() if self._codec in _H264_NAMES else None
         while self._capture.isOpened() and errors < _MOST_ERRORS:
             read, content = self._capture.retrieve() if self._capture.grab() else (False, None)
             if not read or content is None:
@@ -105,14 +110,15 @@ class PacketReader:
             errors = 0
             stamp = round(1000 * self._capture.get(cv2.CAP_PROP_POS_MSEC))
             key = bool(self._capture.get(cv2.CAP_PROP_LRF_HAS_KEY_FRAME))
+            data = content.tobytes()
             orientation = 1
             if key:
-                data = content.tobytes()
                 orientation = noted_orientation(data) if self._codec == _OF_CAMERAS else 1
                 parameters, length = _parameters(data, self._codec)
                 if parameters[:length] != head:
                     head, size = parameters[:length], _stated_size(parameters, self._codec) or size
-            yield Packet(stamp, content.size > _EMPTY_PACKET, key, size, orientation)
+            lossy = numbers is not None and numbers.follows_loss(data, key)
+            yield Packet(stamp, content.size > _EMPTY_PACKET, key, size, orientation, lossy)
 
     def close(self) -> None:
         """Closes the file."""

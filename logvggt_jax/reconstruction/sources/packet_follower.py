@@ -63,6 +63,8 @@ class PacketFollower:
     Attributes:
       size: (H, W) before rotation, as stated for the picture at hand; None where nothing states it.
       orientation: EXIF's, that the camera noted in the picture at hand, or in the first where none is; 1 for none.
+      key: decoding could begin with the picture at hand.
+      follows_loss: see `Picture`, of that at hand.
       lead: frames before the first key frame, which refer to some that are not there.
       lead_seconds: how long these would be shown.
       states_size: whether a packet so far states a size.
@@ -82,6 +84,9 @@ class PacketFollower:
         self._timed, self._edited = timed, edited
         # Whether all time stamps of frames so far were those of packets.
         self._trusted = timed and not edited
+        # Time stamps of key frames, and of frames before which some are missing.
+        self._keys: set[int] = set()
+        self._after_loss: set[int] = set()
         # What is stated of a picture, from which on.
         self._stated: deque[tuple[int, tuple[int, int] | None, int]] = deque()
         self._stored = self._shown = self._unreadable = 0
@@ -89,6 +94,7 @@ class PacketFollower:
         self._joint: Packet | None = None
         self.size: tuple[int, int] | None = None
         self.orientation = 1
+        self.key = self.follows_loss = False
         self.lead, self.lead_seconds = 0, 0.0
         self._lead_begins = math.inf
         self.states_size = False
@@ -185,6 +191,9 @@ class PacketFollower:
 
     def _show(self, stamp: int) -> None:
         self._last = stamp
+        self.key, self.follows_loss = stamp in self._keys, stamp in self._after_loss
+        self._keys.discard(stamp)
+        self._after_loss.discard(stamp)
         while self._stated and self._stated[0][0] <= self._shown:
             _, self.size, self.orientation = self._stated.popleft()
         self._shown += 1
@@ -223,6 +232,10 @@ class PacketFollower:
         self.states_size = self.states_size or packet.size is not None
         if not self._stated or self._stated[-1][1:] != (packet.size, packet.orientation):
             self._stated.append((self._stored, packet.size, packet.orientation))
+        if packet.key:
+            self._keys.add(packet.stamp)
+        if packet.follows_loss:
+            self._after_loss.add(packet.stamp)
         if packet.holds_frame:
             self._missing.expect(packet.stamp)
             self._stored += 1

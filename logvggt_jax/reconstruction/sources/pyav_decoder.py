@@ -16,9 +16,11 @@ import numpy as np
 from logvggt_jax.errors import InputError
 from logvggt_jax.reconstruction.sources.decoding import CodecChange, Damage, Picture, VideoHeader
 from logvggt_jax.reconstruction.sources.deinterlacing import Deinterlacer, is_interlaced
+from logvggt_jax.reconstruction.sources.h264_frame_numbers import FrameNumbers
 from logvggt_jax.reconstruction.sources.missing_frames import MissingFrames
 from logvggt_jax.reconstruction.sources.orientation import matrix_of, noted_orientation, shown_size, turn
 from logvggt_jax.reconstruction.sources.pyav_header import (
+    PacketNotes,
     average_rate,
     display_matrix,
     duration,
@@ -126,6 +128,7 @@ class PyAVDecoder:
             damaged=decoded.is_corrupt,
             lasts=float(decoded.duration * stream.time_base) if decoded.duration else None,
             alone=decoded.key_frame,
+            follows_loss=decoded.opaque is not None and decoded.opaque.follows_loss,
         )
 
     def _convert(self, frame: av.VideoFrame, matrix: np.ndarray | None) -> np.ndarray:
@@ -199,6 +202,9 @@ class PyAVDecoder:
         self._lead, self._lead_begins = 0, None
         started, key = False, None  # the time stamp of the first key frame; what is shown before refers to lost frames
         joined, last = False, -math.inf  # whether time goes back, as where recordings are joined
+        is_h264 = stream.codec_context.name == "h264"
+        numbers = FrameNumbers(stream.codec_context.extradata or b"") if is_h264 else None
+        after_loss: set[int | None] = set()  # time stamps of frames before which some are missing
         each = False  # whether every packet is known to show a frame of its own
         for packet in self._packets(container, stream):
             if isinstance(packet, CodecChange):
@@ -220,6 +226,8 @@ class PyAVDecoder:
             holds_frame = packet.size > (0 if self._numbered_as_stored else _EMPTY_PACKET)
             if holds_frame and packet.pts is not None and not packet.is_discard:
                 missing.expect(packet.pts)
+            if numbers is not None and packet.size and numbers.follows_loss(bytes(packet), packet.is_keyframe):
+                after_loss.add(packet.pts)
             try:
                 frames = packet.decode()
             except av.error.EOFError:
@@ -232,7 +240,8 @@ class PyAVDecoder:
                     missing.fail(str(error.strerror))
             noted = matrix_of(noted_orientation(bytes(packet))) if stream.codec_context.name in _OF_CAMERAS else None
             for frame in frames:
-                frame.opaque = noted
+                frame.opaque = PacketNotes(noted, frame.pts in after_loss)
+                after_loss.discard(frame.pts)
                 if self._numbered_as_stored:
                     yield from ((damage, None) for damage in missing.failures())
                     frame.pts = missing.take_next()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from fractions import Fraction
+from typing import NamedTuple
 
 import av
 import av.format
@@ -23,6 +24,18 @@ from logvggt_jax.reconstruction.sources.video_notes import (
 # FFmpeg's numbers of what a lens or its stitching program projects onto.
 _PROJECTIONS = {0: "equirectangular", 1: "a cube map", 2: "equirectangular", 3: "half equirectangular", 5: "fisheye"}
 _HDR_TRANSFERS = {16: "PQ", 18: "HLG"}
+
+
+class PacketNotes(NamedTuple):
+    """What the packet of a frame tells.
+
+    Attributes:
+      matrix: as the camera noted it in a JPEG, see `orientation`; None where nothing is turned.
+      follows_loss: see `Picture`.
+    """
+
+    matrix: np.ndarray | None
+    follows_loss: bool
 
 
 def notes_on(
@@ -48,9 +61,9 @@ def notes_on(
 
 
 def display_matrix(frame: av.VideoFrame, stream: av.video.stream.VideoStream) -> np.ndarray | None:
-    """See `orientation`; None where nothing is turned. A frame's `opaque` is what the camera noted in its JPEG."""
-    if frame.opaque is not None:
-        return frame.opaque
+    """See `orientation`; None where nothing is turned. A frame's `opaque` is what its packet told."""
+    if frame.opaque is not None and frame.opaque.matrix is not None:
+        return frame.opaque.matrix
     if data := _side_data(frame, "DISPLAYMATRIX"):
         return np.frombuffer(data, np.int32)[:9].reshape(3, 3)[:2, :2].astype(np.float64)
     tags = {name.lower(): value for name, value in stream.metadata.items()}

@@ -18,6 +18,7 @@ from logvggt_jax.frames import same_proportions
 from logvggt_jax.reconstruction.sources.decoding import CodecChange, Damage, Picture, VideoDecoder, VideoHeader
 from logvggt_jax.reconstruction.sources.flv_tags import another_follows
 from logvggt_jax.reconstruction.sources.gif_blocks import breaks_off
+from logvggt_jax.reconstruction.sources.listing import some
 from logvggt_jax.reconstruction.sources.masks import Masked, Masks
 from logvggt_jax.reconstruction.sources.media_boxes import boxes
 from logvggt_jax.reconstruction.sources.opencv_decoder import OpenCVDecoder
@@ -148,6 +149,7 @@ class VideoSource(Source):
         size = header.size if header else None
         taken, guessed, position, seconds, lasts = 0, 0, -1, 0.0, None
         lost, doubtful = False, 0  # whether a frame is missing since the last that refers to no other
+        losses: list[str] = []  # frames before which some are not in the stream
         for position, picture in enumerate(self._decoder.pictures()):
             name, seconds = f"frame-{position:06d}", clock.time(picture.seconds)
             if selection.is_over(seconds):
@@ -167,7 +169,9 @@ class VideoSource(Source):
                 if selection.has_begun(seconds) and picture.size != size:
                     self._refuse_size(position, picture.size, size)
                 guessed += picture.damaged
-                lost = lost and picture.alone is False
+                if picture.follows_loss and not lost:
+                    losses.append(name)
+                lost = (lost or picture.follows_loss) and picture.alone is False
                 if wanted:
                     doubtful += lost
                     selection.take(seconds)
@@ -180,10 +184,15 @@ class VideoSource(Source):
             self._check_end(position + 1, seconds, lasts)
         if guessed:
             self._add_note(f"{self.name}: frames with damaged parts, which the decoder filled by guesses: {guessed}")
+        if losses:
+            self._add_note(
+                f"{self.name} lacks frames before {some(losses)}, to which later ones refer: it was recorded or copied "
+                "with gaps"
+            )
         if doubtful:
             self._add_note(
-                f"{self.name}: frames between one that is left out and the next key frame, which may lack what it "
-                f"showed: {doubtful}"
+                f"{self.name}: frames between one that is {'missing' if losses else 'left out'} and the next key "
+                f"frame, which may lack what it showed: {doubtful}"
             )
         if not taken:
             raise InputError(
