@@ -12,7 +12,7 @@ from logvggt_jax.files import EMPTY_PATH
 from logvggt_jax.reconstruction.sources.image_folder import FolderSource
 from logvggt_jax.reconstruction.sources.listing import names_pictures
 from logvggt_jax.reconstruction.sources.masks import Masks
-from logvggt_jax.reconstruction.sources.pictures import IMAGE_SUFFIXES
+from logvggt_jax.reconstruction.sources.pictures import IMAGE_SUFFIXES, SIGNATURE_BYTES, kind_of
 from logvggt_jax.reconstruction.sources.source import SkippedFrame, Source, SourceFrame, SourceOptions
 from logvggt_jax.reconstruction.sources.video import VideoSource, is_live, refuse_address
 
@@ -25,6 +25,12 @@ _NUMBER = re.compile(r"%0?\d*d")
 _EXPECTED = "expected a folder of images or a video file"
 # As file managers give it; a `Path` keeps one slash only.
 _FILE_ADDRESS = re.compile(r"file:(?://(?:localhost)?)?(/[^/].*)")
+
+
+def _is_video(path: Path) -> bool:
+    """Whether a file is a video by its content."""
+    with disk_errors(path), path.open("rb") as file:
+        return kind_of(file.read(SIGNATURE_BYTES)) == "video"
 
 
 def open_source(path: str | Path, *, masks: str | Path | None = None, **options: Any) -> Source:
@@ -64,7 +70,7 @@ def open_source(path: str | Path, *, masks: str | Path | None = None, **options:
         raise error if isinstance(error, InputError) else InputError(f"{given!r} is no path: {error}") from error
     if pictures:
         return FolderSource(path, chosen, of_frames)
-    if path.suffix.lower() in IMAGE_SUFFIXES:
+    if path.suffix.lower() in IMAGE_SUFFIXES and not _is_video(path):
         raise InputError(
             f"{path} is a single image, or an animation (make it an mp4 or a GIF): give the folder that holds the "
             "sequence, a glob, or a video"

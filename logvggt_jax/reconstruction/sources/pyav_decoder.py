@@ -20,6 +20,7 @@ from logvggt_jax.reconstruction.sources.h264_frame_numbers import FrameNumbers
 from logvggt_jax.reconstruction.sources.missing_frames import MissingFrames
 from logvggt_jax.reconstruction.sources.orientation import matrix_of, noted_orientation, shown_size, turn
 from logvggt_jax.reconstruction.sources.pyav_header import (
+    STORE_DECODING_TIMES,
     PacketNotes,
     average_rate,
     display_matrix,
@@ -82,7 +83,7 @@ class PyAVDecoder:
                 codec = stream.codec_context.codec.long_name
                 raise InputError(f"{self._name} holds no frame that can be decoded ({codec}); re-encode the video")
             rate, stated = average_rate(container, stream), stream.frames or None
-            seconds = duration(container, stream, self._lead_begins)
+            seconds = duration(container, stream, frame.pts if self._lead_begins is None else self._lead_begins)
             if stated is not None and stated > container.size:
                 # A recorder that was cut off, or wrote to a pipe, never came to fill in its header.
                 seconds = stated = None
@@ -300,6 +301,8 @@ class PyAVDecoder:
                         yield empty
                         yield CodecChange(None, codec, now)
                         return
+                    if container.format.name in STORE_DECODING_TIMES:
+                        packet.pts = packet.dts
                     yield packet
                     errors = 0
                 return

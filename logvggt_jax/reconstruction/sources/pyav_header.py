@@ -23,6 +23,9 @@ from logvggt_jax.reconstruction.sources.video_notes import (
 
 # FFmpeg's numbers of what a lens or its stitching program projects onto.
 _PROJECTIONS = {0: "equirectangular", 1: "a cube map", 2: "equirectangular", 3: "half equirectangular", 5: "fisheye"}
+STORE_DECODING_TIMES = ("avi", "asf")
+"""Formats that state when packets are decoded, from the beginning of the file; times of presentation, which FFmpeg
+makes up, are those of packets that follow."""
 _HDR_TRANSFERS = {16: "PQ", 18: "HLG"}
 
 
@@ -117,7 +120,8 @@ def duration(
     known, as the library may know none of a stream that does not begin with a key frame."""
     is_matroska = "matroska" in container.format.name
     if stream.duration and not is_matroska:  # which states that of the file, and the library takes it for the stream's
-        return float(stream.duration * stream.time_base)
+        before = (begins or 0) if container.format.name in STORE_DECODING_TIMES else 0
+        return float((stream.duration - before) * stream.time_base)
     start = float((stream.start_time or begins or 0) * stream.time_base)
     if tag := re.fullmatch(r"(\d+):(\d+):(\d+\.?\d*)", stream.metadata.get("DURATION", "")):
         # Matroska's, counted from the beginning of the file.
