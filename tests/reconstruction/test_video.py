@@ -1392,6 +1392,9 @@ def test_names_are_taken_as_they_are(tmp_path: Path, library: str, name: str, mo
 def test_a_video_with_a_pictures_suffix_is_a_video(tmp_path: Path, library: str) -> None:
     path = write(tmp_path / "walk.mkv", [grey(i) for i in range(4)])
     assert len(list(open_source(path.rename(tmp_path / "walk.jpg")))) == 4
+    os.mkfifo(tmp_path / "pipe.jpg")
+    with pytest.raises(InputError, match=r"pipe\.jpg is a single image"):
+        open_source(tmp_path / "pipe.jpg")
 
 
 def test_a_name_that_is_no_unicode(tmp_path: Path, library: str) -> None:

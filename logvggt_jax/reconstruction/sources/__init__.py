@@ -29,8 +29,11 @@ _FILE_ADDRESS = re.compile(r"file:(?://(?:localhost)?)?(/[^/].*)")
 
 def _is_video(path: Path) -> bool:
     """Whether a file is a video by its content."""
-    with disk_errors(path), path.open("rb") as file:
-        return kind_of(file.read(SIGNATURE_BYTES)) == "video"
+    with disk_errors(path):
+        if not path.is_file():  # a pipe would be waited for
+            return False
+        with path.open("rb") as file:
+            return kind_of(file.read(SIGNATURE_BYTES)) == "video"
 
 
 def open_source(path: str | Path, *, masks: str | Path | None = None, **options: Any) -> Source:
