@@ -4,7 +4,7 @@ from typing import IO
 
 
 def breaks_off(stream: IO[bytes]) -> bool:
-    """Whether a GIF ends before the block that marks its end; of what is built otherwise that is not known."""
+    """Whether a GIF ends, or is damaged, before the block that marks its end."""
     stream.seek(10)
     if not (flags := stream.read(1)):
         return True
@@ -21,7 +21,7 @@ def breaks_off(stream: IO[bytes]) -> bool:
         elif kind == b"\0":  # some programs end blocks twice
             continue
         else:
-            return False
+            return True
         while (length := stream.read(1)) not in (b"", b"\0"):
             stream.seek(length[0], 1)
     return True

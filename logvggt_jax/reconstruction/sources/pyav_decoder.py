@@ -227,7 +227,11 @@ class PyAVDecoder:
             holds_frame = packet.size > (0 if self._numbered_as_stored else _EMPTY_PACKET)
             if holds_frame and packet.pts is not None and not packet.is_discard:
                 missing.expect(packet.pts)
-            if numbers is not None and packet.size and numbers.follows_loss(bytes(packet), packet.is_keyframe):
+            # Television's packets are counted.
+            lossy = packet.is_corrupt
+            if numbers is not None and packet.size:
+                lossy = numbers.follows_loss(bytes(packet), packet.is_keyframe) or lossy
+            if lossy:
                 after_loss.add(packet.pts)
             try:
                 frames = packet.decode()

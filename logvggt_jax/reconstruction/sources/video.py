@@ -22,6 +22,7 @@ from logvggt_jax.reconstruction.sources.listing import some
 from logvggt_jax.reconstruction.sources.masks import Masked, Masks
 from logvggt_jax.reconstruction.sources.media_boxes import boxes
 from logvggt_jax.reconstruction.sources.opencv_decoder import OpenCVDecoder
+from logvggt_jax.reconstruction.sources.pauses import Pauses
 from logvggt_jax.reconstruction.sources.sampling import FrameClock, FrameSelection, expected_frames
 from logvggt_jax.reconstruction.sources.source import (
     SkippedFrame,
@@ -43,6 +44,7 @@ _TIMEOUT = 10.0
 _STREAM_RATE = 30.0
 # Brands of files that are built like an mp4 but hold pictures.
 _PICTURES = (b"heic", b"heix", b"hevc", b"mif1", b"msf1", b"avif", b"avis")
+_LONGEST_PACKET = 192
 # Options that say nothing of a video.
 _OF_IMAGES = ("pattern", "size_mismatch")
 
@@ -148,6 +150,7 @@ class VideoSource(Source):
         clock, selection = FrameClock(header.rate if header else _STREAM_RATE), FrameSelection(self.options)
         size = header.size if header else None
         taken, guessed, position, seconds, lasts = 0, 0, -1, 0.0, None
+        pauses = Pauses()
         lost, doubtful = False, 0  # whether a frame is missing since the last that refers to no other
         losses: list[str] = []  # frames before which some are not in the stream
         for position, picture in enumerate(self._decoder.pictures()):
@@ -160,6 +163,8 @@ class VideoSource(Source):
                     f"{self.name} changes its codec about frame {position}, from {picture.before} to {picture.after}: "
                     "all frames need one; cut it there"
                 )
+            if header is not None:
+                pauses.add(seconds, None if isinstance(picture, Damage) else picture.lasts)
             if isinstance(picture, Damage):
                 lost = True
                 if wanted:
@@ -186,14 +191,17 @@ class VideoSource(Source):
             self._add_note(f"{self.name}: frames with damaged parts, which the decoder filled by guesses: {guessed}")
         if losses:
             self._add_note(
-                f"{self.name} lacks frames before {some(losses)}, to which later ones refer: it was recorded or copied "
-                "with gaps"
+                f"{self.name} lacks frames before {some(losses)}, to which later ones refer, or part of these: it was "
+                "recorded or copied with gaps"
             )
         if doubtful:
             self._add_note(
                 f"{self.name}: frames between one that is {'missing' if losses else 'left out'} and the next key "
                 f"frame, which may lack what it showed: {doubtful}"
             )
+        if found := pauses.found():
+            places = some(f"{length:.3g} s after frame-{place:06d}" for place, length in found)
+            self._add_note(f"{self.name} shows nothing for {places}: the recording was paused, or is damaged there")
         if not taken:
             raise InputError(
                 f"{self.name} gave no frame between {self.options.start or 0:g} s and "
@@ -305,11 +313,23 @@ def _check_file(path: Path) -> Iterator[str]:
             if another_follows(file):
                 yield _read_in_part(path, "several")
             file.seek(0)
+            if (length := _television_packet(file.read(2 * _LONGEST_PACKET))) and status.st_size % length:
+                yield _broken_off(path)
+            file.seek(0)
             if file.read(4) == b"GIF8" and breaks_off(file):
                 yield (
                     f"{path} lacks its end: the last frame may be half a picture, and those after it are missing; copy "
                     "it anew"
                 )
+
+
+def _television_packet(head: bytes) -> int | None:
+    """Bytes of each packet of a transport stream, without or behind a time; None for other files."""
+    for length in (188, _LONGEST_PACKET):
+        begin = length - 188
+        if head[begin::length][:2] == b"\x47\x47":
+            return length
+    return None
 
 
 def _check_index(path: Path, file: BinaryIO, size: int) -> Iterator[str]:
@@ -328,9 +348,13 @@ def _check_index(path: Path, file: BinaryIO, size: int) -> Iterator[str]:
         )
     # Nothing announces how many fragments there are to be.
     if any(box.kind == b"moof" for box in found) and found[-1].end != size:
-        yield f"{path} lacks its end: the recording or the copy was broken off, and its last frames may be missing"
+        yield _broken_off(path)
     if kinds.count(b"moov") > 1 and b"moof" not in kinds:
         yield _read_in_part(path, str(kinds.count(b"moov")))
+
+
+def _broken_off(path: Path) -> str:
+    return f"{path} lacks its end: the recording or the copy was broken off, and its last frames may be missing"
 
 
 def _read_in_part(path: Path, count: str) -> str:
