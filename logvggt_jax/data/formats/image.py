@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from logvggt_jax.data.errors import BrokenPicture, missing_file
+from logvggt_jax.data.formats.file_kinds import SIGNATURE_BYTES, kind_of
 from logvggt_jax.data.formats.jpeg import JPEG_START, decode_jpeg, ends_flat
 from logvggt_jax.errors import InputError, one_line
 
@@ -25,6 +26,7 @@ _JPEG_MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 _JPEG_END, _JPEG_SCAN, _JPEG_PROGRESSIVE = 0xD9, 0xDA, 0xC2
 _TIFF_ORDERS = {b"II*\0": "<", b"MM\0*": ">"}
 _TIFF_ORIENTATION = 0x112
+_DECODED = ("JPEG", "PNG", "WebP", "TIFF", "BMP", "GIF picture", "JPEG 2000 picture")
 
 
 def read_rgb(path: str | Path) -> np.ndarray:
@@ -124,11 +126,21 @@ def _decode(path: Path, data: bytes) -> np.ndarray:
     except cv2.error as error:
         raise BrokenPicture(f"{path}: not a picture that OpenCV can decode ({error.err}): fetch it again") from error
     if picture is None:
-        raise BrokenPicture(f"{path}: not a picture that OpenCV can decode: fetch it again")
+        raise BrokenPicture(f"{path}: {_not_decoded(data)}")
     if data.startswith(JPEG_START) and ends_flat(picture):
         with decoding_errors(path):
             decode_jpeg(data)
     return picture
+
+
+def _not_decoded(data: bytes) -> str:
+    """What lies in the place of a picture, and the mend."""
+    kind = kind_of(data[:SIGNATURE_BYTES])
+    if kind in ("HEIC", "AVIF"):
+        return f"{kind} inside: convert it to JPEG"
+    if kind in _DECODED:
+        return f"damaged, or a {kind} of a kind that OpenCV does not decode: fetch it again, or convert it to PNG"
+    return f"no picture but a {kind}: fetch it again" if kind else "no picture: fetch it again"
 
 
 def _as_stored(data: bytes) -> bytes | bytearray:

@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
+from logvggt_jax.data.formats.file_kinds import SIGNATURE_BYTES, kind_of
 from logvggt_jax.errors import InputError, MissingInput, disk_errors
 from logvggt_jax.files import EMPTY_PATH
 from logvggt_jax.reconstruction.sources.image_folder import FolderSource
 from logvggt_jax.reconstruction.sources.listing import names_pictures
 from logvggt_jax.reconstruction.sources.masks import Masks
-from logvggt_jax.reconstruction.sources.pictures import IMAGE_SUFFIXES, SIGNATURE_BYTES, kind_of
+from logvggt_jax.reconstruction.sources.pictures import IMAGE_SUFFIXES
 from logvggt_jax.reconstruction.sources.source import SkippedFrame, Source, SourceFrame, SourceOptions
 from logvggt_jax.reconstruction.sources.video import VideoSource, is_live, refuse_address
 

@@ -20,6 +20,7 @@ from PIL import (
 )
 
 from logvggt_jax.data.errors import BrokenPicture
+from logvggt_jax.data.formats.file_kinds import SIGNATURE_BYTES, kind_of
 from logvggt_jax.data.formats.image import decoding_errors, looks_like_depth, over_white, png_is_whole
 from logvggt_jax.data.formats.jpeg import decode_jpeg
 from logvggt_jax.errors import InputError, MissingPackage, disk_errors, one_line
@@ -30,7 +31,6 @@ IMAGE_SUFFIXES = (
     *(".heic", ".heif", ".hif", ".avif"),
 )
 MOST_PIXELS = 2 * (Image.MAX_IMAGE_PIXELS or 89_478_485)
-SIGNATURE_BYTES = 32
 
 # Plugins by name, rather than Image.open: that looks at suffixes and warns of sizes which MOST_PIXELS allows.
 _READERS: MappingProxyType[str, type[ImageFile.ImageFile]] = MappingProxyType(
@@ -43,14 +43,6 @@ _READERS: MappingProxyType[str, type[ImageFile.ImageFile]] = MappingProxyType(
         "AVIF": AvifImagePlugin.AvifImageFile,
     }
 )
-_SIGNATURES = (
-    *((b"\xff\xd8", "JPEG"), (b"\x89PNG\r\n\x1a\n", "PNG"), (b"BM", "BMP")),
-    *((start, "TIFF") for start in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")),
-    *((b"GIF8", "GIF picture"), (b"\0\0\0\x0cjP  ", "JPEG 2000 picture"), (b"\0\0\0\x0cJXL ", "JPEG XL picture")),
-    *((b"8BPS", "Photoshop file"), (b"v/1\x01", "OpenEXR file"), (b"%PDF", "PDF file"), (b"PK\x03\x04", "ZIP archive")),
-    *((b"\x1aE\xdf\xa3", "video"), (b"<", "web page or XML file"), (b"version https://git-lfs", "Git LFS pointer")),
-)
-_HEIC_BRANDS = {b"heic", b"heix", b"hevc", b"hevx", b"heim", b"heis", b"mif1", b"msf1"}
 # Formats that keep every level as it was, as a rule.
 _EXACT = ("PNG", "BMP", "TIFF")
 # As ImageOps.exif_transpose: what turns the stored pixels upright, by EXIF orientation.
@@ -151,19 +143,6 @@ def open_picture(path: Path, stream: IO[bytes]) -> tuple[str, ImageFile.ImageFil
     if isinstance(picture, TiffImagePlugin.TiffImageFile) and (misread := _misread(picture.tag_v2)):
         raise InputError(f"{path}: a TIFF of {misread}, which is not read: convert it to PNG")
     return kind, picture
-
-
-def kind_of(start: bytes) -> str:
-    """What a file is by its first `SIGNATURE_BYTES` bytes; empty where they are of no known kind."""
-    if start[:4] == b"RIFF":
-        return "WebP" if start[8:12] == b"WEBP" else "video"
-    if start[4:8] == b"ftyp":
-        # The major brand, a version, then the compatible ones.
-        brands = {start[8:12], *(start[at : at + 4] for at in range(16, min(len(start), int.from_bytes(start[:4])), 4))}
-        if brands & {b"avif", b"avis"}:
-            return "AVIF"
-        return "HEIC" if brands & _HEIC_BRANDS else "video"
-    return next((kind for signature, kind in _SIGNATURES if start.startswith(signature)), "")
 
 
 def not_colours(path: Path, values: str) -> InputError:

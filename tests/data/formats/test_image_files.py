@@ -213,6 +213,15 @@ def test_what_is_no_picture_is_named(tmp_path: Path):
         read_rgb(path)
     with pytest.raises(FileNotFoundError, match=r"absent\.png"):
         read_rgb(tmp_path / "absent.png")
+    for content, told in (
+        (b"\0\0\0\x18ftypheic\0\0\0\0mif1heic" + bytes(100), "HEIC inside: convert it to JPEG"),
+        (b"version https://git-lfs.github.com/spec/v1\n", "no picture but a Git LFS pointer"),
+        (b"<!DOCTYPE html>", "no picture but a web page"),
+        (b"BM" + bytes(100), "damaged, or a BMP of a kind"),
+    ):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=rf"text\.png: {told}"):
+            read_rgb(path)
 
 
 def test_wrong_types_are_named(tmp_path: Path):
