@@ -300,6 +300,8 @@ def test_a_list_names_files_in_its_own_order(tmp_path: Path, monkeypatch: pytest
     assert source.path == listing
     monkeypatch.chdir(tmp_path)
     assert reds(list(open_source("frames.txt"))) == [2, 0, 3]
+    listing.write_text("in\\2.png\r\nin\\0.png\r\n", encoding="utf-16")  # as Windows' shell writes it
+    assert reds(list(open_source(listing))) == [2, 0]
     for text, told in (
         ("in/2.png\nin/9.png\n", r"frames\.txt .* line 2 names no file: 'in/9\.png'"),
         ("in\n", r"line 1: 'in' is no file"),

@@ -57,7 +57,7 @@ class SourceFiles:
         other bytes than UTF-8 or, behind its mark, UTF-16, in which Windows' shell redirects."""
         content = self.content(path, expected)
         try:
-            return content.decode("utf-16" if content[:2] in _UTF_16 else "utf-8-sig")
+            return decoded(content)
         except UnicodeDecodeError as error:
             raise InputError(f"{path}: not a text file ({error.reason}): fetch it again") from error
 
@@ -86,6 +86,11 @@ class SourceFiles:
 
     def _note(self, path: Path) -> None:
         self.states[str(path)] = file_state(path)
+
+
+def decoded(content: bytes) -> str:
+    """The text of a file, without a byte order mark: UTF-8 or, behind its mark, UTF-16. Raises UnicodeDecodeError."""
+    return content.decode("utf-16" if content[:2] in _UTF_16 else "utf-8-sig")
 
 
 def file_state(path: Path) -> list[int]:

@@ -14,6 +14,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 
 from logvggt_jax.data.formats.ordering import missing_numbers
+from logvggt_jax.data.formats.source_files import decoded
 from logvggt_jax.errors import InputError, MissingInput, disk_errors
 from logvggt_jax.reconstruction.sources.pictures import IMAGE_SUFFIXES
 
@@ -122,9 +123,9 @@ def _of_glob(path: Path, pattern: str | None) -> Listing:
 
 def _of_list(path: Path, pattern: str | None) -> Listing:
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        lines = decoded(path.read_bytes()).splitlines()
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: no text in UTF-8: expected a list of image files, one path a line") from error
+        raise InputError(f"{path}: no text in UTF-8 or UTF-16: expected a list of images, one path a line") from error
     files: dict[Path, int] = {}
     for number, line in enumerate(lines, 1):
         text = line.strip()
@@ -132,6 +133,8 @@ def _of_list(path: Path, pattern: str | None) -> Listing:
             continue
         file = path.absolute().parent / text
         with disk_errors(f"{path}, line {number}"):
+            if "\\" in text and not file.exists():  # as Windows has them between folders
+                file = path.absolute().parent / text.replace("\\", "/")
             if "\0" in text or not file.exists():
                 raise MissingInput(
                     f"{path} is text and taken for a list of images; line {number} names no file: {text!r}; paths are "
