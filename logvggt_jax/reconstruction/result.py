@@ -87,6 +87,9 @@ class Reconstruction:
             wrong with a file is said when it is read.
         """
         folder = user_path(folder)
+        with disk_errors(folder):
+            if folder.is_file():
+                raise InputError(f"{folder} is a file: give the folder that `logvggt reconstruct` has made")
         result = cls.with_cameras_of(folder)
         files = [depth_file(folder, name) for name in result.names]
         with disk_errors(folder / IMAGE_FOLDER):

@@ -47,6 +47,12 @@ def test_a_partial_folder_is_refused_and_the_file_named(tmp_path: Path, name: st
     assert str(tmp_path / name) in str(caught.value) and "\n" not in str(caught.value)
 
 
+def test_a_file_in_a_folders_place_is_called_one(tmp_path: Path) -> None:
+    write_result(tmp_path)
+    with pytest.raises(InputError, match=r"points\.ply is a file: give the folder"):
+        Reconstruction.open(tmp_path / "points.ply")
+
+
 @pytest.mark.parametrize("name", ["cameras.json", "depth/1.npz", "images/1.jpg", "points.ply"])
 @pytest.mark.parametrize("kept", [0, 0.5])
 def test_a_damaged_file_is_named_when_it_is_read(tmp_path: Path, name: str, kept: float) -> None:
