@@ -283,13 +283,26 @@ def test_a_process_that_cannot_label_says_so_before_the_others_are_done(
     assert re.search(r"rooms: .*teacher.*: .*; this process waits until the others", said[0])
 
 
-def test_a_teacher_of_another_kind_is_refused(small_config: ModelConfig, tmp_path: Path) -> None:
+def test_a_teacher_of_another_kind_is_refused(
+    small_config: ModelConfig, run_config: TrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     provenance = Provenance("windows", 42).to_dict()
     (tmp_path / "model").mkdir()
     description = {"config": small_config.to_dict(), "digests": {}, "provenance": provenance}
     write_description(tmp_path / "model", description)
     with pytest.raises(InputError, match=r"model: trained for 'windows', a teacher is plain VGGT"):
         PlainVGGT(TeacherConfig(str(tmp_path / "model"), 4))
+    # Before hours of listing or drawing.
+    monkeypatch.setattr(run_data, "open_sources", lambda *_: pytest.fail("data were opened"))
+    for name, told in (("model", "trained for 'windows'"), ("none", "no such file or folder")):
+        config = dataclasses.replace(
+            run_config,
+            loss=dataclasses.replace(run_config.loss, name="distillation"),
+            data=dataclasses.replace(run_config.data, cache_dir=str(tmp_path)),
+            teacher=TeacherConfig(str(tmp_path / name), 4),
+        )
+        with pytest.raises(InputError, match=told):
+            run_data.open_data(config)
 
 
 def test_a_teachers_weights_are_read_to_label_and_not_where_all_is_labelled(

@@ -13,16 +13,20 @@ from logvggt_jax.training.feeding.sources import open_source, open_sources
 from logvggt_jax.training.feeding.truth import check_depth, check_truth
 from logvggt_jax.training.parallel.agreement import check_shared
 from logvggt_jax.training.teaching.labelling import taught
-from logvggt_jax.training.teaching.teacher import PlainVGGT, Teacher
+from logvggt_jax.training.teaching.teacher import PlainVGGT, Teacher, check_teacher
+from logvggt_jax.weights.address import hub_address
 
 
 def open_data(config: TrainConfig) -> tuple[Mapping[str, Dataset], Sequence[Dataset]]:
     """The mixture's data sets by name, and the validation sets where they are not simply their sources.
 
     With a teacher every clip is labelled here, or found in the cache; the teacher is gone when this returns. Raises
-    InputError as `check_truth`, `open_sources`, `check_depth`, `PlainVGGT` and `taught`.
+    InputError as `check_truth`, `check_teacher`, `open_sources`, `check_depth`, `PlainVGGT` and `taught`.
     """
     check_truth(config)
+    # What is at hand is looked at before data are listed or drawn; gigabytes are downloaded and read after that.
+    if config.teacher is not None and hub_address(config.teacher.weights) is None:
+        check_teacher(config.teacher)
     datasets = open_sources(config.data, () if config.validation is None else config.validation.sources)
     check_depth(config, datasets)
     if config.teacher is None:

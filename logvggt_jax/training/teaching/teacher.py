@@ -35,17 +35,25 @@ class Teacher(Protocol):
         ...
 
 
+def check_teacher(config: TeacherConfig) -> None:
+    """Raises MissingInput where there are no such weights, InputError where they are known not to be plain VGGT's.
+
+    Reads no parameter; weights of a hub are downloaded.
+    """
+    kind = read_provenance(config.weights).trained_for
+    if kind not in ("vggt", None):
+        raise InputError(
+            f"teacher.weights={config.weights}: trained for {kind!r}, a teacher is plain VGGT ('vggt'): give "
+            "VGGT-1B as `logvggt convert` writes it, or a checkpoint of it"
+        )
+
+
 class PlainVGGT:
     """The teacher of a run, on the default device. Its weights are read when the first clip is labelled, and at once
     where only they tell their digests. Raises InputError for weights that are not plain VGGT's."""
 
     def __init__(self, config: TeacherConfig) -> None:
-        kind = read_provenance(config.weights).trained_for
-        if kind not in ("vggt", None):
-            raise InputError(
-                f"teacher.weights={config.weights}: trained for {kind!r}, a teacher is plain VGGT ('vggt'): give "
-                "VGGT-1B as `logvggt convert` writes it, or a checkpoint of it"
-            )
+        check_teacher(config)
         self._config = config
         self._path = resolve(config.weights)
         self._weights: tuple[LogVGGT, dict[str, Any]] | None = None
