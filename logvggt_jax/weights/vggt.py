@@ -225,9 +225,12 @@ def check_vggt(state_dict: Mapping[str, np.ndarray], config: ModelConfig) -> Non
     present = set(state_dict)  # a lazy mapping may read a tensor to say whether it is there
     missing = [rule.name for rule in rules if rule.name not in present and rule.name != _MASK_TOKEN]
     if missing:
+        differences, seen = _differences(state_dict, config), _seen(state_dict)
+        # That sizes cannot be told for want of a key says what this line says.
+        differences = "" if differences.endswith(seen) else differences
         raise InputError(
             f"{len(missing)} of {len(rules)} keys are missing from the state dict, first {', '.join(missing[:3])}"
-            f"{_differences(state_dict, config)}; {_seen(state_dict)}"
+            f"{differences}; {seen}"
         )
     for rule in rules:
         if rule.name in present and (header := _header(state_dict, rule.name)) is not None:

@@ -178,6 +178,15 @@ def test_missing_keys_are_counted_and_named(vggt_state_dict, vggt_config):
         params_from_vggt(fewer, vggt_config)
 
 
+@pytest.mark.parametrize("lost", ["aggregator.camera_token", "aggregator.frame_blocks.3."])
+def test_a_missing_key_that_tells_a_size_is_said_once(vggt_state_dict, vggt_config, lost):
+    fewer = {name: tensor for name, tensor in vggt_state_dict.items() if not name.startswith(lost)}
+    with pytest.raises(InputError, match=r"^\d+ of \d+ keys are missing") as raised:
+        params_from_vggt(fewer, vggt_config)
+    message = str(raised.value)
+    assert lost in message and message.count("it holds") == 1 and "lacks" not in message
+
+
 def test_a_misshapen_tensor_is_named_with_both_shapes(vggt_state_dict, vggt_config):
     bad = {**vggt_state_dict, "camera_head.embed_pose.weight": np.zeros((32, 8), np.float32)}
     with pytest.raises(ValueError, match=r"embed_pose\.weight has shape \(32, 8\), expected \(32, 9\).*damaged"):
