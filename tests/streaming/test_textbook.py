@@ -4,6 +4,8 @@ few and many heads, grids that are far from square, budgets and caps of every ki
 from __future__ import annotations
 
 import dataclasses
+import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -99,31 +101,30 @@ def _poses(subject: Subject, method: str, settings: Any, frames: int = FRAMES) -
 
 def _network(subject: Subject, method: str, settings: Any) -> Network:
     """Its account in numpy."""
-    depth, tokens, special = (
-        subject.config.aggregator.depth,
-        subject.tokens,
-        1 + subject.config.aggregator.num_registers,
-    )
+    sizes, tokens = subject.config.aggregator, subject.tokens
 
-    def all_frames(t: int) -> list[int]:
-        return list(range(t + 1))
+    def of_layers(memory: Callable[[], Any]) -> list[Any]:
+        return [memory() for _ in range(sizes.depth)]
 
-    single = getattr(settings, "camera_cache", "per_round") == "single"
-    layers: list[Any] = [Everything() for _ in range(depth)]
-    trunk, registers = Everything, all_frames
+    kept: dict[str, Any] = {
+        "layers": of_layers(Everything),
+        "trunk": Everything,
+        "registers": lambda t: list(range(t + 1)),
+        "single": getattr(settings, "camera_cache", "per_round") == "single",
+    }
     if method == "anchored-window":
-        window = settings.window
-        layers, trunk = [FirstAndNewest(window) for _ in range(depth)], lambda: FirstAndNewest(window)  # type: ignore[assignment]
-        registers = lambda t: [i for i in range(t + 1) if i == 0 or i > t - window]  # noqa: E731
+        few = functools.partial(FirstAndNewest, settings.window)
+        registers = lambda t: [i for i in range(t + 1) if i == 0 or i > t - settings.window]  # noqa: E731
+        kept |= {"layers": of_layers(few), "trunk": few, "registers": registers}
     if method == "rolling":
-        layers = [Rolling(settings.anchor) for _ in range(depth)]
+        kept["layers"] = of_layers(functools.partial(Rolling, settings.anchor))
     if method == "pruned":
-        layers = [Pruned(settings.cap, special, codes=settings.bits == 4) for _ in range(depth)]
-        trunk = lambda: Pruned(settings.cap, 1)  # type: ignore[assignment, return-value]  # noqa: E731
-        kept = max(settings.cap, 2 * tokens) // tokens
-        registers = lambda t: [i for i in range(t + 1) if i == 0 or i > t - kept + 1]  # noqa: E731
-    options: Any = {"layers": layers, "trunk": trunk, "registers": registers, "single": single}
-    return Network(subject.config, subject.params, subject.grid, **options)
+        wanted = functools.partial(Pruned, settings.cap)
+        layer = functools.partial(wanted, 1 + sizes.num_registers, codes=settings.bits == 4)
+        fit = max(settings.cap, 2 * tokens) // tokens
+        registers = lambda t: [i for i in range(t + 1) if i == 0 or i > t + 1 - fit]  # noqa: E731
+        kept |= {"layers": of_layers(layer), "trunk": functools.partial(wanted, 1), "registers": registers}
+    return Network(subject.config, subject.params, subject.grid, **kept)
 
 
 def _in_numpy(subject: Subject, method: str, settings: Any) -> tuple[np.ndarray, Network]:
