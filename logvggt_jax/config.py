@@ -282,6 +282,11 @@ class AggregatorConfig:
     layer_scale: float = 0.01
     token_scale: float = 1e-6
 
+    @property
+    def num_special(self) -> int:
+        """Tokens of a frame before its patches: the camera token and the registers."""
+        return 1 + self.num_registers
+
     def __post_init__(self) -> None:
         freeze_lists(self)
         require_counts(self, "depth", "num_heads", "mlp_ratio", "num_registers")

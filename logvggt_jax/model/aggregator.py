@@ -83,7 +83,7 @@ class Aggregator(ShapeCheck, nn.Module):
         """
         config, sizes = self.config, self.config.aggregator
         batch, frames, _, width = patch_tokens.shape
-        num_special = 1 + sizes.num_registers
+        num_special = sizes.num_special
         special = self._special_tokens(starts_sequence, frames, width)
         x = jnp.concatenate([special, patch_tokens.astype(jnp.float32)], axis=2)
         shape, tokens = x.shape, x.shape[2]

@@ -82,7 +82,7 @@ def _module_calls(config: ModelConfig, image_size: tuple[int, int]) -> dict[str,
         return jax.ShapeDtypeStruct(shape, jnp.float32)
 
     lengths, first = jax.ShapeDtypeStruct((1,), jnp.int32), jax.ShapeDtypeStruct((1,), bool)
-    cached = floats(1, len(config.aggregator.key_layers), 1, patches + 1 + registers, width)
+    cached = floats(1, len(config.aggregator.key_layers), 1, config.aggregator.num_special + patches, width)
     memory = CrossWindowMemory(cached, lengths, config.aggregator.key_layers)  # type: ignore[arg-type]
     camera, levels = floats(1, 1, 2 * width), [floats(1, patches, 2 * width)] * 4
     dense: dict[str, Any] = {"grid": grid, "image_size": image_size}

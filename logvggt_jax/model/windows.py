@@ -89,15 +89,15 @@ class Windows:
         config, overlap = self.config, self.overlap
         frame_mask = self._checked_group(frames, frame_mask, overlap, "start")
         batch, image_size = frames.shape[0], _image_size(frames)
-        width, registers = config.encoder.embed_dim, config.aggregator.num_registers
+        width, special = config.encoder.embed_dim, config.aggregator.num_special
         check_masks(frames, masks)
         patch_tokens = self.encode(variables, frames, masks)
-        tokens = patch_tokens.shape[2] + 1 + registers
+        tokens = special + patch_tokens.shape[2]
         key_shape = (batch, len(config.aggregator.key_layers), overlap, tokens, 2 * width)
         return WindowState(
             patch_tokens=patch_tokens,
             key_tokens=jnp.zeros(key_shape, config.dtype),
-            special_tokens=jnp.zeros((batch, overlap, 1 + registers, 2 * width), jnp.float32),
+            special_tokens=jnp.zeros((batch, overlap, special, 2 * width), jnp.float32),
             frame_mask=frame_mask,
             image_size=image_size,
             step=jnp.zeros((batch,), jnp.int32),
@@ -293,7 +293,7 @@ class Windows:
         """
         params, grid = variables["params"], self.grid(image_size)
         batch, num_levels, count = tokens.key.shape[:3]
-        patches = tokens.key[..., 1 + self.config.aggregator.num_registers :, :]
+        patches = tokens.key[..., self.config.aggregator.num_special :, :]
         levels = [patches[:, i].reshape(batch * count, *patches.shape[3:]) for i in range(num_levels)]
 
         def dense(head: DPTHead, name: str) -> jax.Array:
@@ -365,7 +365,7 @@ class Windows:
             state.key_tokens[..., half],
             jnp.where(state.step == 0, 0, state.frame_mask.sum(1)),
             self.config.aggregator.key_layers if windows.cross_window else (),
-            None if seen is None else with_special(seen, 1 + self.config.aggregator.num_registers),
+            None if seen is None else with_special(seen, self.config.aggregator.num_special),
         )
 
     def _checked_group(self, frames: jax.Array, mask: jax.Array | None, count: int, name: str) -> jax.Array:

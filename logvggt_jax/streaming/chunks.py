@@ -23,6 +23,7 @@ from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.model.parameters import in_compute_type
 from logvggt_jax.streaming.alignment import align, move, residual
 from logvggt_jax.streaming.loops import LoopCloser, LoopSettings, frame_describer, loop_settings
+from logvggt_jax.streaming.named_arrays import of_part, part_of
 from logvggt_jax.streaming.offline import FinalFrames, PlainPrediction, plain_program, predict_plain
 from logvggt_jax.streaming.program import Program
 from logvggt_jax.streaming.results import (
@@ -126,7 +127,7 @@ class ChunkChain:
         if self.joints:
             arrays["joints"] = np.array(self.joints, np.float64)
         shared = {} if self._shared is None else self._shared._asdict()
-        return arrays | {f"shared/{name}": value for name, value in shared.items() if value is not None}
+        return arrays | of_part("shared", {name: value for name, value in shared.items() if value is not None})
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Takes up what `arrays` gave."""
@@ -135,9 +136,8 @@ class ChunkChain:
             self._masks = list(arrays.get("masks", ()))
         if "joints" in arrays:
             self.joints = [(int(first), scale, apart) for first, scale, apart in arrays["joints"].tolist()]
-        if "shared/depth" in arrays:
-            found = {name: arrays.get(f"shared/{name}") for name in PlainPrediction._fields}
-            self._shared = PlainPrediction(**found)  # type: ignore[arg-type]
+        if shared := part_of(arrays, "shared"):
+            self._shared = PlainPrediction(**shared)
 
     def _next_chunk(self) -> PlainPrediction:
         chunk = self._predict(*(np.stack(arrays) for arrays in (self._images, self._masks) if arrays))
@@ -235,16 +235,15 @@ class ChunkSession:
         """See `Predictor.snapshot`: the images of the chunk to come, and what the next is aligned with."""
         if self._closed:
             return [], {}
-        final = {f"final/{name}": array for name, array in self._final.arrays().items()}
-        loops = {} if self._loops is None else self._loops.arrays()
-        return [], {**final, **self._chain.arrays(), **{f"loops/{name}": array for name, array in loops.items()}}
+        loops = {} if self._loops is None else of_part("loops", self._loops.arrays())
+        return [], {**of_part("final", self._final.arrays()), **self._chain.arrays(), **loops}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """See `Predictor.restore`."""
-        self._final.restore({name.removeprefix("final/"): x for name, x in arrays.items() if name.startswith("final/")})
+        self._final.restore(part_of(arrays, "final"))
         self._chain.restore(arrays)
         if self._loops is not None:
-            self._loops.restore({name.removeprefix("loops/"): x for name, x in arrays.items() if name[:6] == "loops/"})
+            self._loops.restore(part_of(arrays, "loops"))
         if "images" in arrays:
             self._newest = arrays["images"][-1]
             self._newest_mask = arrays["masks"][-1] if "masks" in arrays else None

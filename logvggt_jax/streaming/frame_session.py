@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -19,6 +20,7 @@ from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.model.memory import Memory, RoundMemory
 from logvggt_jax.model.padding import doubled
 from logvggt_jax.model.parameters import in_compute_type
+from logvggt_jax.model.windows import Windows
 from logvggt_jax.streaming.program import Program, abstract_variables, flops_of
 from logvggt_jax.streaming.results import (
     Cameras,
@@ -245,8 +247,7 @@ class FrameSession:
 
 def tokens_a_frame(config: ModelConfig, image_size: tuple[int, int]) -> int:
     """P: camera and register tokens, and the patches of images of (H, W) pixels."""
-    patch = config.encoder.patch_size
-    return 1 + config.aggregator.num_registers + (image_size[0] // patch) * (image_size[1] // patch)
+    return config.aggregator.num_special + math.prod(Windows(config).grid(image_size))
 
 
 def block_shape(config: ModelConfig, capacity: int) -> tuple[int, ...]:

@@ -5,18 +5,22 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from logvggt_jax.config import require_one_of, require_within
-from logvggt_jax.geometry import decode_poses
-from logvggt_jax.model.logvggt import LogVGGT, Variables
+from logvggt_jax.model.logvggt import LogVGGT, Variables, predictions_of
 from logvggt_jax.model.merging import TokenMerging, merging_of
 from logvggt_jax.model.parameters import run
-from logvggt_jax.streaming.offline import OfflineSession, OfflineSettings, PlainPrediction, plain_vggt
+from logvggt_jax.streaming.offline import (
+    OfflineSession,
+    OfflineSettings,
+    PlainPrediction,
+    of_one_sequence,
+    plain_vggt,
+)
 from logvggt_jax.streaming.program import Program, abstract_variables, flops_of
 from logvggt_jax.streaming.results import FrameResult, refuse_masks
 
@@ -89,7 +93,7 @@ def merging_for(
     return merging_of(
         num_frames,
         model.windows.grid((image_size[0], image_size[1])),
-        1 + model.config.aggregator.num_registers,
+        model.config.aggregator.num_special,
         ratio=settings.ratio,
         protected=settings.protected,
         similarity=settings.similarity,
@@ -111,10 +115,7 @@ def _predict(model: LogVGGT, variables: Variables, images: jax.Array, merging: T
     )
     out = windows.decode_dense(variables, tokens, mask, size)
     encodings = model.refinement.refine_sequence(variables, out.camera_tokens, out.register_tokens, mask)
-    extrinsics, intrinsics = decode_poses(encodings[:, :, -1], size)
-    dense: Any = (out.points, out.points_confidence)
-    arrays: Any = (out.depth, out.depth_confidence, extrinsics, intrinsics, *dense, encodings[:, :, -1])
-    return jax.tree.map(lambda x: x[0], PlainPrediction(*arrays))
+    return of_one_sequence(predictions_of(out, encodings, size))
 
 
 def merged_program(

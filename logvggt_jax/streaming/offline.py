@@ -25,6 +25,7 @@ from logvggt_jax.streaming.results import (
     checked_masks,
     device_memory,
 )
+from logvggt_jax.types import Predictions
 
 
 class PlainPrediction(NamedTuple):
@@ -80,7 +81,11 @@ def predict_plain(
 def _predict(
     model: LogVGGT, variables: Variables, images: jax.Array, masks: jax.Array | None = None
 ) -> PlainPrediction:
-    predictions = model.apply(variables, images[None], masks=None if masks is None else masks[None])
+    return of_one_sequence(model.apply(variables, images[None], masks=None if masks is None else masks[None]))
+
+
+def of_one_sequence(predictions: Predictions) -> PlainPrediction:
+    """What is handed out of the predictions of a batch of one."""
     wanted = {name: getattr(predictions, name) for name in PlainPrediction._fields}
     return jax.tree.map(lambda x: x[0], PlainPrediction(**wanted))
 

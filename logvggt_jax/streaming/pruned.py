@@ -65,7 +65,7 @@ class KeepWanted:
                 f"at least {tokens}, or {2 * tokens} for the first frame and the newest"
             )
         capacity = min(doubled(settings.first_capacity, frames) * tokens, self._most(tokens))
-        shape, special = block_shape(config, capacity), 1 + config.aggregator.num_registers
+        shape, special = block_shape(config, capacity), config.aggregator.num_special
 
         def layer() -> PrunedCache:
             if settings.bits == 4:

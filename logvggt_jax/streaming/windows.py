@@ -20,6 +20,7 @@ from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.model.parameters import in_compute_type
 from logvggt_jax.model.windows import WindowState
 from logvggt_jax.streaming.loops import LoopCloser, LoopSettings, frame_describer, loop_settings
+from logvggt_jax.streaming.named_arrays import of_part, part_of
 from logvggt_jax.streaming.offline import predict_plain
 from logvggt_jax.streaming.pose_stream import Poses, PoseStream, in_one_mode, relative_change
 from logvggt_jax.streaming.program import Program, abstract_variables, flops_of
@@ -291,10 +292,10 @@ class StreamSession:
             results = self._landed(0)
         if self._newest is None:
             return results, {}
-        arrays = {f"tokens/{name}": array for name, array in self._poses.arrays().items()}
+        arrays = of_part("tokens", self._poses.arrays())
         if self._state is not None:
             values = {field.name: getattr(self._state, field.name) for field in dataclasses.fields(self._state)}
-            arrays |= {f"state/{name}": np.asarray(value) for name, value in values.items() if value is not None}
+            arrays |= of_part("state", {name: np.asarray(x) for name, x in values.items() if x is not None})
         if self._pending:
             arrays["pending"] = np.stack([frame.image for frame in self._pending])
         if self._newest.mask is not None:
@@ -302,7 +303,7 @@ class StreamSession:
         if masks := [frame.mask for frame in self._pending if frame.mask is not None]:
             arrays["pending_masks"] = np.stack(masks)
         if self._loops is not None:
-            arrays |= {f"loops/{name}": array for name, array in self._loops.arrays().items()}
+            arrays |= of_part("loops", self._loops.arrays())
         return results, {
             **arrays,
             "newest": self._newest.image,
@@ -322,12 +323,10 @@ class StreamSession:
         self._received, self._handed_out = (int(count) for count in arrays["counts"])
         self._arrivals = deque([None] * (self._received - self._handed_out))
         self._final, self._overlap = Rows(arrays["final"]), Rows(arrays["overlap"])
-        self._poses.restore(
-            {name.removeprefix("tokens/"): x for name, x in arrays.items() if name.startswith("tokens/")}
-        )
+        self._poses.restore(part_of(arrays, "tokens"))
         if self._loops is not None:
-            self._loops.restore({name.removeprefix("loops/"): x for name, x in arrays.items() if name[:6] == "loops/"})
-        if fields := {name.removeprefix("state/"): x for name, x in arrays.items() if name.startswith("state/")}:
+            self._loops.restore(part_of(arrays, "loops"))
+        if fields := part_of(arrays, "state"):
             del fields["image_size"]
             self._state = WindowState(
                 image_size=self._image_size, **{name: jnp.asarray(array) for name, array in fields.items()}
