@@ -1156,6 +1156,10 @@ def test_packets_that_a_transport_stream_lost_are_told(tmp_path: Path) -> None:
     path.write_bytes(content[:place] + content[place + 188 :])
     source = open_source(path)
     list(source)
+    # Where recordings are joined packets are counted anew, and none is lost.
+    path.write_bytes(content * 2)
+    joined = open_source(path)
+    assert len(list(joined)) == 80 and joined.notes == []
     told = re.compile(r"lacks frames before frame-0000\d\d, .* or part of these")
     assert [note for note in source.notes if told.search(note)]
 
@@ -1188,6 +1192,7 @@ def test_a_pause_that_the_file_states_is_none(tmp_path: Path) -> None:
     [
         (range(40), []),
         ([*range(20), *range(35, 55)], [(19, 16.0)]),
+        ([*range(20), *range(10**9, 10**9 + 20)], []),
         # Too few to be even; as many long steps as short ones; frames of a screen on which something moves at times.
         ([*range(5), *range(35, 40)], []),
         ([2.9 * n + (n % 2) for n in range(40)], []),

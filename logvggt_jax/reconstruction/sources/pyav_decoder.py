@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections import deque
 from collections.abc import Iterator
 from functools import partial
 
@@ -52,6 +53,8 @@ _EMPTY_PACKET = 8
 _EASILY_PLEASED = ("mjpeg",)
 # Codecs of which a packet is a picture as a camera writes it, and gives its frame at once.
 _OF_CAMERAS = ("mjpeg",)
+# The packet that is said to be incomplete is the last before the gap, or the one before that.
+_AHEAD = 2
 # Packets within which a stream that shows its frames in another order than it holds them does so.
 _MOST_UNTIL_REORDERED = 48
 
@@ -207,7 +210,7 @@ class PyAVDecoder:
         numbers = FrameNumbers(stream.codec_context.extradata or b"") if is_h264 else None
         after_loss: set[int | None] = set()  # time stamps of frames before which some are missing
         each = False  # whether every packet is known to show a frame of its own
-        for packet in self._packets(container, stream):
+        for packet, before_key in self._before_what(container, stream):
             if isinstance(packet, CodecChange):
                 yield packet, None
                 return
@@ -227,8 +230,8 @@ class PyAVDecoder:
             holds_frame = packet.size > (0 if self._numbered_as_stored else _EMPTY_PACKET)
             if holds_frame and packet.pts is not None and not packet.is_discard:
                 missing.expect(packet.pts)
-            # Television's packets are counted.
-            lossy = packet.is_corrupt
+            # Television's packets are counted; where recordings are joined the count begins anew, with a key frame.
+            lossy = packet.is_corrupt and not before_key
             if numbers is not None and packet.size:
                 lossy = numbers.follows_loss(bytes(packet), packet.is_keyframe) or lossy
             if lossy:
@@ -290,6 +293,18 @@ class PyAVDecoder:
                         return True
                     shown = stamp
         return False
+
+    def _before_what(
+        self, container: av.container.InputContainer, stream: av.video.stream.VideoStream
+    ) -> Iterator[tuple[av.Packet | str | CodecChange, bool]]:
+        """Packets, and whether one of the next two has a key frame; a network's are not waited for."""
+        following: deque[av.Packet | str | CodecChange] = deque()
+        for packet in self._packets(container, stream):
+            following.append(packet)
+            if len(following) > _AHEAD or self._timeout is not None:
+                yield following.popleft(), any(isinstance(each, av.Packet) and each.is_keyframe for each in following)
+        while following:
+            yield following.popleft(), False
 
     def _packets(
         self, container: av.container.InputContainer, stream: av.video.stream.VideoStream
