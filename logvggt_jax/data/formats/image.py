@@ -17,7 +17,7 @@ import numpy as np
 
 from logvggt_jax.data.errors import BrokenPicture, missing_file
 from logvggt_jax.data.formats.file_kinds import SIGNATURE_BYTES, kind_of
-from logvggt_jax.data.formats.jpeg import JPEG_START, decode_jpeg, ends_flat
+from logvggt_jax.data.formats.jpeg import JPEG_START, LOST, decode_jpeg, ends_flat
 from logvggt_jax.errors import InputError, one_line
 
 PNG_START = b"\x89PNG\r\n\x1a\n"
@@ -164,6 +164,7 @@ def _jpeg_is_regular(data: bytes) -> bool:
     """Whether the segments up to the end-of-image marker are all there and nothing else (ITU T.81, annex B).
 
     A progressive picture counts as irregular: without its last scans it is coarse throughout, and ends like any other.
+    So does one of which a part may be lost.
     """
     position = len(JPEG_START)
     while position + 2 <= len(data):
@@ -182,7 +183,7 @@ def _jpeg_is_regular(data: bytes) -> bool:
         position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
         if kind == _JPEG_SCAN:
             marker = _JPEG_MARKER.search(data, position)
-            if marker is None:
+            if marker is None or data.find(LOST, position, marker.start()) >= 0:
                 return False
             position = marker.start()
     return False

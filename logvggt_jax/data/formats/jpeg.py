@@ -17,6 +17,10 @@ _SCAN = b"\xff\xda"
 # pixels than the zeros that libjpeg assumes; where none is missing nobody looks at them.
 _OTHER_BITS = b"".join(b"\x5a\xa5\x33\xcc" * 4 + bytes((0xFF, 0xD0 + number % 8)) for number in range(16))
 _MOST_ZEROS = 16
+# What disks and networks leave of a lost part. As coded pixels it stands for 84 blocks of one colour or more, half of
+# which may lie in the next row, or for noise that no picture has.
+LOST = bytes(64)
+_PLAIN = 32
 
 
 class _Pixels(JpegImagePlugin.JpegImageFile):
@@ -48,6 +52,9 @@ def decode_jpeg(data: bytes) -> Image.Image:
             raise
         return picture
     progressive = "progressive" in picture.info
+    scan = first_scan(data)
+    if not progressive and LOST in data[scan : data.find(_END, scan)] and not _has_plain_area(picture):
+        raise OSError("part of the picture is zeros")
     if progressive or ends_flat(np.asarray(picture.crop(_last_unit(picture.size)))):
         end = data.rfind(_END)
         if (progressive and _lacks_scans(data[:end], picture)) or _asks_for_more(data[:end], data[end:], picture):
@@ -91,15 +98,30 @@ def _lacks_scans(data: bytes, picture: Image.Image) -> bool:
     return len(complete) < 64 * len(picture.getbands())
 
 
+def _has_plain_area(picture: Image.Image) -> bool:
+    """Whether many blocks of 8 x 8 pixels in a row are of one and the same colour."""
+    pixels = np.asarray(picture)
+    height, width = (length // 8 for length in pixels.shape[:2])
+    blocks = pixels[: 8 * height, : 8 * width].reshape(height, 8, width, 8, -1)
+    colours = blocks.min((1, 3))
+    plain = (blocks.max((1, 3)) == colours).all(-1)
+    same = plain[:, 1:] & plain[:, :-1] & (colours[:, 1:] == colours[:, :-1]).all(-1)
+    run = longest = np.zeros(height, np.int64)
+    for column in same.T:
+        run = (run + 1) * column
+        longest = np.maximum(longest, run)
+    return bool((longest + 1 >= min(_PLAIN, width // 2)).any())
+
+
 def _asks_for_more(content: bytes, tail: bytes, picture: Image.Image) -> bool:
     """Whether other bits between the `content` and `tail` of a file make another picture: it lacks pixels there."""
     return picture.tobytes() != _decode(content + _OTHER_BITS + (tail or _END)).tobytes()
 
 
 def _last_unit(size: tuple[int, int]) -> tuple[int, int, int, int]:
-    """Left, top, right and bottom of the last coded unit of a picture of (W, H).
+    """Left, top, right and bottom of what surely is of the last coded unit of a picture of (W, H).
 
-    Of its up to 16 x 16 pixels those that are smoothed with other units' are left out.
+    Units are of 8 x 8 pixels or more; those that are smoothed with other units' are left out.
     """
-    left, top = (length - max(1, (length - 1) % 16 - 1) for length in size)
+    left, top = (length - max(1, (length - 1) % 8 - 1) for length in size)
     return left, top, *size

@@ -176,6 +176,29 @@ def test_a_jpeg_with_its_end_is_refused_where_pixels_are_missing(
         read_rgb(path)
 
 
+@pytest.mark.parametrize("subsampling", [0, 2])
+@pytest.mark.parametrize("place", [0.2, 0.5, 0.8])
+def test_a_jpeg_of_which_a_part_is_zeros_is_refused(tmp_path: Path, place: float, subsampling: int):
+    """Where the decoder finds its way again the end of the picture tells nothing."""
+    path = tmp_path / "lost.jpg"
+    Image.fromarray(np.tile(PICTURE, (4, 4, 1))).save(path, quality=95, subsampling=subsampling)
+    data = bytearray(path.read_bytes())
+    start = data.index(b"\xff\xda")
+    begin = start + int(place * (len(data) - start))
+    data[begin : begin + 512] = bytes(512)
+    path.write_bytes(data)
+    with pytest.raises(ValueError, match=r"lost\.jpg.*fetch it again"):
+        read_rgb(path)
+
+
+def test_a_jpeg_with_a_large_area_of_one_colour_is_whole(tmp_path: Path):
+    flat = np.full((320, 480, 3), 200, np.uint8)
+    flat[:8, -8:] = 0
+    Image.fromarray(flat).save(tmp_path / "a.jpg", quality=95, optimize=True)
+    assert bytes(64) in (tmp_path / "a.jpg").read_bytes()
+    assert (read_rgb(tmp_path / "a.jpg")[0, 0] == 200).all()
+
+
 @pytest.mark.parametrize("progressive", [False, True])
 def test_a_jpeg_whose_corner_is_of_one_colour_is_whole(tmp_path: Path, progressive: bool):
     flat = PICTURE.copy()
