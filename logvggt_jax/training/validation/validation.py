@@ -134,8 +134,13 @@ def clip_starts(name: str, dataset: Dataset, config: ValidationConfig) -> list[t
     # Starts that a sequence has room for.
     room = {sequence: dataset.num_frames(sequence) - span + 1 for sequence in dataset.sequences}
     sequences = [sequence for sequence in dataset.sequences if room[sequence] > 0][: config.num_clips]
-    counts = {each: len(range(i, config.num_clips, len(sequences))) for i, each in enumerate(sequences)}
-    if not sequences or any(counts[each] > room[each] for each in sequences):
+    counts, left = dict.fromkeys(sequences, 0), config.num_clips
+    # Dealt out in turn; what has no room left is passed over.
+    while takers := [each for each in sequences if counts[each] < room[each]][:left]:
+        for each in takers:
+            counts[each] += 1
+        left -= len(takers)
+    if left:
         raise InputError(
             f"validation: data set {name!r} has {len(sequences)} sequences of at least {span} frames, "
             f"num_clips={config.num_clips} needs more or longer ones, {longest(dataset)}; lower num_clips, clip_length "

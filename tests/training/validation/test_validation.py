@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -163,3 +164,12 @@ def test_one_sequence_gives_clips_from_several_places() -> None:
         np.testing.assert_array_equal(clip.extrinsics, rooms.read(name, range(start, start + 5, 2)).extrinsics)
     with pytest.raises(InputError, match="has 2 sequences of at least 5 frames, num_clips=9 needs more or longer"):
         module._read_clips("rooms", rooms, dataclasses.replace(config, num_clips=9))
+
+
+def test_a_short_sequence_gives_what_it_has_room_for_and_long_ones_the_rest() -> None:
+    frames = {"short": 6, "too short": 4, "long": 30}
+    recordings: Any = SimpleNamespace(sequences=list(frames), num_frames=frames.get)
+    source = SourceConfig("tum_recording", "mine", "all")
+    config = ValidationConfig((source,), every=1, num_clips=8, clip_length=3, stride=2, size=(28, 42))
+    found = module.clip_starts("tum_recording", recordings, config)
+    assert found == [("short", 0), ("short", 1), *(("long", start) for start in (0, 5, 10, 15, 20, 25))]
