@@ -86,6 +86,7 @@ class Watchdog:
         self._allow(max(self._least, self._factor * median), f"no step has ended {since}(the median is {median:.3g} s)")
 
     def _allow(self, seconds: float, reason: str) -> None:
+        seconds = min(seconds, threading.TIMEOUT_MAX - _GRACE)  # three centuries
         with self._changed:
             self._deadline = time.monotonic() + seconds
             self._reason = f"for {seconds:.0f} s {reason}"

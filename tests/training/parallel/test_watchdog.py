@@ -29,6 +29,7 @@ RUNS = {
     # sleep() of a library that is called with the interpreter's lock held.
     "library": ("import ctypes; ctypes.PyDLL(None).sleep(50)", {}),
     "no factor": ("time.sleep(2)", {"factor": 0, "other": 0.1}),
+    "longer than a timer counts": ("time.sleep(0.1)", {"factor": "float('inf')"}),
 }
 
 
@@ -76,3 +77,7 @@ def test_a_library_that_holds_the_interpreter_is_ended_too(finished: Finished) -
 
 def test_without_a_factor_nothing_is_watched(finished: Finished) -> None:
     assert finished["no factor"].returncode == 0 and finished["no factor"].stdout == "the end\n"
+
+
+def test_a_factor_may_be_as_large_as_one_likes(finished: Finished) -> None:
+    assert finished["longer than a timer counts"].stdout == "the end\n", finished["longer than a timer counts"].stderr
