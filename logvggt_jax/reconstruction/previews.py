@@ -24,9 +24,9 @@ _RANGE_FRAMES, _RANGE_PIXELS = 32, 4096
 
 def write_previews(result: Reconstruction, frames: Sequence[int], pool: FramePool) -> None:
     """Has the pool write a preview of each of these frames into the result's folder."""
-    (result.folder / PREVIEW_FOLDER).mkdir(exist_ok=True)
     if not frames:
         return
+    (result.folder / PREVIEW_FOLDER).mkdir(exist_ok=True)
     near, far = depth_range(result)
 
     def write(index: int) -> None:

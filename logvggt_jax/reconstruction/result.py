@@ -195,12 +195,13 @@ class Reconstruction:
         """One line a result, with its place; for people, so that a name's control characters are shown as escapes."""
         height, width = self.depth_size
         scaled = f"; times depth_scale of {CAMERAS_FILE}" if (self.depth_scale != 1).any() else ""
+        has_previews = (self.folder / PREVIEW_FOLDER).is_dir()
         lines = [
             (CAMERAS_FILE, f"intrinsics and world-to-camera extrinsics of {self.num_frames} frames"),
             (TRAJECTORY_FILE, "camera-to-world trajectory, TUM format"),
             (f"{DEPTH_FOLDER}/*.npz", f"depth and confidence, {height} x {width}, float16{scaled}"),
             (f"{IMAGE_FOLDER}/*.jpg", "the frames at that size"),
-            (f"{PREVIEW_FOLDER}/*.png", "some images beside their depth"),
+            *([(f"{PREVIEW_FOLDER}/*.png", "some images beside their depth")] if has_previews else []),
             (POINTS_FILE, f"{self.num_points:,} coloured points"),
         ]
         took = ""

@@ -33,6 +33,16 @@ def test_all_previews_of_a_sequence_are_on_one_scale(tmp_path: Path) -> None:
         np.testing.assert_array_equal(shown, depth_picture(result.depth(index), near=near, far=far))
 
 
+def test_a_result_without_previews_has_no_folder_of_them_and_says_nothing_of_it(tmp_path: Path) -> None:
+    write_result(tmp_path, 2)
+    result = Reconstruction.open(tmp_path)
+    for frames in ([], [1]):
+        with FramePool(1) as pool:
+            write_previews(result, frames, pool)
+            pool.finish()
+        assert (tmp_path / "previews").exists() == ("previews/*.png" in result.summary()) == bool(frames)
+
+
 def test_the_bar_runs_from_far_to_near_and_is_labelled() -> None:
     picture = preview(np.zeros((60, 600, 3), np.uint8), np.full((60, 600), 2.0), 1.0, 4.0, "m")
     assert picture.shape[0] == 60  # wide enough as it is
