@@ -15,7 +15,6 @@ most that are kept between two frames for those to come, over the sequence's fra
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
 import statistics
 from pathlib import Path
@@ -26,7 +25,7 @@ from rich.console import Console
 from rich.table import Table
 from subject import add_options, subject
 
-from logvggt_jax.evaluation.costs.streams import cost_of_length, random_pictures
+from logvggt_jax.evaluation.costs.streams import cost_of_length, random_pictures, unlimited_settings
 from logvggt_jax.evaluation.environment import describe_device
 from logvggt_jax.evaluation.methods.method import Checkpoint, model_row
 from logvggt_jax.model.parameters import in_compute_type
@@ -38,9 +37,7 @@ def measure(checkpoint: Checkpoint, options: argparse.Namespace) -> list[dict[st
     pictures, rows = random_pictures(options.image_size), []
     for length in sorted(options.lengths):
         for method in options.methods:
-            settings = METHODS[method].settings()
-            if getattr(settings, "max_frames", None) is not None:
-                settings = dataclasses.replace(settings, max_frames=None)
+            settings = unlimited_settings(method)
             cost = cost_of_length(model_row(method, checkpoint, settings), pictures, length, options.rounds)
             program = METHODS[method].program(checkpoint.model, options.image_size, settings, length)
             rows.append({"method": method, "frames": length, "flops": program.flops / program.frames, **cost})

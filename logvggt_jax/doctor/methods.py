@@ -13,7 +13,7 @@ import numpy as np
 
 from logvggt_jax.doctor.finding import Finding
 from logvggt_jax.doctor.subject import Subject, random_variables
-from logvggt_jax.evaluation.costs.streams import random_pictures, time_stream
+from logvggt_jax.evaluation.costs.streams import random_pictures, time_stream, unlimited_settings
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.model.parameters import in_compute_type
 from logvggt_jax.streaming import (
@@ -97,9 +97,7 @@ def _streamed(method: str, subject: Subject, variables: Any, pictures: np.ndarra
 
 def _in_batches(method: str, subject: Subject, variables: Any, pictures: np.ndarray) -> Iterator[Finding]:
     lengths = (6,) if subject.tiny else (100,) if subject.quick else (100, 200)
-    settings = METHODS[method].settings()
-    if getattr(settings, "max_frames", None) is not None:
-        settings = dataclasses.replace(settings, max_frames=None)
+    settings = unlimited_settings(method)
     for count in lengths:
 
         def run(count: int = count) -> float:

@@ -22,7 +22,7 @@ from logvggt_jax.evaluation.methods.method import Method
 from logvggt_jax.evaluation.progress import progress_display
 from logvggt_jax.evaluation.records import plain, record_key
 from logvggt_jax.files import open_regular, write_text
-from logvggt_jax.streaming import PredictionError, Predictor
+from logvggt_jax.streaming import METHODS, PredictionError, Predictor
 
 TIMINGS_FILE = "timings.json"
 # Distinct pictures; a sequence shows them in turn.
@@ -60,6 +60,14 @@ class StreamTime:
 def random_pictures(image_size: tuple[int, int]) -> np.ndarray:
     """[16, H, W, 3] uint8."""
     return np.random.default_rng(0).integers(0, 256, (NUM_PICTURES, *image_size, 3), np.uint8)
+
+
+def unlimited_settings(method: str) -> Any:
+    """The defaults of a method, by its name, but that a sequence may have any number of frames."""
+    settings = METHODS[method].settings()
+    if getattr(settings, "max_frames", None) is None:
+        return settings
+    return dataclasses.replace(settings, max_frames=None)
 
 
 def time_stream(predictor: Predictor, pictures: np.ndarray, num_frames: int, *, watch: bool = False) -> StreamTime:

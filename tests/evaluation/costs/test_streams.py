@@ -12,10 +12,16 @@ import numpy as np
 import pytest
 
 from logvggt_jax.evaluation.costs import streams
-from logvggt_jax.evaluation.costs.streams import TimingConfig, cost_of_length, median_rate, random_pictures
+from logvggt_jax.evaluation.costs.streams import (
+    TimingConfig,
+    cost_of_length,
+    median_rate,
+    random_pictures,
+    unlimited_settings,
+)
 from logvggt_jax.evaluation.costs.throughput import measured_costs
 from logvggt_jax.evaluation.methods.method import Method
-from logvggt_jax.streaming import PredictionError
+from logvggt_jax.streaming import CausalSettings, MergedSettings, PredictionError
 
 
 class Keeper:
@@ -58,6 +64,11 @@ def test_a_cost_has_rates_and_the_most_that_was_kept() -> None:
     assert cost_of_length(row("a"), PICTURES, 2, rounds=1)["state_bytes"] == 20
     assert cost_of_length(row("a"), PICTURES, 7, rounds=1) == {"reason": "too long"}
     assert median_rate({"reason": "too long"}) is None
+
+
+def test_a_method_is_timed_on_any_number_of_frames() -> None:
+    assert unlimited_settings("merged") == MergedSettings(max_frames=None) != MergedSettings()
+    assert unlimited_settings("causal") == CausalSettings()
 
 
 def test_programs_made_after_the_first_run_are_counted() -> None:
