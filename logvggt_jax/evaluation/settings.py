@@ -36,6 +36,11 @@ class Run:
                     raise InputError(f"{type(self).__name__}.{field}: unknown {name!r}; known are {', '.join(known)}")
         for name in self.settings:
             self.settings_of(name)
+        if not (self.methods or self.variants or self.baselines):
+            raise InputError(
+                f"{type(self).__name__}.methods names none, nor does variants, and there are no baselines: name one, "
+                "or set baselines=True"
+            )
 
     def settings_of(self, method: str) -> Any:
         """Settings of a method, of its own settings class; None where the run says nothing of it."""

@@ -68,6 +68,15 @@ def test_wrong_settings_of_the_papers_run_are_named(field: str, value: Any, mess
         read_run({**PAPER_RUN, field: value})
 
 
+@pytest.mark.parametrize("run", [CLIP_RUN, PAPER_RUN])
+def test_a_run_of_no_rows_is_refused(run: dict[str, Any]) -> None:
+    nothing = {**run, "methods": (), "variants": (), "baselines": False}
+    with pytest.raises(InputError, match=r"^config\.methods names none, .*: name one, or set baselines=True$"):
+        read_run(nothing)
+    for rows in ({"methods": ["windows"]}, {"variants": ["full"]}, {"baselines": True}):
+        read_run({**nothing, **rows})
+
+
 def test_settings_of_a_method_are_of_its_own_class() -> None:
     found = read_run({**CLIP_RUN, "methods": ["chunks", "windows"], "settings": {"chunks": {"size": 6, "overlap": 3}}})
     assert found.settings_of("chunks") == ChunkPlan(6, 3) and found.settings_of("windows") is None
