@@ -294,6 +294,9 @@ def _check_step(
     after, metrics, _ = traced.out_info
     assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(lambda x: (x.shape, x.dtype), state)
     assert all(value.shape == () for value in metrics.values())
+    # Tables of positions and of interpolation are made by the program, of a row or column each: as constants, those of
+    # one size were 250 MB of its text.
+    assert max(map(len, program.splitlines())) < 300_000
     # Layers and windows are loops, so that a kernel is in the program a few times and runs many: attention of a frame
     # and of a window with its cache at least.
     assert program.count(backward) >= 2 and program.count(forward) >= 2

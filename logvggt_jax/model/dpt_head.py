@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import flax.linen as nn
 import jax
@@ -128,14 +129,11 @@ def _interpolation(source: int, target: int) -> tuple[np.ndarray, np.ndarray, np
     return lower, np.minimum(lower + 1, source - 1), (positions - lower).astype(np.float32)
 
 
-def _interpolation_matrix(source: int, target: int) -> np.ndarray:
-    """[target, source] weights of `_interpolation`."""
-    lower, upper, share = _interpolation(source, target)
-    matrix = np.zeros((target, source), np.float32)
-    rows = np.arange(target)
-    matrix[rows, lower] = 1.0 - share
-    matrix[rows, upper] += share
-    return matrix
+def _interpolation_matrix(source: int, target: int, dtype: Any) -> jax.Array:
+    """[target, source] weights of `_interpolation`. The program holds a number a row and makes the matrix by itself."""
+    lower, upper, share = (jnp.asarray(each)[:, None] for each in _interpolation(source, target))
+    column = jnp.arange(source)
+    return (jnp.where(column == lower, 1.0 - share, 0.0) + jnp.where(column == upper, share, 0.0)).astype(dtype)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(1,))
@@ -162,8 +160,8 @@ def _from_neighbours(x: jax.Array, size: tuple[int, int]) -> jax.Array:
 
 
 def _by_products(x: jax.Array, size: tuple[int, int]) -> jax.Array:
-    rows = jnp.asarray(_interpolation_matrix(x.shape[1], size[0]), x.dtype)
-    columns = jnp.asarray(_interpolation_matrix(x.shape[2], size[1]), x.dtype)
+    rows = _interpolation_matrix(x.shape[1], size[0], x.dtype)
+    columns = _interpolation_matrix(x.shape[2], size[1], x.dtype)
     precision = product_precision(x.dtype)
     x = jnp.einsum("yh,nhwc->nywc", rows, x, precision=precision)
     return jnp.einsum("xw,nywc->nyxc", columns, x, precision=precision)
