@@ -26,7 +26,10 @@ from logvggt_jax.streaming import (
     frame_session,
     open_predictor,
 )
+from logvggt_jax.streaming.anchored_window import KeepWindow
+from logvggt_jax.streaming.causal import KeepAll
 from logvggt_jax.streaming.frame_session import FrameSession
+from logvggt_jax.streaming.pruned import KeepWanted
 from logvggt_jax.streaming.rolling import KeepWithinBudget
 from logvggt_jax.streaming.state_file import save_stream
 
@@ -227,6 +230,24 @@ def test_bytes_of_a_pruned_state(small_config: ModelConfig, small_variables: dic
             found.append(stream.state_bytes)
         full = [bytes_ - camera * n for n, bytes_ in enumerate(found, 1)][3:]
         assert full == [expected + 3 * registers] * len(full)
+
+
+@pytest.mark.parametrize(
+    ("keeping", "megabytes"),
+    [
+        (KeepAll(CausalSettings(first_capacity=1), 4), 102),
+        (KeepWindow(5), 6 * 102),
+        (KeepWithinBudget(RollingSettings(first_capacity=10**6), 4), 2 * 4_915 + 102),
+        (KeepWanted(PrunedSettings(bits=16), 4), 205),
+        (KeepWanted(PrunedSettings(), 4), 61),
+    ],
+)
+def test_megabytes_at_the_size_of_vggt_1b(keeping: Any, megabytes: int) -> None:
+    """Of all layers at 392 x 518 pixels in bfloat16, as published sizes and docs/methods.md have them; a budget with
+    the room that it may need, and a frame."""
+    blocks = jax.eval_shape(lambda: keeping.start(ModelConfig(dtype="bfloat16"), 1041).blocks)
+    bytes_ = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(blocks) if leaf.ndim > 1)
+    assert round(bytes_ / 1e6) == pytest.approx(megabytes, abs=2)
 
 
 def test_one_program_serves_all_frames(small_config: ModelConfig, small_variables: dict) -> None:
