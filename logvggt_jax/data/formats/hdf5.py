@@ -27,7 +27,8 @@ def read_hdf5(
         check_regular(path)
     try:
         with h5py.File(path if content is None else io.BytesIO(content), "r") as file:
-            names = list(file)
+            # Damaged ones come as bytes.
+            names = [name if isinstance(name, str) else name.decode(errors="replace") for name in file]
             array = file[dataset][()] if isinstance(file.get(dataset), h5py.Dataset) else None
     except (OSError, RuntimeError) as error:
         reason = str(error).partition("\n")[0]

@@ -72,6 +72,11 @@ def test_other_types_and_a_missing_package_are_named(tmp_path: Path, monkeypatch
     write_disparity(path, np.array([[b"a"]]))
     with pytest.raises(ValueError, match=r"words\.h5: expected numbers of shape any x 1.*S1"):
         read_hdf5(path, "disparity", shape=(None, 1))
+    content = path.read_bytes()
+    assert content.count(b"disparity") == 1
+    path.write_bytes(content.replace(b"disparity", b"di\xffparity"))
+    with pytest.raises(ValueError, match=r"words\.h5: no array 'disparity', only di�parity"):
+        read_hdf5(path, "disparity", shape=(None, 1))
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(ImportError, match=r"logvggt-jax\[data\]"):
         read_hdf5(path, "disparity", shape=(None, 1))
