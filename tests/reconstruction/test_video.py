@@ -1193,6 +1193,8 @@ def test_a_pause_that_the_file_states_is_none(tmp_path: Path) -> None:
         (range(40), []),
         ([*range(20), *range(35, 55)], [(19, 16.0)]),
         ([*range(20), *range(10**9, 10**9 + 20)], []),
+        # A phone that drops ten of 60 frames a second now and then.
+        (np.delete(np.arange(600) / 60, [*range(99, 109), *range(400, 410)]), []),
         # Too few to be even; as many long steps as short ones; frames of a screen on which something moves at times.
         ([*range(5), *range(35, 40)], []),
         ([2.9 * n + (n % 2) for n in range(40)], []),

@@ -12,8 +12,8 @@ _FEWEST = 12
 # that are of these.
 _UNEVEN, _LONG = 0.5, 2.5
 _LEAST_EVEN, _MOST_LONG = 0.8, 0.05
-# Seconds from which on a time is damaged.
-_DAY = 86400.0
+# Seconds for which phones drop frames now and then, and from which on a time is damaged.
+_SHORTEST, _DAY = 0.5, 86400.0
 # The length of a step, as a share, for which a file has to say itself that the frame before is shown.
 _STATED = 0.9
 
@@ -39,7 +39,8 @@ class Pauses:
         steps = np.diff(np.array(self._seconds))
         middle = float(np.median(steps))
         even = np.abs(steps - middle) <= _UNEVEN * middle
-        long = (steps > _LONG * middle) & (steps < _DAY) & (np.array(self._lasts)[:-1] < _STATED * steps)
+        stated = np.array(self._lasts)[:-1] >= _STATED * steps
+        long = (steps > max(_LONG * middle, _SHORTEST)) & (steps < _DAY) & ~stated
         if even.mean() < _LEAST_EVEN or long.sum() > max(1, _MOST_LONG * len(steps)):
             return []
         return [(int(place), float(steps[place])) for place in np.flatnonzero(long)]
