@@ -1037,7 +1037,7 @@ def test_a_beginning_that_an_edit_list_leaves_out_is_not_missing(tmp_path: Path,
     assert abs(shown[0].image.mean() - 40 - 8 * frames) < 6
 
 
-@pytest.mark.parametrize(("suffix", "count"), [("mp4", "2"), ("flv", "several")])
+@pytest.mark.parametrize(("suffix", "count"), [("mp4", "2"), ("flv", "several"), ("asf", "several")])
 def test_files_that_were_appended_are_told(tmp_path: Path, library: str, suffix: str, count: str) -> None:
     one = write(tmp_path / f"one.{suffix}", [grey(i) for i in range(4)])
     path = tmp_path / f"both.{suffix}"

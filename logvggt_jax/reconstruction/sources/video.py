@@ -15,8 +15,8 @@ import numpy as np
 
 from logvggt_jax.errors import InputError, disk_errors
 from logvggt_jax.frames import same_proportions
+from logvggt_jax.reconstruction.sources.appended_files import another_follows
 from logvggt_jax.reconstruction.sources.decoding import CodecChange, Damage, Picture, VideoDecoder, VideoHeader
-from logvggt_jax.reconstruction.sources.flv_tags import another_follows
 from logvggt_jax.reconstruction.sources.gif_blocks import breaks_off
 from logvggt_jax.reconstruction.sources.listing import some
 from logvggt_jax.reconstruction.sources.masks import Masked, Masks
