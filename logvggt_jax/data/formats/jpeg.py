@@ -53,11 +53,13 @@ def decode_jpeg(data: bytes) -> Image.Image:
         return picture
     progressive = "progressive" in picture.info
     scan = first_scan(data)
-    if not progressive and LOST in data[scan : data.find(_END, scan)] and not _has_plain_area(picture):
+    if LOST in data[scan : data.find(_END, scan)] and (
+        _lacks_scans(data, picture) if progressive else not _has_plain_area(picture)
+    ):
         raise OSError("part of the picture is zeros")
     if progressive or ends_flat(np.asarray(picture.crop(_last_unit(picture.size)))):
         end = data.rfind(_END)
-        if (progressive and _lacks_scans(data[:end], picture)) or _asks_for_more(data[:end], data[end:], picture):
+        if _asks_for_more(data[:end], data[end:], picture):
             raise OSError("part of the picture is missing")
     return picture
 

@@ -176,6 +176,14 @@ def test_a_jpeg_with_its_end_is_refused_where_pixels_are_missing(
         read_rgb(path)
 
 
+def test_a_jpeg_that_was_written_with_fewer_scans_is_whole(tmp_path: Path):
+    """Servers leave the last ones out to save bytes: it is coarser, and nothing is missing."""
+    path = tmp_path / "a.jpg"
+    data = jpeg(path, progressive=True)
+    path.write_bytes(data[: data.rindex(b"\xff\xda")] + b"\xff\xd9")
+    assert np.abs(read_rgb(path).astype(int) - cv2.GaussianBlur(PICTURE, (0, 0), 3)).mean() < 4
+
+
 @pytest.mark.parametrize("subsampling", [0, 2])
 @pytest.mark.parametrize("place", [0.2, 0.5, 0.8])
 def test_a_jpeg_of_which_a_part_is_zeros_is_refused(tmp_path: Path, place: float, subsampling: int):
