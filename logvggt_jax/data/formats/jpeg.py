@@ -17,9 +17,10 @@ _SCAN = b"\xff\xda"
 # pixels than the zeros that libjpeg assumes; where none is missing nobody looks at them.
 _OTHER_BITS = b"".join(b"\x5a\xa5\x33\xcc" * 4 + bytes((0xFF, 0xD0 + number % 8)) for number in range(16))
 _MOST_ZEROS = 16
-# What disks and networks leave of a lost part. As coded pixels it stands for 84 blocks of one colour or more, half of
-# which may lie in the next row, or for noise that no picture has.
-LOST = bytes(64)
+# What disks and networks leave of a lost part. As coded pixels it stands for some 300 blocks of one colour, for a third
+# as many beside each other where colours are coded as well, half of which may lie in the next row; or for noise that no
+# picture has.
+LOST = bytes(256)
 _PLAIN = 32
 
 
@@ -51,13 +52,10 @@ def decode_jpeg(data: bytes) -> Image.Image:
         if _lacks_scans(content, picture) or _asks_for_more(content, b"", picture):
             raise
         return picture
-    progressive = "progressive" in picture.info
     scan = first_scan(data)
-    if LOST in data[scan : data.find(_END, scan)] and (
-        _lacks_scans(data, picture) if progressive else not _has_plain_area(picture)
-    ):
+    if LOST in data[scan : data.find(_END, scan)] and not _has_plain_area(picture):
         raise OSError("part of the picture is zeros")
-    if progressive or ends_flat(np.asarray(picture.crop(_last_unit(picture.size)))):
+    if "progressive" in picture.info or ends_flat(np.asarray(picture.crop(_last_unit(picture.size)))):
         end = data.rfind(_END)
         if _asks_for_more(data[:end], data[end:], picture):
             raise OSError("part of the picture is missing")

@@ -168,7 +168,9 @@ def test_a_jpeg_with_its_end_is_refused_where_pixels_are_missing(
     tmp_path: Path, keep: float, lost: int, progressive: bool
 ):
     path = tmp_path / "cut.jpg"
-    data = jpeg(path, progressive=progressive)
+    picture = np.tile(cv2.GaussianBlur(PICTURE, (0, 0), 3), (3, 3, 1))
+    Image.fromarray(picture).save(path, quality=95, progressive=progressive)
+    data = path.read_bytes()
     start, end = data.index(b"\xff\xda"), len(data) - 2
     cut = start + int(keep * (end - start))
     path.write_bytes(data[:cut] + bytes(lost * (end - cut)) + data[end:])
@@ -203,7 +205,7 @@ def test_a_jpeg_with_a_large_area_of_one_colour_is_whole(tmp_path: Path):
     flat = np.full((320, 480, 3), 200, np.uint8)
     flat[:8, -8:] = 0
     Image.fromarray(flat).save(tmp_path / "a.jpg", quality=95, optimize=True)
-    assert bytes(64) in (tmp_path / "a.jpg").read_bytes()
+    assert bytes(256) in (tmp_path / "a.jpg").read_bytes()
     assert (read_rgb(tmp_path / "a.jpg")[0, 0] == 200).all()
 
 
