@@ -1,6 +1,7 @@
 """The files under `configs/`: each builds its run, and the largest one's whole step is checked on shapes."""
 
 import dataclasses
+import functools
 import importlib
 import math
 import operator
@@ -13,6 +14,7 @@ from typing import Any
 
 import jax
 import pytest
+from ml_collections import ConfigDict
 from root_programs import RootPrograms
 
 from logvggt_jax import LogVGGT, ModelConfig
@@ -335,6 +337,13 @@ OPTIONAL = {
 }
 
 
+def _type_on_the_command_line(values: ConfigDict, field: str) -> type:
+    """As what a flag for this field is read; there is none for a None that no placeholder stands for."""
+    *parents, name = field.split(".")
+    holder = functools.reduce(operator.getitem, parents, values)
+    return holder.get_type(name)
+
+
 @pytest.mark.parametrize("name", ["tiny", "demo", "rooms", "small", "h20", "finetune", "distill", "distill_rooms"])
 def test_fields_that_a_file_leaves_out_can_be_changed_on_the_command_line(
     name: str, monkeypatch: pytest.MonkeyPatch
@@ -343,6 +352,8 @@ def test_fields_that_a_file_leaves_out_can_be_changed_on_the_command_line(
     values = importlib.import_module(f"configs.{name}").get_config()
     before = TrainConfig.from_dict(values.to_dict())
     values.lock()
+    for field, value in OPTIONAL.items():
+        assert _type_on_the_command_line(values, field) is type(value), field
     values.update_from_flattened_dict(OPTIONAL)
     changed = TrainConfig.from_dict(values.to_dict())
     assert changed != before
@@ -350,7 +361,7 @@ def test_fields_that_a_file_leaves_out_can_be_changed_on_the_command_line(
         assert operator.attrgetter(field)(changed) == value, field
 
 
-@pytest.mark.parametrize("name", ["tiny", "rooms", "small", "distill_rooms"])
+@pytest.mark.parametrize("name", ["tiny", "demo", "rooms", "small", "distill_rooms"])
 def test_options_that_a_file_leaves_to_the_reader_can_be_given_on_the_command_line(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -359,6 +370,8 @@ def test_options_that_a_file_leaves_to_the_reader_can_be_given_on_the_command_li
     values.lock()
     left = dict(TrainConfig.from_dict(values.to_dict()).data.sources[0].options)
     assert "lights" not in left and None not in left.values(), "a run of an earlier version is still the same"
+    for source in (values.data.sources, values.validation.sources):
+        assert _type_on_the_command_line(source, "rooms.options.lights") is int
     values.update_from_flattened_dict({"data.sources.rooms.options.lights": 2})
     assert dict(TrainConfig.from_dict(values.to_dict()).data.sources[0].options) == {**left, "lights": 2}
 

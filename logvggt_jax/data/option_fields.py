@@ -16,13 +16,13 @@ def option_fields(name: str, chosen: Mapping[str, Any]) -> ConfigDict:
 
     Args:
       name: of the data set.
-      chosen: options and their values; they come first.
+      chosen: options and their values; they come first. None, as an unfilled placeholder reads, is no choice.
 
     Returns:
       What was chosen, and a placeholder for each of the others that is one number, string or truth value. None, as a
       placeholder reads until it is filled, leaves an option to the reader's default, see `given_options`.
     """
-    fields = ConfigDict(dict(chosen), sort_keys=False)
+    fields = ConfigDict(given_options(chosen), sort_keys=False)
     for option, kind in option_types(name).items():
         if option not in fields and kind in (bool, int, float, str):
             fields[option] = placeholder(kind)
