@@ -40,6 +40,7 @@ from logvggt_jax.weights.folder import MEND, is_model_folder, read_description, 
 from logvggt_jax.weights.half_precision import PARAMETERS_FILE, read_parameters, rounded, write_parameters
 from logvggt_jax.weights.hub import licence
 from logvggt_jax.weights.lazy import LazyTensors
+from logvggt_jax.weights.orbax_paths import as_it_is_named
 from logvggt_jax.weights.orbax_writing import writing_with_orbax
 from logvggt_jax.weights.provenance import Provenance
 from logvggt_jax.weights.shipped_models import SHIPPED, shipped_model
@@ -96,8 +97,11 @@ def write_arrays(path: Path, tree: Any) -> None:
         multiprocessing_options=_alone(),
         type_handler_registry=ocp.type_handlers.create_type_handler_registry(*kinds),
     )
-    with ocp.AsyncCheckpointer(handler, multiprocessing_options=_alone()) as checkpointer:
-        checkpointer.save(path, args=ocp.args.PyTreeSave(jax.tree.map(np.asarray, jax.device_get(tree))))
+    with (
+        as_it_is_named(path) as where,
+        ocp.AsyncCheckpointer(handler, multiprocessing_options=_alone()) as checkpointer,
+    ):
+        checkpointer.save(where, args=ocp.args.PyTreeSave(jax.tree.map(np.asarray, jax.device_get(tree))))
         checkpointer.wait_until_finished()
 
 
@@ -109,8 +113,8 @@ def read_arrays(path: Path, target: Any) -> Any:
     Raises InputError where a pipe or a device lies in a file's place, for which Orbax would wait.
     """
     check_regular_files(path)
-    with _reader() as checkpointer:
-        return checkpointer.restore(path, target)
+    with as_it_is_named(path) as where, _reader() as checkpointer:
+        return checkpointer.restore(where, target)
 
 
 def save_rounded_model(path: str | Path, config: ModelConfig, params: Any, provenance: Provenance) -> float:
@@ -353,8 +357,8 @@ def _restore(folder: Path, target: Any) -> Any:
 
     def read() -> Any:
         check_regular_files(path)
-        with _reader() as checkpointer:
-            stored = checkpointer.metadata(path).item_metadata
+        with as_it_is_named(path) as where, _reader() as checkpointer:
+            stored = checkpointer.metadata(where).item_metadata
         if stored is None:
             raise FileNotFoundError("Orbax's description of the parameters is missing")
         if wrong := first_misfit(stored.tree, target, "the configuration in config.json"):

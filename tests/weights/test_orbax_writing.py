@@ -7,12 +7,21 @@ import sys
 import time
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
 from logvggt_jax.errors import DiskError
-from logvggt_jax.weights.checkpoints import save_model, write_arrays
+from logvggt_jax.weights.checkpoints import load_model, save_model, write_arrays
 from logvggt_jax.weights.orbax_writing import writing_with_orbax
+
+
+@pytest.mark.parametrize("name", ["plain", "sweep[3]", "a*", "a?", "a\\b", "straße (1) #%20"])
+def test_a_model_is_read_back_whatever_its_folder_is_called(name, tmp_path, small_config, small_variables):
+    (tmp_path / "ab").mkdir()
+    save_model(tmp_path / name / "model", small_config, small_variables["params"])
+    found = load_model(tmp_path / name / "model")[1]["params"]
+    jax.tree.map(np.testing.assert_array_equal, found, small_variables["params"])
 
 
 def test_a_save_says_nothing_and_a_failed_one_its_line_alone(tmp_path, small_config, small_variables, caplog):
