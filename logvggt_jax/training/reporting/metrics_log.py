@@ -151,7 +151,7 @@ class MetricsLog:
     def say(self, message: str) -> None:
         """One line on the terminal."""
         if not self.silent:
-            self.console.print(message, highlight=False, soft_wrap=True)
+            self.console.print(message, highlight=False, markup=False, soft_wrap=True)
 
 
 def _steady_time() -> float:

@@ -35,6 +35,13 @@ def test_lines_hold_what_was_written(tmp_path: Path) -> None:
     }
 
 
+def test_what_is_said_is_no_markup(tmp_path: Path) -> None:
+    said = io.StringIO()
+    with MetricsLog(tmp_path, first_step=0, console=Console(file=said)) as log:
+        log.say("results in runs/sweep[3]/a[/b]")
+    assert said.getvalue() == "results in runs/sweep[3]/a[/b]\n"
+
+
 def test_pictures_are_shown_by_tensorboard(tmp_path: Path) -> None:
     picture = np.random.default_rng(0).integers(0, 256, (4, 6, 3)).astype(np.uint8)
     with _log(tmp_path, 0) as log:
