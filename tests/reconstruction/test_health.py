@@ -142,6 +142,18 @@ def test_depth_that_is_wrong_for_a_while_is_not_called_movement() -> None:
     assert np.nanmax(np.delete(moving.elsewhere, range(rooms.FAULT.start, until))) < 0.06
 
 
+@pytest.mark.parametrize(
+    ("make", "first", "changed"), [(rooms.dark, 12, 16), (rooms.blurred, 12, 16), (rooms.hurried, 24, 24)]
+)
+def test_pictures_that_change_for_another_reason_are_no_movement(
+    make: Callable[[], Frames], first: int, changed: int
+) -> None:
+    measures = measured(make(), rooms.signals(rooms.COUNT, rooms.FAULT))
+    measures.conflicts[first : first + 3] = 0.3
+    measures.elsewhere[changed : changed + 4] = 0.2
+    assert "moving" not in {stretch.cause for stretch in stretches(measures)}
+
+
 @pytest.mark.parametrize("degrees", [25, 60])
 def test_cameras_that_turn_where_the_picture_stays_are_not_called_fast(degrees: int) -> None:
     frames = rooms.clean()

@@ -51,7 +51,8 @@ ZOOM, ZOOM_FRAMES, ZOOM_TIMES = 0.1, 8, 6.0
 # Something moves: this share of the points that should be seen from four frames away is not, and so many times as many;
 # and in one of the frames so much of the picture was not near its place either: depth that is wrong changes no picture.
 CONFLICTS, CONFLICT_TIMES = 0.04, 4.0
-ELSEWHERE = 0.06
+# Pictures whose fine detail differs by such a factor cannot be compared for that.
+ELSEWHERE, AS_SHARP = 0.06, 3.0
 # Nothing that moves hides so much of the view, in any frame of a stretch.
 MOST_CONFLICTS = 0.6
 
@@ -110,8 +111,9 @@ def stretches(measures: Measures) -> tuple[Stretch, ...]:
     """All stretches of doubtful frames, by their first frame."""
     with warnings.catch_warnings(), np.errstate(divide="ignore", invalid="ignore"):
         warnings.filterwarnings("ignore", "All-NaN|Mean of empty", RuntimeWarning)
-        signs = _signs(measures)
-        causes = _causes(measures, signs)
+        pictures = _pictures(measures)
+        signs = _signs(measures, pictures)
+        causes = _causes(measures, pictures, signs)
     found = [
         Stretch(cause, first, last, tuple(name for name, frames in signs.items() if _around(frames, first, last).any()))
         for cause, frames in causes.items()
@@ -134,7 +136,8 @@ def doubtful(found: tuple[Stretch, ...], count: int) -> np.ndarray:
     return frames
 
 
-def _causes(m: Measures, signs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def _pictures(m: Measures) -> dict[str, np.ndarray]:
+    """What the pictures by themselves have to do with it, by cause."""
     dark = (m.dark > DARK_PIXELS) | (m.brightness < DARK_SHARE * _median(m.brightness))
     bright = (m.bright > BRIGHT_PIXELS) & ~(m.bright <= BRIGHT_TIMES * _median(m.bright))
     texture = (m.texture < LEAST_TEXTURE) | (m.texture < TEXTURE_SHARE * _median(m.texture))
@@ -142,10 +145,17 @@ def _causes(m: Measures, signs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     poor = dark | bright | texture
     ratio = np.where(poor, np.nan, m.sharpness / m.texture)
     blur = (m.sharpness < BLUR_SHARPNESS * _median(m.sharpness)) & (ratio < BLUR_RATIO * _median(ratio)) & ~poor
-    blur &= m.texture > BLUR_TEXTURE * _median(m.texture)
+    blur, soft = _sudden(blur & (m.texture > BLUR_TEXTURE * _median(m.texture)), m.sharpness)
+    return {"dark": dark, "bright": bright, "texture": texture, "blur": blur, "soft": soft}
 
-    blur, soft = _sudden(blur, m.sharpness)
 
+def _poor(pictures: dict[str, np.ndarray]) -> np.ndarray:
+    """Frames that show nothing."""
+    return pictures["dark"] | pictures["bright"] | pictures["texture"]
+
+
+def _causes(m: Measures, pictures: dict[str, np.ndarray], signs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    poor = _poor(pictures)
     zoom = _over(_zoom(np.where(poor, np.nan, m.field_of_view)), ZOOM, ZOOM_TIMES)
     new = 1 - m.overlap
     # A picture says nothing where it, or the one before, shows nothing.
@@ -161,33 +171,28 @@ def _causes(m: Measures, signs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     fast = far & ~(new > ALL_NEW) & ~zoom
     no_overlap = (far & (new > ALL_NEW)) | (cut & ~moving & ~fast)
     fast_or_cut = fast & (m.likeness < ALIKE) & _alone(m.picture_change > OTHER_PICTURE)
-    moving &= ~_across(no_overlap | fast_or_cut)
+    moving &= ~_across(no_overlap | fast)
     exposure = jump & ~no_overlap & ~fast & ~moving
-    found = {
+    found = pictures | {
         "no overlap": no_overlap,
         "fast": fast & ~fast_or_cut,
         "fast or cut": fast_or_cut,
-        "dark": dark,
-        "bright": bright,
         "exposure": exposure,
-        "texture": texture,
-        "blur": blur,
-        "soft": soft,
         "zoom": zoom,
         "moving": moving & ~zoom & ~no_overlap,
     }
     return {name: found[name] for name in CAUSES}
 
 
-def _signs(m: Measures) -> dict[str, np.ndarray]:
+def _signs(m: Measures, pictures: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     scales = np.full(m.num_frames, np.nan)
     missing = _over(m.conflicts, CONFLICTS, CONFLICT_TIMES)
+    seen_to_move = (m.elsewhere > ELSEWHERE) & _comparable(m, _poor(pictures))
     no_movement = np.zeros(m.num_frames, bool)
     for first, last in _runs(missing):  # one error makes conflicts of all sizes
         run = slice(first, last + 1)
-        no_movement[run] |= (m.conflicts[run] > MOST_CONFLICTS).any() or not _around(
-            m.elsewhere > ELSEWHERE, first, last
-        ).any()
+        hidden = (m.conflicts[run] > MOST_CONFLICTS).any()
+        no_movement[run] |= hidden or not _around(seen_to_move, first, last).any()
     joints = np.flatnonzero(np.isfinite(m.chunk_scale))
     scales[joints] = np.abs(np.diff(np.log(m.chunk_scale[joints]), prepend=0.0))  # the first chunk's is one
     return {
@@ -217,6 +222,13 @@ def _far(m: Measures) -> np.ndarray:
     return _over(new, NEW_VIEW, NEW_VIEW_TIMES) | (new > MOST_NEW)
 
 
+def _comparable(m: Measures, poor: np.ndarray) -> np.ndarray:
+    """Frames whose picture can be compared with that of the frame four before: both show something, as sharply."""
+    earlier = np.maximum(np.arange(m.num_frames) - CONFLICTS_APART, 0)
+    as_sharp = np.abs(np.log(m.sharpness / m.sharpness[earlier])) < np.log(AS_SHARP)
+    return as_sharp & ~poor & ~poor[earlier]
+
+
 def _sudden(blur: np.ndarray, sharpness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Of blurred frames those whose stretch begins or ends from one frame to the next, and the others."""
     steps = np.abs(np.diff(np.log(sharpness), prepend=np.nan, append=np.nan))  # before each frame, and after the last
@@ -242,7 +254,7 @@ def _alone(frames: np.ndarray) -> np.ndarray:
 
 
 def _across(jumps: np.ndarray) -> np.ndarray:
-    """Frames whose conflicts are searched for in a frame before a jump: the two cannot be compared."""
+    """Frames whose conflicts are searched for in a frame before a jump, or a fast step: the two cannot be compared."""
     across: np.ndarray = np.convolve(jumps, np.ones(CONFLICTS_APART))[: len(jumps)] > 0
     return across
 
