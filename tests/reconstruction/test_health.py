@@ -63,7 +63,8 @@ def test_every_fault_is_named_where_it_is(cause: str) -> None:
 def test_a_walk_without_fault_has_no_doubtful_frame(number: int) -> None:
     measures = measured(rooms.clean(number), rooms.signals(rooms.COUNT, ()))
     assert stretches(measures) == ()
-    assert "None of the 40 frames is doubtful" in paragraph((), measures, [])
+    assert "None of the 40 frames is doubtful" in (text := paragraph((), measures, [])) and "Most rules" not in text
+    assert "Most rules need 8 frames or more, and say nothing here" in paragraph((), Measures.of({}, 3), [])
 
 
 def test_a_cut_is_seen_though_the_predicted_cameras_do_not_tell() -> None:
@@ -217,6 +218,19 @@ def test_trouble_that_the_footage_does_not_explain_is_said_to_be_so() -> None:
     (found,) = stretches(measures)
     assert found.cause is None and found.first >= 30 and found.last <= 32
     assert "nothing that is measured of the footage says why" in paragraph((found,), measures, ["x"] * rooms.COUNT)
+
+
+def test_what_nothing_explains_is_told_once() -> None:
+    measures, names = measured(rooms.clean(), rooms.signals(rooms.COUNT, ())), [f"{i}.png" for i in range(rooms.COUNT)]
+    found = [Stretch(None, 3, 4, ("conflicts",)), Stretch("dark", 6, 6, ()), Stretch(None, 9, 9, ("correction",))]
+    text = paragraph(found, measures, names)
+    assert text.startswith("4 of 40 frames are doubtful. Frame 6 (6.png): most likely it is too dark")
+    assert text.endswith(
+        " Frames 3 to 4 (3.png to 4.png), 9 (9.png): the global refinement moved the camera far and points that should "
+        "be seen from four frames away are not; nothing that is measured of the footage says why."
+    )
+    many = [Stretch(None, 4 * index, 4 * index, ("correction",)) for index in range(9)]
+    assert "; nothing" in (text := paragraph(many, measures, names)) and "3 shorter stretches are in its list" in text
 
 
 def test_signs_are_told_as_a_list() -> None:

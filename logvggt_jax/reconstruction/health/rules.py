@@ -15,7 +15,7 @@ import numpy as np
 from logvggt_jax.reconstruction.health.measures import CONFLICTS_APART, Measures
 
 # Medians of fewer frames say nothing: rules that need them are then left out.
-_FEWEST = 8
+FEWEST = 8
 
 # Light. A frame is dark if so many of its pixels are nearly black, or its brightness is so small a share of the median.
 DARK_PIXELS, DARK_SHARE = 0.6, 0.25
@@ -208,7 +208,7 @@ def _signs(m: Measures, pictures: dict[str, np.ndarray]) -> dict[str, np.ndarray
 
 def _median(values: np.ndarray) -> float:
     """NaN, which nothing is above or below, where too few are known."""
-    return float(np.nanmedian(values)) if np.isfinite(values).sum() >= _FEWEST else np.nan
+    return float(np.nanmedian(values)) if np.isfinite(values).sum() >= FEWEST else np.nan
 
 
 def _over(values: np.ndarray, least: float, times: float) -> np.ndarray:

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from logvggt_jax.reconstruction.health.measures import Measures
-from logvggt_jax.reconstruction.health.rules import CAUSES, SIGNS, Stretch, doubtful
+from logvggt_jax.reconstruction.health.rules import CAUSES, FEWEST, SIGNS, Stretch, doubtful
 
-# Stretches that are told one by one.
+# Stretches that are told of those with a cause, and of those without.
 _MOST = 6
 # A camera whose steps are shorter, in median depths, stands still.
 _STILL = 1e-3
@@ -40,14 +40,25 @@ def paragraph(found: Sequence[Stretch], measures: Measures, names: Sequence[str]
     count = measures.num_frames
     frames = int(doubtful(tuple(found), count).sum())
     if not frames:
-        return f"None of the {count} frames is doubtful: no sign of trouble, and nothing wrong with the footage."
+        few = f" Most rules need {FEWEST} frames or more, and say nothing here." if count < FEWEST else ""
+        return (
+            f"None of the {count} frames is doubtful: no sign of trouble, and nothing wrong seen in the footage.{few}"
+        )
     parts = [f"{frames} of {count} frames {'is' if frames == 1 else 'are'} doubtful."]
-    # The longest are told, in their order.
-    longest = sorted(found, key=lambda stretch: stretch.first - stretch.last)[:_MOST]
-    parts += [_sentence(stretch, measures, names) for stretch in sorted(longest, key=lambda stretch: stretch.first)]
-    if len(found) > _MOST:
-        parts.append(f"{len(found) - _MOST} shorter stretches are in its list.")
+    explained = [stretch for stretch in found if stretch.cause is not None]
+    others = [stretch for stretch in found if stretch.cause is None]
+    parts += [_sentence(stretch, measures, names) for stretch in _longest(explained)]
+    if others:
+        parts.append(_unexplained(_longest(others), names))
+    if left := max(0, len(explained) - _MOST) + max(0, len(others) - _MOST):
+        parts.append(f"{left} shorter {'stretch is' if left == 1 else 'stretches are'} in its list.")
     return " ".join(parts)
+
+
+def _longest(found: Sequence[Stretch]) -> list[Stretch]:
+    """Those that are told, in their order."""
+    longest = sorted(found, key=lambda stretch: stretch.first - stretch.last)[:_MOST]
+    return sorted(longest, key=lambda stretch: stretch.first)
 
 
 def in_short(found: Sequence[Stretch], count: int) -> str:
@@ -74,12 +85,22 @@ def reasons(stretch: Stretch) -> str:
 
 
 def _sentence(stretch: Stretch, measures: Measures, names: Sequence[str]) -> str:
-    where = f"Frame{'' if stretch.first == stretch.last else 's'} {_numbers(stretch)} ({names[stretch.first]}"
-    where += ")" if stretch.first == stretch.last else f" to {names[stretch.last]})"
-    if stretch.cause is None:
-        return f"{where}: {reasons(stretch)}."
     evidence = _evidence(stretch, measures)
-    return f"{where}: most likely {reasons(stretch)}{f' ({evidence})' if evidence else ''}."
+    return f"{_where([stretch], names)}: most likely {reasons(stretch)}{f' ({evidence})' if evidence else ''}."
+
+
+def _unexplained(found: Sequence[Stretch], names: Sequence[str]) -> str:
+    signs = tuple(name for name in SIGNS if any(name in stretch.signs for stretch in found))
+    return f"{_where(found, names)}: {reasons(found[0]._replace(signs=signs))}."
+
+
+def _where(found: Sequence[Stretch], names: Sequence[str]) -> str:
+    told = [
+        f"{_numbers(each)} ({names[each.first]}{'' if each.first == each.last else f' to {names[each.last]}'})"
+        for each in found
+    ]
+    several = len(found) > 1 or found[0].first != found[0].last
+    return f"Frame{'s' if several else ''} {', '.join(told)}"
 
 
 def _evidence(stretch: Stretch, measures: Measures) -> str:
