@@ -19,6 +19,7 @@ from logvggt_jax.errors import InputError
 from logvggt_jax.frames import Frames
 from logvggt_jax.reconstruction import Reconstruction
 from logvggt_jax.reconstruction.health import report
+from logvggt_jax.reconstruction.health.looks import NUMBERS
 from logvggt_jax.reconstruction.health.measures import Measures
 from logvggt_jax.reconstruction.health.pictures import compare_pictures
 from logvggt_jax.reconstruction.health.plot import svg_plot
@@ -177,12 +178,31 @@ def rotation_y(degrees: float) -> np.ndarray:
 
 def test_detail_that_goes_little_by_little_may_be_that_of_a_smooth_surface() -> None:
     measures = measured(rooms.clean(), rooms.signals(rooms.COUNT, ()))
-    measures.sharpness[10:30] *= 0.75 ** np.concatenate([np.arange(1, 11), np.arange(10, 0, -1)])
+    fading = 0.75 ** np.concatenate([np.arange(1, 11), np.arange(10, 0, -1)])
+    measures.sharpness[10:30] *= fading
+    measures.detail[10:30] *= fading
     (found,) = stretches(measures)
     assert found.cause == "soft"
     assert "most likely the picture is blurred, or shows smooth surfaces" in paragraph(
         (found,), measures, ["x"] * rooms.COUNT
     )
+
+
+def test_an_edge_that_leaves_the_view_is_no_blur() -> None:
+    """Nearly all fine detail of a picture may be in one edge."""
+    noise = np.random.default_rng(0).integers(0, 9, (*rooms.SIZE, 1), np.uint8)
+    wall = np.full((*rooms.SIZE, 3), 200, np.uint8) + noise
+    edge = wall.copy()
+    edge[:, -20:] = 20
+    sharp, soft = (HealthRecorder() for _ in range(2))
+    for recorder, second in ((sharp, wall), (soft, cv2.GaussianBlur(edge, (0, 0), 2))):
+        recorder.see(0, np.ones(rooms.SIZE), np.full(rooms.SIZE, 5.0), edge)
+        recorder.see(1, np.ones(rooms.SIZE), np.full(rooms.SIZE, 5.0), second)
+    numbers = [dict(zip(NUMBERS, recorder.arrays()["numbers"].T, strict=True)) for recorder in (sharp, soft)]
+    for each in numbers:
+        assert each["sharpness"][1] < each["sharpness"][0] / 4
+    leaves, blurs = (each["detail"][0] / each["detail"][1] for each in numbers)
+    assert 0.5 < leaves < 2 < blurs
 
 
 def test_a_lens_is_not_said_to_zoom_by_pictures_that_show_nothing() -> None:
@@ -325,7 +345,7 @@ def test_every_result_says_how_it_is(tmp_path: Path, reconstruct_dark: Reconstru
     assert f"{result.folder}/health.html: " in summary
     assert '<meta name="viewport"' in (result.folder / "health.html").read_text()  # else it is tiny on a phone
     page = Words((result.folder / "health.html").read_text())
-    assert health.text in page.text and "it is too dark" in page.text and page.plots == 18
+    assert health.text in page.text and "it is too dark" in page.text and page.plots == 19
 
 
 def test_a_run_that_died_says_the_same_in_the_end(tmp_path: Path, reconstruct_dark: Reconstruct) -> None:
@@ -364,7 +384,7 @@ def test_results_without_a_report_open_and_a_damaged_one_is_named(tmp_path: Path
     report.write_health(tmp_path, report.examine(unknown, result.names), result.names)
     assert result.health is not None and not result.health.doubtful.any()
     sound = json.loads((tmp_path / "health.json").read_text())
-    for later in ("likeness", "shared_picture", "elsewhere"):  # as the first reports are
+    for later in ("detail", "likeness", "shared_picture", "elsewhere"):  # as the first reports are
         del sound["measures"][later]
     (tmp_path / "health.json").write_text(json.dumps(sound))
     assert result.health is not None and np.isnan(result.health.measures.likeness).all()

@@ -13,8 +13,10 @@ _CELLS = 24
 _DARK, _BRIGHT = 20, 250
 # Coarse detail is that of pictures so many times smaller.
 _COARSE = 4
+# Fine detail is looked for in cells, so many along the longer edge.
+_DETAIL_CELLS = 12
 
-NUMBERS = ("brightness", "dark", "bright", "sharpness", "texture", "confidence", "median_depth")
+NUMBERS = ("brightness", "dark", "bright", "sharpness", "detail", "texture", "confidence", "median_depth")
 
 
 class Look(NamedTuple):
@@ -48,6 +50,8 @@ def look(image: np.ndarray, depth: np.ndarray, confidence: np.ndarray) -> Look:
     coarse = cv2.resize(fine, (-(-width // _COARSE), -(-height // _COARSE)), interpolation=cv2.INTER_AREA)
     light = (float(fine.mean()) + 1.0) ** 2
     slopes = np.mean(np.diff(coarse, axis=0) ** 2) + np.mean(np.diff(coarse, axis=1) ** 2)
+    edges = cv2.Laplacian(fine, cv2.CV_32F)
+    cells_of_detail = tuple(max(1, round(edge * _DETAIL_CELLS / max(height, width))) for edge in (width, height))
     valid = np.isfinite(depth) & (depth > 0)
     rows, columns = places((height, width))
     cells = depth[np.ix_(rows, columns)]
@@ -55,7 +59,8 @@ def look(image: np.ndarray, depth: np.ndarray, confidence: np.ndarray) -> Look:
         fine.mean() / 255,
         np.mean(grey[kept] <= _DARK) if kept.any() else np.nan,
         np.mean(grey[kept] >= _BRIGHT) if kept.any() else np.nan,
-        cv2.Laplacian(fine, cv2.CV_32F).var() / light,
+        edges.var() / light,
+        np.median(cv2.resize(edges**2, cells_of_detail, interpolation=cv2.INTER_AREA)) / light,
         slopes / light,
         np.median(confidence[kept]) if kept.any() else np.nan,
         np.median(depth[valid]) if valid.any() else np.nan,

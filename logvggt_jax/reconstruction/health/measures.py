@@ -25,6 +25,8 @@ class Measures:
       dark: share of pixels that are nearly black.
       bright: share of pixels that are nearly white.
       sharpness: variance of the Laplacian over the squared mean grey level: fine detail.
+      detail: median over cells, twelve a row, of the squared Laplacian over the squared mean grey level: fine detail
+        wherever one looks, which an edge that comes into view does not change.
       texture: gradient energy of the picture at a quarter of its size over the squared mean grey level: coarse detail.
       picture_change: one minus the correlation with the frame before, of small grey pictures.
       confidence: the median over the pixels.
@@ -48,6 +50,7 @@ class Measures:
     dark: np.ndarray = _measure("Dark pixels", "share")
     bright: np.ndarray = _measure("Overexposed pixels", "share")
     sharpness: np.ndarray = _measure("Sharpness", "variance of the Laplacian")
+    detail: np.ndarray = _measure("Detail everywhere", "squared Laplacian")
     texture: np.ndarray = _measure("Texture", "gradient energy")
     picture_change: np.ndarray = _measure("Change of the picture", "1 - correlation")
     confidence: np.ndarray = _measure("Confidence", "median")

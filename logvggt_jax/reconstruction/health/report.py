@@ -23,7 +23,7 @@ from logvggt_jax.reconstruction.health.words import in_short, paragraph, reasons
 HEALTH_FILE, HEALTH_PAGE = "health.json", "health.html"
 _FORMAT = "logvggt-health-1"
 # Measures that the first reports of this format do not have.
-_LATER = ("likeness", "shared_picture", "elsewhere")
+_LATER = ("detail", "likeness", "shared_picture", "elsewhere")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

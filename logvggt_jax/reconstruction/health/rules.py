@@ -31,8 +31,8 @@ TEXTURE_SHARE, LEAST_TEXTURE = 0.1, 2e-4
 BLUR_SHARPNESS, BLUR_RATIO = 0.5, 0.35
 # Of frames with less coarse detail than this share of the median nobody can say whether they are blurred.
 BLUR_TEXTURE = 0.15
-# A picture is blurred from one frame to the next, by such a factor of its fine detail; what comes little by little may
-# as well be a smooth surface that fills more and more of the view.
+# A picture is blurred from one frame to the next, and everywhere, by such a factor; what comes little by little, or as
+# an edge leaves the view, may as well be a smooth surface.
 BLUR_STEP = 2.0
 
 # Movement. Too fast: this much of the view is new in every frame, and so many times as much as in the median frame; or
@@ -145,7 +145,7 @@ def _pictures(m: Measures) -> dict[str, np.ndarray]:
     poor = dark | bright | texture
     ratio = np.where(poor, np.nan, m.sharpness / m.texture)
     blur = (m.sharpness < BLUR_SHARPNESS * _median(m.sharpness)) & (ratio < BLUR_RATIO * _median(ratio)) & ~poor
-    blur, soft = _sudden(blur & (m.texture > BLUR_TEXTURE * _median(m.texture)), m.sharpness)
+    blur, soft = _sudden(blur & (m.texture > BLUR_TEXTURE * _median(m.texture)), m.detail)
     return {"dark": dark, "bright": bright, "texture": texture, "blur": blur, "soft": soft}
 
 
@@ -229,9 +229,9 @@ def _comparable(m: Measures, poor: np.ndarray) -> np.ndarray:
     return as_sharp & ~poor & ~poor[earlier]
 
 
-def _sudden(blur: np.ndarray, sharpness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _sudden(blur: np.ndarray, detail: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Of blurred frames those whose stretch begins or ends from one frame to the next, and the others."""
-    steps = np.abs(np.diff(np.log(sharpness), prepend=np.nan, append=np.nan))  # before each frame, and after the last
+    steps = np.abs(np.diff(np.log(detail), prepend=np.nan, append=np.nan))  # before each frame, and after the last
     sudden = np.zeros_like(blur)
     for first, last in _runs(blur):
         sudden[first : last + 1] = (steps[max(first - 1, 0) : last + 3] > np.log(BLUR_STEP)).any()
