@@ -15,9 +15,10 @@ from PIL import Image
 from recorder import reconstruct_recorded
 from result_folder import write_result
 
+from logvggt_jax import load_model
 from logvggt_jax.errors import InputError
 from logvggt_jax.frames import Frames
-from logvggt_jax.reconstruction import Reconstruction
+from logvggt_jax.reconstruction import Reconstruction, reconstruct
 from logvggt_jax.reconstruction.health import report
 from logvggt_jax.reconstruction.health.looks import NUMBERS
 from logvggt_jax.reconstruction.health.measures import Measures
@@ -409,3 +410,25 @@ def test_a_plot_of_a_long_sequence_stays_small_and_keeps_its_peaks() -> None:
     assert len(plot) < 20_000 and plot.count("<polyline") == 2 and plot.count("<rect") == 1
     assert ">9</text>" in plot and "waves &amp; &lt;peaks&gt;" in plot
     assert "polyline" not in svg_plot(np.full(5, np.nan), [], label="nothing")
+
+
+@pytest.mark.slow
+def test_what_moves_is_told_from_the_errors_of_a_real_model(tmp_path: Path) -> None:
+    """The model that ships, whose depth and cameras are far from exact."""
+    model, variables = load_model("rooms")
+
+    def causes(frames: Frames, name: str) -> set[str | None]:
+        (tmp_path / name).mkdir()
+        for index, picture in enumerate(frames.images):
+            Image.fromarray(picture).save(tmp_path / name / f"{index:03d}.png")
+        options = {"longer_edge": max(rooms.SIZE), "progress": False, "num_previews": 0}
+        output = tmp_path / f"{name} result"
+        health = reconstruct(tmp_path / name, output, model=model, variables=variables, **options).health
+        assert health is not None
+        return {stretch.cause for stretch in health.stretches}
+
+    for number, step in ((0, 3), (2, 2), (2, 3), (3, 2), (5, 2), (7, 2)):
+        still = causes(rooms.walk(range(0, step * rooms.COUNT, step), number=number), f"still {number} {step}")
+        assert still <= {None, "fast", "soft"}
+    for standing in (False, True):
+        assert "moving" in causes(rooms.moving_subject(standing=standing), f"ball {standing}")
