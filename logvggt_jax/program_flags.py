@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from absl import flags, logging
 from ml_collections import config_flags
 
-from logvggt_jax.errors import one_line
+from logvggt_jax.errors import one_line, printable
 
 # Of a configuration file that the library cannot open, between words on where it looked.
 _NO_FILE = re.compile(r"Failed loading config file.*\[Errno \d+\] (?P<reason>[^:]+): '(?P<path>[^']*)'", re.DOTALL)
@@ -18,6 +18,9 @@ _NO_FILE = re.compile(r"Failed loading config file.*\[Errno \d+\] (?P<reason>[^:
 _OWN = re.compile(r"(?:logvggt_jax\.errors\.\w+|earlier failure to load): (?P<message>[^\n]+)\s*$")
 # A field that is left out, whatever its type: the library reads numbers and tuples alone where those stand.
 _LEFT_OUT = re.compile(r"--?config\.(?P<field>[^=]+)=None")
+# The name of a field that is given; names that the library can read have parts joined by dots, or in brackets.
+_GIVEN = re.compile(r"--?config\.(?P<field>[^=]*)")
+_NAME = re.compile(r"""[^\W\d]\w*(\.[^\W\d]\w*|\[\d+\]|\['[^']*'\]|\["[^"]*"\])*""")
 # What the library says at length of a field that is not there.
 _ALL_FIELDS = re.compile(r' Other fields present: "\{.*\}"')
 # In the words of absl, once for each flag.
@@ -42,6 +45,10 @@ def flags_parser(program: str) -> Callable[[list[str]], list[str]]:
     """
 
     def parse(arguments: list[str]) -> list[str]:
+        for found in filter(None, map(_GIVEN.match, arguments)):
+            if not _NAME.fullmatch(found["field"]):
+                mend = "a name has letters, digits and underscores, its parts are joined by dots"
+                sys.exit(f"{program}: --config.{printable(found['field'])}: no field is named so; {mend}")
         left_out = [found["field"] for found in map(_LEFT_OUT.fullmatch, arguments) if found]
         try:
             with _command_line(_others(sys.argv)):
@@ -50,7 +57,7 @@ def flags_parser(program: str) -> Callable[[list[str]], list[str]]:
             is_mapping = hasattr(config, "to_dict")  # a file that cannot be loaded says so only now
             if is_mapping:
                 config.update_from_flattened_dict(dict.fromkeys(left_out))
-        except (AttributeError, KeyError) as error:
+        except (AttributeError, LookupError, TypeError) as error:
             # The library wraps one error in the other, with quotes around quotes.
             reason = error.args[0] if error.args else error
             reason = reason.args[0] if isinstance(reason, KeyError) else reason

@@ -25,7 +25,7 @@ from logvggt_jax.doctor import training as doctors_step
 from logvggt_jax.errors import InputError, MissingInput
 from logvggt_jax.evaluation.datasets import open_evaluation_set
 from logvggt_jax.evaluation.settings import ClipRun, read_run
-from logvggt_jax.streaming import METHODS
+from logvggt_jax.streaming import METHODS, AnchoredWindowSettings, CausalSettings, PrunedSettings
 from logvggt_jax.training.config import TrainConfig
 from logvggt_jax.training.parallel.sharding import check_batch_size, data_mesh
 from logvggt_jax.training.step.costs import abstract_clips
@@ -413,14 +413,23 @@ def test_every_field_of_an_evaluation_can_be_changed_on_the_command_line(
         assert {field.name for field in dataclasses.fields(part)} == set(fields)
 
 
-def test_what_decides_a_methods_numbers_can_be_set_on_the_command_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The others are of buffers and of what is shown on the way, or close loops, which is a run of its own."""
+@pytest.mark.parametrize("config", ["rooms", "seven_scenes", "methods", "ablations", "paper"])
+def test_every_setting_of_a_method_can_be_given_on_the_command_line(
+    config: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.syspath_prepend(str(ROOT))
-    settings = importlib.import_module("configs.eval.methods").get_config().settings
-    others = {"ahead", "first_capacity", "provisional", "loops"}
+    values = importlib.import_module(f"configs.eval.{config}").get_config()
     for name, method in METHODS.items():
-        fields = {field.name for field in dataclasses.fields(method.settings)} - others
-        assert fields == set(settings.get(name, {})), name
+        fields = {field.name for field in dataclasses.fields(method.settings)}
+        assert fields == set(values.settings[name.replace("-", "_")]), name
+    values.lock()
+    values.update_from_flattened_dict(
+        {"settings.pruned.cap": 99, "settings.chunks.loops": True, "settings.anchored_window.window": 3}
+    )
+    run = read_run(values.to_dict())
+    assert run.settings_of("pruned") == PrunedSettings(cap=99) and run.settings_of("chunks").loops
+    assert run.settings_of("anchored-window") == AnchoredWindowSettings(window=3)
+    assert run.settings_of("causal") == CausalSettings(), "what is not given is the default"
 
 
 def test_frozen_encoder_is_configured_by_the_model(monkeypatch: pytest.MonkeyPatch) -> None:

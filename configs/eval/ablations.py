@@ -13,6 +13,7 @@ from ml_collections import ConfigDict
 from ml_collections.config_dict import placeholder
 
 from logvggt_jax.data.option_fields import option_fields
+from logvggt_jax.evaluation.settings import method_fields
 
 
 def get_config(dataset: str = "rooms") -> ConfigDict:
@@ -29,7 +30,7 @@ def get_config(dataset: str = "rooms") -> ConfigDict:
     # Rows of the model: LoG-VGGT's windows, VGGT offline up to max_frames, and VGGT on overlapping chunks, as long as
     # the model was trained at.
     config.methods = ("windows", "offline", "chunks")
-    config.settings = ConfigDict({"offline": {"max_frames": 300}, "chunks": {"size": 12, "overlap": 6}})
+    config.settings = method_fields({"offline": {"max_frames": 300}, "chunks": {"size": 12, "overlap": 6}})
     # Names of logvggt_jax/evaluation/methods/variants.py.
     config.variants = (
         "full",

@@ -14,6 +14,7 @@ from ml_collections import ConfigDict
 from ml_collections.config_dict import placeholder
 
 from logvggt_jax.data.option_fields import option_fields
+from logvggt_jax.evaluation.settings import method_fields
 
 LENGTHS = (12, 25, 50, 100)
 
@@ -40,14 +41,11 @@ def get_config() -> ConfigDict:
     )
     # Tokens are those of the tiny model: 25 a frame of 56 x 70 pixels, four layers. All bounded methods are full well
     # before the longest clip ends: 12 frames of every layer, the first frame, the newest and six frames' worth of
-    # others, 12 frames of a chunk. The other values are the defaults, here so that the command line can change them.
-    config.settings = ConfigDict(
+    # others, 12 frames of a chunk.
+    config.settings = method_fields(
         {
-            "causal": {"camera_cache": "per_round"},
-            "anchored-window": {"window": 5},
-            "rolling": {"budget": 12 * 25 * 4, "temperature": 0.5, "anchor": 1, "camera_cache": "per_round"},
-            "pruned": {"cap": 8 * 25, "bits": 4, "camera_cache": "per_round"},
-            "merged": {"max_frames": 1000, "ratio": 0.9, "protected": 0.1, "similarity": "bfloat16"},
+            "rolling": {"budget": 12 * 25 * 4},
+            "pruned": {"cap": 8 * 25},
             "offline": {"max_frames": 200},
             "chunks": {"size": 12, "overlap": 6},
         }

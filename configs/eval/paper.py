@@ -11,6 +11,7 @@ co3dv2. What is missing is named and counted. An interrupted evaluation goes on 
 from ml_collections import ConfigDict, config_dict
 
 from logvggt_jax.data.option_fields import option_fields
+from logvggt_jax.evaluation.settings import method_fields
 
 
 def get_config() -> ConfigDict:
@@ -27,7 +28,7 @@ def get_config() -> ConfigDict:
 
     # Rows of the model: LoG-VGGT's windows, VGGT offline up to max_frames, VGGT on overlapping chunks chained together.
     config.methods = ("windows", "offline", "chunks")
-    config.settings = ConfigDict({"offline": {"max_frames": 200}, "chunks": {"size": 60, "overlap": 30}})
+    config.settings = method_fields({"offline": {"max_frames": 200}, "chunks": {"size": 60, "overlap": 30}})
     # Names of logvggt_jax/evaluation/methods/variants.py, evaluated beside the network.
     config.variants = ()
 

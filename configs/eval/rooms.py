@@ -7,6 +7,7 @@ from ml_collections import ConfigDict
 from ml_collections.config_dict import placeholder
 
 from logvggt_jax.data.option_fields import option_fields
+from logvggt_jax.evaluation.settings import method_fields
 
 
 def get_config() -> ConfigDict:
@@ -21,7 +22,7 @@ def get_config() -> ConfigDict:
     # Rows of the model: LoG-VGGT's windows, VGGT offline up to max_frames, and VGGT on overlapping chunks, as long as
     # the model was trained at.
     config.methods = ("windows", "offline", "chunks")
-    config.settings = ConfigDict({"offline": {"max_frames": 200}, "chunks": {"size": 12, "overlap": 6}})
+    config.settings = method_fields({"offline": {"max_frames": 200}, "chunks": {"size": 12, "overlap": 6}})
     # Names of logvggt_jax/evaluation/methods/variants.py, evaluated beside the methods.
     config.variants = ()
     # Sequences that are timed on this device, by their numbers of frames.

@@ -4,6 +4,8 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
+from ml_collections import ConfigDict
+
 from logvggt_jax.config import from_mapping, require_counts
 from logvggt_jax.data.option_fields import given_options
 from logvggt_jax.errors import InputError
@@ -22,7 +24,8 @@ class Run:
     baselines: bool  # whether answers that need no learning are evaluated beside the model
     # Rows of the model, names of `logvggt_jax.streaming.METHODS`; the first one is drawn.
     methods: tuple[str, ...] = ("windows", "offline", "chunks")
-    # Fields of a method's own settings class, by the method's name; what is left out has that class's defaults.
+    # Fields of a method's own settings class, by the method's name, whose hyphen may be an underscore as flags have it;
+    # what is left out has that class's defaults.
     settings: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
     # Names of `logvggt_jax.evaluation.methods.variants.VARIANTS` that are evaluated beside the methods.
     variants: tuple[str, ...] = ()
@@ -30,6 +33,8 @@ class Run:
     timings: TimingConfig | None = None
 
     def __post_init__(self) -> None:
+        settings = {name.replace("_", "-"): fields for name, fields in self.settings.items()}
+        object.__setattr__(self, "settings", settings)
         for field, known in {"methods": METHODS, "settings": METHODS, "variants": VARIANTS}.items():
             for name in getattr(self, field):
                 if name not in known:
@@ -89,6 +94,19 @@ class PaperRun(Run):
             raise InputError("PaperRun.benchmarks must name at least one, for example ('*',) or ('seven_scenes-*',)")
         require_counts(self, "max_sequences")
         require_counts(self, "figures", least=0)
+
+
+def method_fields(chosen: Mapping[str, Mapping[str, Any]]) -> ConfigDict:
+    """The settings of all methods as a configuration file holds them, so that each can be given on the command line,
+    under the method's name with an underscore for its hyphen.
+
+    Args:
+      chosen: of some methods, by name, settings and their values; the others are the defaults.
+    """
+    fields = {}
+    for name, method in METHODS.items():
+        fields[name.replace("-", "_")] = {**dataclasses.asdict(method.settings()), **chosen.get(name, {})}
+    return ConfigDict(fields, sort_keys=False)
 
 
 def read_run(values: Mapping[str, Any]) -> ClipRun | PaperRun:

@@ -49,6 +49,15 @@ def test_an_evaluation_leaves_tables_json_and_figures(
     ("arguments", "message"),
     [
         (["--config.evaluation.strides=3"], "no such field: 'strides' Did you mean \"stride\""),
+        (
+            ["--config.settings.anchored-window.window=3"],
+            "--config.settings.anchored-window.window: no field is named so",
+        ),
+        (["--config.evaluation..stride=3"], "--config.evaluation..stride: no field is named so"),
+        (["--config.=3"], "--config.: no field is named so"),
+        (["--config.options.num_rooms[0]=3"], "no such field: <class 'int'> does not support integer indexing [0]"),
+        (["--config.evaluation.clip_lengths[0]=3"], "no such field: 0 is not a valid index for <class 'tuple'>"),
+        (["--config.methods.x=3"], "no such field: tuple indices must be integers"),
         (["--config=configs/eval/none.py"], "configs/eval/none.py"),
         (["--flagfile=none.txt"], "Unable to open flagfile: [Errno 2] No such file or directory: 'none.txt'"),
         (["--data_root=d", "--config.evaluation.image_size=(28, 42)"], "leave --data_root=d out"),

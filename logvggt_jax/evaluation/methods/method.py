@@ -103,16 +103,16 @@ def model_row(
     """A row of the model, run by the `method` of that name of `logvggt_jax.streaming.METHODS`.
 
     `settings` are the method's own dataclass, None for its defaults; `name` is the row's label and `knows` what the
-    table says of it, by default the method's title, and its summary with the settings.
+    table says of it, by default the method's title, and its summary with the settings that are not the defaults.
     """
     found = METHODS[method]
 
     def start() -> Predictor:
         return open_predictor(method, checkpoint.model, checkpoint.variables, settings)
 
-    described = None if settings is None else dataclasses.asdict(settings)
+    described, defaults = (dataclasses.asdict(each) for each in (found.chosen(settings), found.settings()))
     if knows is None:
-        chosen = ", ".join(f"{key}={value}" for key, value in (described or {}).items())
+        chosen = ", ".join(f"{key}={value}" for key, value in described.items() if value != defaults[key])
         knows = f"its training; {found.summary}{f' ({chosen})' if chosen else ''}"
     identity = [method, described, checkpoint.model.config.to_dict(), checkpoint.digest]
     return Method(name or found.title, knows, lambda images: predicted(start(), images), identity, start)
