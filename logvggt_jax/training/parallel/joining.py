@@ -50,6 +50,7 @@ def join_processes(
     waited = (
         f"not all {f'of the {num_processes} ' if num_processes else ''}processes joined within {join_seconds:g} s "
         f"(process 0 is to be at {coordinator or 'an address that the cluster gives'}): look at the output of each, "
+        f"{'' if process_id is None else 'give each a --process_id of its own, '}"
         "and give --join_seconds where machines start later than that"
     )
     # JAX would end the process itself, with a trace.

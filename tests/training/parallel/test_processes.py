@@ -325,7 +325,9 @@ def test_a_process_that_never_joins_is_waited_for_as_long_as_stated(programs: Ro
     with PixelRuns(programs, tmp_path, tmp_path, patches=("", "sys.exit()"), flags=("--join_seconds=2",)) as runs:
         errors = runs.errors(0)
         assert runs.processes[0].returncode == 1
-    assert re.fullmatch(r"train.py: not all of the 2 processes joined within 2 s .*\n", errors)
+    assert re.fullmatch(
+        r"train.py: not all of the 2 processes joined within 2 s .*give each a --process_id of its own.*\n", errors
+    )
 
 
 @pytest.mark.slow
