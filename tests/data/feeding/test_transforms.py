@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from logvggt_jax.data.feeding.transforms import ResizeTransform, fit, nearest_size, preprocess, resize
@@ -149,6 +149,7 @@ def test_points_project_to_the_transformed_pixels(seed: int, height: int, width:
 
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 10**6))
+@example(680)
 def test_resampled_pictures_follow_their_cameras(seed: int):
     """A picture that shows its own ray directions still does after fitting."""
     rng = np.random.default_rng(seed)
@@ -161,8 +162,11 @@ def test_resampled_pictures_follow_their_cameras(seed: int):
     pixel = 1 / fitted.intrinsics[0, 0, 0]
     # Two border pixels see a cut-off filter; half a grey level is 1/160.
     inner = (slice(None), slice(2, -2), slice(2, -2))
-    difference = (fitted.images[..., :2] / 80 - 1.5 - expected[..., :2])[inner]
-    assert np.abs(difference).max() < 1.2 / 80 and np.abs(difference.mean()) < 0.3 / 80
+    assert np.abs(fitted.images[..., :2] / 80 - 1.5 - expected[..., :2])[inner].max() < 1.2 / 80
+    # A slope of two levels a pixel may be rounded the same way throughout, like a shift, but for levels that waver.
+    frames.images[..., :2] = np.floor((rays[..., :2] + 1.5) * 80 + rng.random(rays[..., :2].shape))
+    wavering = (fit(frames, (56, 70)).images[..., :2] / 80 - 1.5 - expected[..., :2])[inner]
+    assert np.abs(wavering.mean()) < 0.3 / 80
     # Nearest depth is at most half an original pixel off.
     source_pixel = 1 / frames.intrinsics[0, 0, 0]
     assert np.abs(fitted.depth - 3 - expected[..., 0]).max() < 0.51 * source_pixel + 0.01 * pixel
