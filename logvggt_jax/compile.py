@@ -69,8 +69,8 @@ def check_devices() -> None:
         platform = jax.default_backend()
     except (RuntimeError, AssertionError) as error:
         raise InputError(
-            f"JAX_PLATFORMS={asked}: these devices do not start ({one_line(error):.200}); install JAX for them "
-            f"({install_line('cuda')} for NVIDIA GPUs) or unset JAX_PLATFORMS"
+            f"JAX_PLATFORMS={asked}: these devices do not start ({one_line(error):.200}); {_mend(asked)} or unset "
+            "JAX_PLATFORMS"
         ) from error
     if platform == "cpu" and "cpu" not in asked and nvidia_gpu_present():
         warnings.warn(
@@ -78,6 +78,16 @@ def check_devices() -> None:
             "JAX_PLATFORMS=cpu",
             stacklevel=2,
         )
+
+
+def _mend(asked: str) -> str:
+    built = any(name.startswith("jax-cuda") for name in installed_packages())
+    if built and not nvidia_gpu_present() and {"cuda", "gpu"} & set(asked.split(",")):
+        return (
+            "JAX for NVIDIA GPUs is installed, but no GPU with its driver is there: see that nvidia-smi lists one (in "
+            "a container: docker run --gpus all)"
+        )
+    return f"install JAX for them ({install_line('cuda')} for NVIDIA GPUs)"
 
 
 @functools.cache

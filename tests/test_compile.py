@@ -22,9 +22,23 @@ def test_a_platform_that_does_not_start_is_one_line(monkeypatch: pytest.MonkeyPa
     def refuse() -> str:
         raise AssertionError
 
+    def message() -> str:
+        with pytest.raises(InputError, match=r"do not start \(AssertionError\).*unset JAX_PLATFORMS$") as refused:
+            module.check_devices()
+        return str(refused.value)
+
     monkeypatch.setattr(jax, "default_backend", refuse)
-    with pytest.raises(InputError, match=r"do not start \(AssertionError\).*logvggt-jax\[cuda\].*unset JAX_PLATFORMS"):
-        module.check_devices()
+    monkeypatch.setattr(module, "nvidia_gpu_present", lambda: False)
+    monkeypatch.setattr(module, "installed_packages", lambda: {"jax": "0.11.2", "jax-cuda13-plugin": "0.11.2"})
+    assert "pip install" in message(), "of other devices"
+    platforms = jax.config.jax_platforms
+    jax.config.update("jax_platforms", "cuda")
+    try:
+        assert "see that nvidia-smi lists one" in message()
+        monkeypatch.setattr(module, "installed_packages", lambda: {"jax": "0.11.2"})
+        assert "logvggt-jax[cuda]" in message()
+    finally:
+        jax.config.update("jax_platforms", platforms)
 
 
 def test_programs_are_counted_as_they_are_made() -> None:
