@@ -40,5 +40,6 @@ def get_config(initial_weights: str = "") -> ConfigDict:
         del config.stages.stage_1
         config.stages.stage_2.steps, config.stages.stage_3.steps = 300, 1400
         config.optimizer.update(learning_rate=5e-4, schedule="cosine")
-        config.data.sources.rooms.options.num_rooms = 3600  # 9.5 GB on the disk
+        config.data.sources.rooms.options.num_rooms = 3600
+        config.data.cache_dir = "runs/rooms-cache"  # 9.5 GB, more than is kept in memory
     return with_all_fields(config)

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import importlib
+import inspect
 import math
 import operator
 import os
@@ -19,6 +20,7 @@ from root_programs import RootPrograms
 
 from logvggt_jax import LogVGGT, ModelConfig
 from logvggt_jax.data.feeding.holdouts import PUBLISHED
+from logvggt_jax.data.rooms.pool import render_pool
 from logvggt_jax.data.rooms.rooms import Rooms
 from logvggt_jax.described import cudnn_by_description
 from logvggt_jax.doctor import training as doctors_step
@@ -111,6 +113,23 @@ def test_a_model_of_rooms_goes_on_from_weights_with_its_last_stages(
     assert more.stages == tuple(dataclasses.replace(stage, steps=each) for stage, each in last)
     assert more.model == whole.model
     assert more.optimizer.learning_rate < whole.optimizer.learning_rate
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments"),
+    [*((name, ()) for name in ("tiny", "demo", "rooms", "small", "distill_rooms")), ("rooms", ("weights",))],
+)
+def test_rooms_that_are_kept_in_memory_fit_there(
+    name: str, arguments: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(ROOT))
+    config = importlib.import_module(f"configs.{name}").get_config(*arguments)
+    data = TrainConfig.from_dict(config.to_dict()).data
+    rooms = Rooms("train", **dict(data.sources[0].options))
+    frames = len(rooms.sequences) * rooms.num_frames(rooms.sequences[0])
+    in_memory = data.cache_dir is None and rooms.renderer == "host"
+    most = inspect.signature(render_pool).parameters["max_bytes"].default
+    assert not in_memory or 7 * frames * math.prod(rooms.image_size(rooms.sequences[0])) < most
 
 
 def test_what_ships_is_trained_on_by_a_script() -> None:
