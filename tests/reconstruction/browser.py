@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import shutil
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
-from PIL import Image
 
 SIZE = (500, 800)
 
@@ -24,14 +21,6 @@ def browser_command(profile: Path) -> list[str]:
     options = ("headless", "no-sandbox", "use-angle=swiftshader", "enable-unsafe-swiftshader", "hide-scrollbars")
     size = f"--window-size={SIZE[1]},{SIZE[0]}"
     return [program, *(f"--{option}" for option in options), size, f"--user-data-dir={profile}"]
-
-
-def photograph(page: Path, profile: Path, *options: str) -> np.ndarray:
-    """What a page in a file looks like, [H, W, 3] uint8."""
-    picture = profile.with_suffix(".png")
-    command = [*browser_command(profile), *options, "--virtual-time-budget=2000", f"--screenshot={picture}"]
-    subprocess.run([*command, page.as_uri()], check=True, capture_output=True, timeout=120)
-    return np.asarray(Image.open(io.BytesIO(picture.read_bytes())).convert("RGB"))
 
 
 @contextlib.contextmanager

@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browser import photograph
-from devtools import opened
+from devtools import Page, opened
 from PIL import Image
 from result_folder import write_result
 from room_result import write_room_result
@@ -22,6 +21,14 @@ from logvggt_jax.errors import InputError, OutputExists
 from logvggt_jax.reconstruction.points.cloud_file import VERTEX, write_points
 from logvggt_jax.reconstruction.result import Reconstruction
 from logvggt_jax.reconstruction.viewer import save_page
+
+
+def wait_until(page: Page, state: str) -> None:
+    """Until a page says that it is in this state."""
+    end = time.monotonic() + 30
+    while page.value("document.body && document.body.dataset.state") != state:
+        assert time.monotonic() < end, f"the page is not {state!r}"
+        time.sleep(0.1)
 
 
 def scene_of(page: Path) -> dict[str, Any]:
@@ -159,12 +166,16 @@ def test_what_cannot_be_saved_is_one_line_and_leaves_what_was_there(room: Recons
 def test_a_browser_draws_the_page(room: Reconstruction, tmp_path: Path) -> None:
     page = tmp_path / "room.html"
     save_page(room.folder, page)
-    picture = photograph(page, tmp_path / "with")
+    with opened(page.as_uri(), tmp_path / "with", tmp_path) as browser:
+        wait_until(browser, "drawn")
+        picture = browser.picture()
     # Left of the controls there is more than the ground, and it has the room's colours.
     scene = picture[:, :500]
     drawn = np.abs(scene.astype(int) - 0x12).max(axis=2) > 25
     assert 0.1 < drawn.mean() < 0.98 and scene[drawn].std(axis=0).min() > 10
-    without = photograph(page, tmp_path / "without", "--disable-3d-apis")
+    with opened(page.as_uri(), tmp_path / "without", tmp_path, "--disable-3d-apis") as browser:
+        wait_until(browser, "no WebGL")
+        without = browser.picture()
     # A line of text on an even ground.
     assert 0.001 < (np.abs(without.astype(int) - 0x12).max(axis=2) > 25).mean() < 0.06
 
@@ -176,9 +187,7 @@ def test_the_page_is_used_on_a_phone_and_by_keyboard(room: Reconstruction, tmp_p
     with opened("about:blank", tmp_path / "profile", tmp_path) as page:
         page.call("Emulation.setDeviceMetricsOverride", width=390, height=844, deviceScaleFactor=1, mobile=True)
         page.call("Page.navigate", url=file.as_uri())
-        end = time.monotonic() + 30
-        while page.value("document.body && document.body.dataset.state") != "drawn" and time.monotonic() < end:
-            time.sleep(0.1)
+        wait_until(page, "drawn")
         # The controls are out of the way until they are asked for.
         height = "document.getElementById('panel').clientHeight"
         assert page.value(height) < 60
