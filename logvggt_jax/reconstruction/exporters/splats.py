@@ -55,7 +55,9 @@ def export_splats(
 
 
 def _widths(result: Reconstruction, vertices: np.ndarray) -> np.ndarray:
-    """Standard deviations [n]: half of the root mean square distance to the nearest neighbours.
+    """Standard deviations [n]: the root mean square distance to the nearest neighbours.
+
+    Balls of half of that let one see through a wall between them.
 
     What stands alone is no wider than the gap between the chosen pixels of its own frame, and what lies upon another
     point no narrower than a tenth of that.
@@ -66,4 +68,4 @@ def _widths(result: Reconstruction, vertices: np.ndarray) -> np.ndarray:
     height, width = result.depth_size
     gap = depth / result.depth_intrinsics[frames, 0, 0] * np.sqrt(height * width / np.bincount(frames)[frames])
     distances, _ = KDTree(points).query(points, _NEIGHBOURS + 1, workers=-1)
-    return np.clip(np.sqrt(np.mean(distances[:, 1:] ** 2, axis=1)) / 2, gap / 10, gap)
+    return np.clip(np.sqrt(np.mean(distances[:, 1:] ** 2, axis=1)), gap / 10, gap)
