@@ -202,7 +202,7 @@ def test_splats_leave_no_holes_in_what_a_camera_saw(result: Reconstruction, tmp_
     seen = unproject_pixels(result.depth(2)[None], result.depth_intrinsics[2:3], result.extrinsics[2:3], pixels)
     rays = seen - camera_centres(result.extrinsics[2:3])
     lengths = np.linalg.norm(rays, axis=-1, keepdims=True)
-    # What a ball hides of a ray depends on how near it passes; those far before or behind the surface hide other things.
+    # What a ball hides of a ray depends on how near it passes; those far from the surface hide other things.
     away = centres[None] - seen[:, None]
     along = np.einsum("pnc,pc->pn", away, rays / lengths)
     beside = np.maximum((away**2).sum(-1) - along**2, 0)
