@@ -7,6 +7,7 @@ import ast
 import contextlib
 import sys
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Any
 
 from logvggt_jax.cli.choices import FORMATS, METHOD_NAMES
@@ -24,7 +25,9 @@ from logvggt_jax.errors import InputError, one_line, printable
 from logvggt_jax.interruption import INTERRUPTED
 
 if TYPE_CHECKING:
+    from logvggt_jax.config import ModelConfig
     from logvggt_jax.reconstruction.result import Reconstruction
+    from logvggt_jax.reconstruction.sources import Source
 
 SOURCE_OPTIONS = ("stride", "max_frames", "fps", "start", "end", "pattern", "size_mismatch", "strict")
 
@@ -96,7 +99,8 @@ def _reconstruct(options: argparse.Namespace) -> int:
     if options.dry_run:
         return 0
     with watched(options) as window:
-        model, variables = loaded_model(checkpoint, options)
+        with _first_programs(source, config, method, settings, longer_edge, options):
+            model, variables = loaded_model(checkpoint, options)
         result = reconstruct(
             source,
             options.output,
@@ -121,6 +125,23 @@ def _reconstruct(options: argparse.Namespace) -> int:
             print("logvggt: note: not exported, since it is incomplete; see logvggt export --help", file=sys.stderr)
         stay_open(window, result)
     return code
+
+
+def _first_programs(
+    source: Source, config: ModelConfig, method: str, settings: Any, longer_edge: int, options: argparse.Namespace
+) -> AbstractContextManager[None]:
+    """Compiles what the run begins with while weights are read, where it is known by then."""
+    from logvggt_jax.data.feeding.transforms import resized_size
+    from logvggt_jax.model.logvggt import LogVGGT
+    from logvggt_jax.streaming import METHODS
+    from logvggt_jax.streaming.program import compiled_meanwhile
+
+    if source.image_size is None or source.masks is not None or options.precision:
+        return contextlib.nullcontext()
+    found, size = METHODS[method], resized_size(source.image_size, longer_edge)
+    return compiled_meanwhile(
+        lambda: found.opening(LogVGGT(config), size, found.chosen(settings), source.expected_frames)
+    )
 
 
 def _exports(result: Reconstruction, formats: Sequence[str]) -> int:

@@ -24,7 +24,7 @@ from logvggt_jax.model.parameters import in_compute_type
 from logvggt_jax.streaming.alignment import align, move, residual
 from logvggt_jax.streaming.loops import LoopCloser, LoopSettings, frame_describer, loop_settings
 from logvggt_jax.streaming.named_arrays import of_part, part_of
-from logvggt_jax.streaming.offline import FinalFrames, PlainPrediction, plain_program, predict_plain
+from logvggt_jax.streaming.offline import FinalFrames, PlainPrediction, lowered_plain, plain_program, predict_plain
 from logvggt_jax.streaming.program import Program
 from logvggt_jax.streaming.results import (
     Cameras,
@@ -162,6 +162,13 @@ def chunk_program(model: LogVGGT, image_size: tuple[int, int], plan: ChunkPlan, 
     size = min(plan.size, num_frames or plan.size)
     final = size - plan.overlap if size == plan.size else size
     return plain_program(model, image_size, size)._replace(frames=final)
+
+
+def chunk_opening(
+    model: LogVGGT, image_size: tuple[int, int], plan: ChunkPlan, num_frames: int | None
+) -> list[jax.stages.Lowered]:
+    """A full chunk's program where there is sure to be one, see `Method.opening`."""
+    return [lowered_plain(model, image_size, plan.size)] if num_frames and num_frames > plan.size else []
 
 
 class ChunkSession:

@@ -95,7 +95,13 @@ def plain_program(model: LogVGGT, image_size: tuple[int, int], num_frames: int) 
     plain, variables = plain_vggt(model, num_frames), abstract_variables(model.config)
     images = jax.ShapeDtypeStruct((num_frames, *image_size, 3), np.uint8)
     flops = flops_of(plain, lambda chosen: lambda v, i: chosen.apply(v, i[None]), variables, images)
-    return Program(_predict.lower(plain, variables, images), flops, num_frames)
+    return Program(lowered_plain(model, image_size, num_frames), flops, num_frames)
+
+
+def lowered_plain(model: LogVGGT, image_size: tuple[int, int], num_frames: int) -> jax.stages.Lowered:
+    """The program that `predict_plain` calls for so many frames without masks."""
+    images = jax.ShapeDtypeStruct((num_frames, *image_size, 3), np.uint8)
+    return _predict.lower(plain_vggt(model, num_frames), abstract_variables(model.config), images, None)
 
 
 class FinalFrames:

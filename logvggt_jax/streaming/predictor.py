@@ -19,7 +19,7 @@ from logvggt_jax.errors import InputError
 from logvggt_jax.model.logvggt import LogVGGT, Variables
 from logvggt_jax.streaming.anchored_window import AnchoredWindowSettings, KeepWindow
 from logvggt_jax.streaming.causal import CausalSettings, KeepAll
-from logvggt_jax.streaming.chunks import ChunkPlan, ChunkSession, chunk_program
+from logvggt_jax.streaming.chunks import ChunkPlan, ChunkSession, chunk_opening, chunk_program
 from logvggt_jax.streaming.frame_session import FrameSession, Keeping, frame_program, tokens_a_frame
 from logvggt_jax.streaming.merged import MergedSession, MergedSettings, merged_program
 from logvggt_jax.streaming.offline import OfflineSession, OfflineSettings, offline_program
@@ -27,7 +27,7 @@ from logvggt_jax.streaming.program import Program
 from logvggt_jax.streaming.pruned import KeepWanted, PrunedSettings
 from logvggt_jax.streaming.results import Cameras, FrameResult, Progress, Signals
 from logvggt_jax.streaming.rolling import KeepWithinBudget, RollingSettings
-from logvggt_jax.streaming.windows import StreamSession, WindowSettings, window_program
+from logvggt_jax.streaming.windows import StreamSession, WindowSettings, window_opening, window_program
 
 
 class Predictor(Protocol):
@@ -110,6 +110,8 @@ class Method(NamedTuple):
         single `push` tells nothing.
       check: configuration of a model, (H, W) of the images and settings; raises PredictionError where what the method
         keeps cannot hold one such frame.
+      opening: of the same as `program` the programs, lowered, that a sequence without masks calls before its first
+        result, as its calls find them where they are compiled; none where these cannot be told beforehand.
     """
 
     title: str
@@ -121,6 +123,7 @@ class Method(NamedTuple):
     takes_masks: bool = False
     in_batches: bool = False
     check: Callable[[ModelConfig, tuple[int, int], Any], None] = lambda config, image_size, settings: None
+    opening: Callable[[LogVGGT, tuple[int, int], Any, int | None], list[jax.stages.Lowered]] = lambda *_: []
 
     def chosen(self, settings: Any) -> Any:
         """These settings, or the defaults where they are None."""
@@ -160,6 +163,7 @@ METHODS: dict[str, Method] = {
         "overlapping windows that hand tokens on, poses refined globally",
         window_program,
         takes_masks=True,
+        opening=window_opening,
     ),
     "offline": Method(
         "VGGT offline",
@@ -180,6 +184,7 @@ METHODS: dict[str, Method] = {
         chunk_program,
         takes_masks=True,
         in_batches=True,
+        opening=chunk_opening,
     ),
     "merged": Method(
         "FastVGGT",

@@ -1,9 +1,11 @@
-"""The program in which a method spends its time, for estimates of what it needs."""
+"""Programs of a method before it has parameters or frames: for estimates of what it needs, and to compile them."""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from typing import Any, NamedTuple
 
 import jax
@@ -37,3 +39,21 @@ def abstract_variables(config: ModelConfig) -> dict[str, Any]:
 def flops_of(model: LogVGGT, call: Callable[[LogVGGT], Callable[..., Any]], *arguments: Any) -> float:
     """Operations of `call(model)` on abstract arguments, whichever kernels the model has."""
     return count_flops(call(LogVGGT(dataclasses.replace(model.config, attention="xla"))), *arguments)
+
+
+@contextlib.contextmanager
+def compiled_meanwhile(lower: Callable[[], Sequence[jax.stages.Lowered]]) -> Iterator[None]:
+    """Compiles what `lower` gives, all at once, in threads of their own while the body runs, whose end waits for them.
+
+    Calls of the same programs then find them made. What fails here fails in these calls as well, where it is explained;
+    what the body raises waits for nothing.
+    """
+    pool = ThreadPoolExecutor(thread_name_prefix="compilation")
+    begun = pool.submit(lambda: [pool.submit(lowered.compile) for lowered in lower()])
+    try:
+        yield
+        wait([begun])
+        if begun.exception() is None:
+            wait(begun.result())
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)

@@ -76,16 +76,30 @@ def window_program(
     model: LogVGGT, image_size: tuple[int, int], settings: WindowSettings, num_frames: int | None
 ) -> Program:
     """The step of a stream whose frames are all real."""
+    plain, (_, arguments) = in_one_mode(model), _abstract_calls(model, image_size)
+    flops = flops_of(plain, lambda chosen: chosen.step, *arguments)
+    return Program(_step.lower(plain, *arguments), flops, model.config.windows.stride)
+
+
+def window_opening(
+    model: LogVGGT, image_size: tuple[int, int], settings: WindowSettings, num_frames: int | None
+) -> list[jax.stages.Lowered]:
+    """What a stream without masks calls before its first result, see `Method.opening`."""
+    plain, (start, step) = in_one_mode(model), _abstract_calls(model, image_size)
+    return [_start.lower(plain, *start), _step.lower(plain, *step)]
+
+
+def _abstract_calls(model: LogVGGT, image_size: tuple[int, int]) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+    """The arguments of `_start` and of `_step` as a session has them where all frames are real and have no masks."""
     plain, config = in_one_mode(model), model.config.windows
     variables = abstract_variables(model.config)
 
     def frames(count: int) -> jax.ShapeDtypeStruct:
         return jax.ShapeDtypeStruct((1, count, *image_size, 3), jnp.uint8)
 
-    state = jax.eval_shape(lambda v, f: plain.start(v, f, None), variables, frames(config.size - config.stride))
-    arguments = (variables, state, frames(config.stride))
-    flops = flops_of(plain, lambda chosen: lambda v, s, f: chosen.step(v, s, f, None), *arguments)
-    return Program(_step.lower(plain, *arguments, None), flops, config.stride)
+    start = (variables, frames(config.size - config.stride), None, None)
+    state = jax.eval_shape(plain.start, *start)
+    return start, (variables, state, frames(config.stride), None, None)
 
 
 class _Frame(NamedTuple):

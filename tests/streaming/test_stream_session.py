@@ -12,9 +12,10 @@ import pytest
 
 from logvggt_jax import LogVGGT, ModelConfig, Predictions, RefinementConfig, WindowConfig
 from logvggt_jax.errors import InputError
-from logvggt_jax.streaming import METHODS, LoopSettings, open_predictor, pose_stream
+from logvggt_jax.streaming import METHODS, ChunkPlan, LoopSettings, open_predictor, pose_stream
 from logvggt_jax.streaming import windows as session_module
 from logvggt_jax.streaming.loops import LoopCloser
+from logvggt_jax.streaming.program import compiled_meanwhile
 from logvggt_jax.streaming.results import Cameras
 from logvggt_jax.streaming.windows import FrameResult, StreamSession, WindowSettings
 
@@ -282,6 +283,44 @@ def test_nothing_compiles_per_frame_and_the_state_does_not_grow(
     assert state_bytes() == size
     assert session._poses._store.capacity == capacity == 64
     assert len(session._pending) < 2
+
+
+@pytest.mark.parametrize(
+    ("method", "settings", "names"),
+    [("windows", None, ("_start", "_step")), ("chunks", ChunkPlan(3, 1), ("_predict",))],
+)
+def test_what_is_compiled_meanwhile_is_what_a_stream_begins_with(
+    method: str,
+    settings: Any,
+    names: tuple[str, ...],
+    small_config: ModelConfig,
+    small_variables: dict,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    model, found, size = with_modes(small_config), METHODS[method], (42, 14)  # sizes that no other test compiles for
+
+    def compiled_for(size: tuple[int, int]) -> set[str]:
+        predictor = open_predictor(method, model, small_variables, settings)
+        caplog.clear()
+        with jax.log_compiles():
+            for frame in np.zeros((4, *size, 3), np.uint8):
+                predictor.push(frame)
+        return {name for name in names for each in caplog.messages if f"XLA compilation of jit({name})" in each}
+
+    with compiled_meanwhile(lambda: found.opening(model, size, found.chosen(settings), 10)):
+        pass
+    assert not compiled_for(size)
+    assert compiled_for(size[::-1]) == set(names)
+
+
+def test_what_fails_meanwhile_is_left_to_the_stream() -> None:
+    def lower() -> list[jax.stages.Lowered]:
+        raise MemoryError
+
+    with compiled_meanwhile(lower):
+        pass
+    with pytest.raises(InputError, match="no weights"), compiled_meanwhile(lower):
+        raise InputError("no weights")
 
 
 def test_programs_grow_with_the_logarithm_of_a_stream_that_reads_everything(
