@@ -155,9 +155,7 @@ class _Run:
             self.validation = Validation(LogVGGT(config.model), config.validation, layout, validated)
             self.validation_set = validation_digest(config, validated)
         self.checkpoints = RunCheckpoints(workdir, config, trained_on=trained_on)
-        self.peak = None
-        if layout.mesh.devices.flat[0].platform != "cpu":  # whose cores share one peak
-            self.peak = layout.mesh.size * matmul_flops_per_second(config.model.dtype)
+        self.peak = _peak(layout.mesh, config.model.dtype)
         self.vote = Vote(layout.mesh, delay=steps_in_flight.MOST)
 
     def start(self, resume_step: int | None) -> tuple[int, Position | None]:
@@ -255,7 +253,7 @@ class _Run:
             self.profiler.before(step + 1)
             self.state, metrics, finite = program(self.state, batch)
             step += 1
-            self.times.count(self.operations.get(batch["images"].shape, 0.0))
+            self.times.count(self._operations_of(batch["images"].shape[:4]))
             self.in_flight.add(step, metrics, finite, batch, batches.names)
             if self.profiler.is_last(step):
                 self.in_flight.finish()
@@ -330,15 +328,23 @@ class _Run:
             taught = self.config.teacher is not None
             for number, step in enumerate(compiled_steps(self.program, self.state, stage, new, taught=taught), 1):
                 self.programs[step.clips] = step.run
-                if self.peak is not None:
-                    self.operations[step.clips] = step_flops(
-                        self.config.model, step.clips[:4], frozen=frozen_patterns(self.config)
-                    )
                 height, width = step.clips[2:4]
                 log.say(
                     f"{stage.name}: step for images of {height} x {width} compiled after {step.seconds:.0f} s, "
                     f"{number} of {len(new)}"
                 )
+
+    def _operations_of(self, clips: tuple[int, ...]) -> float:
+        """Operations of a step on clips [B, T, H, W]; 0 where utilisation is not known.
+
+        Counting them takes seconds for each size: it is done when the first of its steps is on the device, which has
+        work meanwhile, so that no start waits for all of them.
+        """
+        if self.peak is None:
+            return 0.0
+        if clips not in self.operations:
+            self.operations[clips] = step_flops(self.config.model, clips, frozen=frozen_patterns(self.config))
+        return self.operations[clips]
 
     def _log(self, step: int, end: int, stage: StageConfig, broken_clips: int, log: MetricsLog) -> None:
         """One line about the steps since the last one, all of which have finished."""
@@ -406,3 +412,10 @@ class _Run:
         # A process that left alone would let the others wait for its share of the next step for ever.
         ending = (reason or "another process is to stop") if self.vote(reason is not None) else None
         return ending, failure
+
+
+def _peak(mesh: Mesh, dtype: str) -> float | None:
+    """Operations a second of all devices at their best; None for CPUs, whose cores share one peak."""
+    if mesh.devices.flat[0].platform == "cpu":
+        return None
+    return mesh.size * matmul_flops_per_second(dtype)

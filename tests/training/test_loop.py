@@ -31,10 +31,12 @@ from logvggt_jax.training.checkpoints import run_checkpoints
 from logvggt_jax.training.checkpoints.checkpoint_files import Position
 from logvggt_jax.training.checkpoints.run_checkpoints import RunCheckpoints
 from logvggt_jax.training.config import VALIDATION_METRICS, SourceConfig, StageConfig, TrainConfig, ValidationConfig
+from logvggt_jax.training.feeding.device_batches import DeviceBatches
 from logvggt_jax.training.loop import NonFiniteTraining, train
 from logvggt_jax.training.parallel.sharding import data_mesh
 from logvggt_jax.training.reporting.metrics_log import COST, TIMES_NAME, MetricsLog, read_metrics
 from logvggt_jax.training.reporting.profile import ProfiledSteps
+from logvggt_jax.training.step.freezing import frozen_patterns
 from logvggt_jax.training.step.program import Program, make_program
 from logvggt_jax.training.step.state import TrainState
 from logvggt_jax.training.validation.earlier import is_best
@@ -405,6 +407,32 @@ def test_a_line_shows_the_mean_of_its_interval(
     for name in ("loss/total", "train/abs_rel", "gradient_norm/depth_head"):
         assert lines[1][name] == pytest.approx((each[2][name] + each[3][name]) / 2)
     assert lines[1]["learning_rate"] == each[3]["learning_rate"]
+
+
+def test_operations_of_a_size_are_counted_behind_its_first_step(
+    run_config: TrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each takes seconds to count: a start waits for none of them."""
+    events: list[Any] = []
+
+    class Batches(DeviceBatches):
+        def __next__(self) -> Any:
+            batch = super().__next__()
+            events.append(batch["images"].shape[:4])
+            return batch
+
+    def count(model: Any, clips: tuple[int, ...], *, frozen: tuple[str, ...]) -> float:
+        assert (model, frozen) == (run_config.model, frozen_patterns(run_config))
+        events.append(("counted", clips))
+        return 1e6
+
+    monkeypatch.setattr(loop, "DeviceBatches", Batches)
+    monkeypatch.setattr(loop, "step_flops", count)
+    monkeypatch.setattr(loop, "_peak", lambda mesh, dtype: 1e6)
+    train(run_config, tmp_path, mesh=data_mesh(1))
+    first, second = (2, 2, 28, 42), (2, 3, 28, 42)
+    assert events == [first, ("counted", first), first, first, first, second, ("counted", second), second]
+    assert all(line["utilisation"] > 0 for line in read_metrics(tmp_path / "metrics.jsonl") if "loss" in line)
 
 
 def test_goodput_counts_earlier_sessions(
