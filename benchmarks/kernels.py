@@ -11,6 +11,9 @@ from logvggt_jax.program_text import ProgramText, bytes_of
 _INSTRUCTION = re.compile(r"^\s+(?:ROOT )?%?([\w.\-]+) = (\([^=]*?\)|\S+) ([\w\-]+)\((.*)$")
 # What takes no kernel of its own.
 _FREE = {"parameter", "constant", "get-tuple-element", "tuple", "bitcast", "after-all", "while", "call", "conditional"}
+_FUSED = re.compile(r" fusion\(.*\bcalls=%?([\w.\-]+)")
+# Of an instruction, all that says nothing of what is computed.
+_REMARKS = re.compile(r", (?:metadata|backend_config|frontend_attributes)=\{.*")
 _PRODUCT = ("__cublas", " dot(")
 
 
@@ -47,6 +50,19 @@ def kernels(program: str) -> dict[str, Kernels]:
             moved = sizes[result] + sum(sizes[operand] for operand in operands)
             found[kind] = Kernels(count + times, size + times * moved)
     return found
+
+
+def different_fusions(program: str) -> int:
+    """Fusions of a program without those that are another's equal: for GPUs XLA compiles each of these once."""
+    text = ProgramText(program)
+    fused = {name for lines in text.lines.values() for line in lines for name in _FUSED.findall(line)}
+    return len({_numbered("\n".join(_REMARKS.sub("", line) for line in text.lines[name])) for name in fused})
+
+
+def _numbered(body: str) -> str:
+    """A computation whose values are called by their order."""
+    numbers: dict[str, str] = {}
+    return re.sub(r"%[\w.\-]+", lambda match: numbers.setdefault(match[0], f"%{len(numbers)}"), body)
 
 
 def _kind(text: str) -> str:

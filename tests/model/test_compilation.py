@@ -16,7 +16,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import pytest
-from kernels import kernels
+from kernels import different_fusions, kernels
 
 from logvggt_jax.described import gpu_compiler_installed
 
@@ -87,7 +87,9 @@ def test_lowers_and_compiles_for_a_cpu_within_a_minute() -> None:
     assert figure(r"lowered in ([\d.]+) s", line) + figure(r"compiled in ([\d.]+) s", line) < 60
 
 
-@pytest.mark.parametrize("options", [(), ("--target", "cuda"), ("--target", "h100", "--masks")])
+@pytest.mark.parametrize(
+    "options", [(), ("--target", "cuda"), ("--target", "h100", "--masks"), ("--target", "h100", "--loops")]
+)
 def test_a_training_step_is_not_announced_where_another_would_be_compiled(
     options: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -117,3 +119,16 @@ def test_kernels_are_counted_as_often_as_they_run() -> None:
     assert kernels(text)["others"] == (1, 7 * 16)
     with pytest.raises(ValueError, match="not an instruction"):
         kernels(text.replace("fusion(%x)", "fusion"))
+
+
+def test_equal_fusions_are_counted_once() -> None:
+    def fused(name: str, operation: str, remark: str) -> str:
+        return (
+            f"%{name} (x.{name}: f32[4]) -> f32[4] {{\n  %x.{name} = f32[4] parameter(0)\n"
+            f'  ROOT %y.{name} = f32[4] {operation}(%x.{name}), metadata={{op_name="{remark}"}}\n}}\n\n'
+        )
+
+    computations = ("a", "negate", "layer 0"), ("b", "negate", "layer 1"), ("c", "sine", "layer 1")
+    calls = "".join(f"  %z.{name} = f32[4] fusion(%x), kind=kLoop, calls=%{name}\n" for name, *_ in computations)
+    entry = f"ENTRY %main (x: f32[4]) -> f32[4] {{\n  %x = f32[4] parameter(0)\n{calls}}}\n"
+    assert different_fusions("".join(fused(*each) for each in computations) + entry) == 2
