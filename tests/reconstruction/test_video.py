@@ -10,6 +10,7 @@ import socket
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -84,9 +85,10 @@ def write(
     turned: tuple[float, bool] | None = None,
     context: dict[str, Any] | None = None,
     source_pixels: dict[str, Any] | None = None,
+    container_options: dict[str, str] | None = None,
 ) -> Path:
     """Encodes images; `stamps` are presentation times in units of 1 / rate, `turned` is (degrees, mirrored)."""
-    with av.open(str(path), "w") as container:
+    with av.open(str(path), "w", options=container_options or {}) as container:
         stream = container.add_stream(codec, rate=rate, options=options or {})
         stream.height, stream.width = images[0].shape[:2]
         stream.pix_fmt = pixels
@@ -898,7 +900,7 @@ def test_a_picture_of_av1_that_vanishes_is_named(tmp_path: Path, name: str) -> N
 
 
 @pytest.mark.parametrize("slices", [1, 2])
-def test_damage_within_a_picture_of_h264_is_counted(tmp_path: Path, slices: int) -> None:
+def test_damage_within_a_picture_of_h264_is_counted(tmp_path: Path, library: str, slices: int) -> None:
     images = [busy(i).repeat(2, 0).repeat(2, 1) for i in range(8)]
     path = write(tmp_path / "walk.mp4", images, options={"bf": "0", "x264-params": f"slices={slices}"})
     content = bytearray(path.read_bytes())
@@ -907,7 +909,12 @@ def test_damage_within_a_picture_of_h264_is_counted(tmp_path: Path, slices: int)
     path.write_bytes(content)
     source = open_source(path)
     assert names(list(source)) == list(range(8))
-    assert source.notes == [f"{path}: frames with damaged parts, which the decoder filled by guesses: 1"]
+    (note,) = source.notes
+    if library == "pyav":
+        assert note == f"{path}: frames with damaged parts, which the decoder filled by guesses: 1"
+    else:
+        # The frame is decoded while one before it comes out.
+        assert re.match(re.escape(f"{path} is damaged about frame-00000") + r"[345] \(.+\): pictures there may", note)
 
 
 @pytest.mark.parametrize(
@@ -1114,7 +1121,9 @@ def test_an_mxf_video_cut_short_says_so(tmp_path: Path, library: str) -> None:
     source = open_source(path)
     assert len(list(source)) == 24 and not source.skipped
     path.write_bytes(path.read_bytes()[: packets(path)[12][0]])
-    with pytest.warns(UserWarning, match=r"ends early: 0\.4\d* s decoded, its header announces 0\.96 s"):
+    with pytest.warns(
+        UserWarning, match=r"ends early: (0\.4\d* s|12 frames) decoded, its header announces (0\.96 s|24)"
+    ):
         assert len(list(open_source(path, most_broken=1.0))) >= 10
 
 
@@ -1128,6 +1137,164 @@ def test_a_gif_cut_short_says_so(tmp_path: Path, library: str, place: float) -> 
     first = content.index(b",")
     path.write_bytes(content[: first + 400 + int((len(content) - 1 - first - 400) * place)])
     assert "cut.gif lacks its end" in open_source(path).notes[0]
+
+
+GROUP = {"g": "12", "bf": "2"}
+QUICK = {"g": "12", "deadline": "realtime", "cpu-used": "8"}
+FRAGMENTS = {"movflags": "frag_keyframe+empty_moov+default_base_moof"}
+# Name, codec, pixel format, its options, and the container's.
+KINDS: dict[str, tuple[str, str, dict[str, str], dict[str, str]]] = {
+    "h264.mp4": ("libx264", "yuv420p", GROUP, {}),
+    "fragments.mp4": ("libx264", "yuv420p", GROUP, FRAGMENTS),
+    "h264.mkv": ("libx264", "yuv420p", GROUP, {}),
+    "h264.ts": ("libx264", "yuv420p", GROUP, {}),
+    "h264.flv": ("libx264", "yuv420p", GROUP, {}),
+    "h264.nut": ("libx264", "yuv420p", GROUP, {}),
+    "h264.asf": ("libx264", "yuv420p", GROUP, {}),
+    "bare.h264": ("libx264", "yuv420p", GROUP, {}),
+    "hevc.mp4": ("libx265", "yuv420p", {"x265-params": "log-level=none:keyint=12"}, {}),
+    "hevc.ts": ("libx265", "yuv420p", {"x265-params": "log-level=none:keyint=12"}, {}),
+    "mpeg4.avi": ("mpeg4", "yuv420p", GROUP, {}),
+    "mpeg4.asf": ("mpeg4", "yuv420p", GROUP, {}),
+    "wmv2.wmv": ("wmv2", "yuv420p", {"g": "12"}, {}),
+    "flv1.flv": ("flv", "yuv420p", {"g": "12"}, {}),
+    "mpeg2.mpg": ("mpeg2video", "yuv420p", GROUP, {}),
+    "mpeg2.mxf": ("mpeg2video", "yuv420p", GROUP, {}),
+    "bare.m2v": ("mpeg2video", "yuv420p", GROUP, {}),
+    "vp8.webm": ("libvpx", "yuv420p", QUICK, {}),
+    "vp8.ivf": ("libvpx", "yuv420p", QUICK, {}),
+    "vp9.mkv": ("libvpx-vp9", "yuv420p", QUICK, {}),
+    "vp9.ivf": ("libvpx-vp9", "yuv420p", QUICK, {}),
+    "mjpeg.avi": ("mjpeg", "yuvj420p", {}, {}),
+    "mjpeg.mov": ("mjpeg", "yuvj420p", {}, {}),
+    "bare.mjpeg": ("mjpeg", "yuvj420p", {}, {}),
+    "ffv1.mkv": ("ffv1", "yuv420p", {}, {}),
+    "huffyuv.avi": ("huffyuv", "yuv422p", {}, {}),
+    "raw.y4m": ("wrapped_avframe", "yuv420p", {}, {}),
+    "raw10.y4m": ("wrapped_avframe", "yuv420p10le", {}, {}),
+    "raw.avi": ("rawvideo", "yuv420p", {}, {}),
+    "walk.gif": ("gif", "rgb8", {}, {}),
+}
+# What is told of any file of its kind.
+_OF_KIND = ("states no times", "does not notice where pictures of its codec change their size")
+
+
+def of_kind(tmp_path: Path, name: str, *, late: int = 0) -> Path:
+    """A whole video of this kind, whose first frame is shown so many steps after the file's clock begins."""
+    codec, pixels, options, container = KINDS[name]
+    images = [np.roll(busy(i // 8), 2 * i, 1) for i in range(40)]
+    options = options | ({"strict": "-1"} if "10" in pixels else {})
+    return write(
+        tmp_path / name,
+        images,
+        codec=codec,
+        pixels=pixels,
+        rate=25,
+        options=options,
+        stamps=[i + late for i in range(40)],
+        container_options=container | ({"strict": "-1"} if "10" in pixels else {}),
+    )
+
+
+def told(path: Path) -> list[str]:
+    """All that is said of a video, but what is said of any of its kind."""
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        try:
+            source = open_source(path, most_broken=1.0)
+            list(source)
+        except InputError as error:
+            return [str(error)]
+    notes = [note for note in source.notes if not any(each in note for each in _OF_KIND)]
+    return [*notes, *(frame.reason for frame in source.skipped), *(str(each.message) for each in warned)]
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_whole_videos_of_every_kind_draw_no_word(tmp_path: Path, library: str, name: str) -> None:
+    assert told(of_kind(tmp_path, name)) == []
+
+
+@pytest.mark.parametrize("name", ["h264.flv", "h264.asf", "mpeg4.asf", "wmv2.wmv", "flv1.flv", "h264.mkv", "h264.ts"])
+def test_what_begins_late_ends_no_earlier(tmp_path: Path, library: str, name: str) -> None:
+    assert told(of_kind(tmp_path, name, late=125)) == []
+
+
+def test_of_sound_that_goes_on_pictures_are_not_missing(tmp_path: Path, library: str) -> None:
+    path = of_kind(tmp_path, "h264.flv")
+    with av.open(str(path)) as container, av.open(str(tmp_path / "long.flv"), "w") as output:
+        stream, sound = (
+            output.add_stream_from_template(container.streams.video[0]),
+            output.add_stream("libmp3lame", 44100),
+        )
+        for number in range(150):
+            frame = av.AudioFrame.from_ndarray(np.zeros((2, 1152), np.float32), "fltp", "stereo")
+            frame.sample_rate, frame.pts, frame.time_base = 44100, 1152 * number, Fraction(1, 44100)
+            output.mux(sound.encode(frame))
+        for packet in container.demux(video=0):
+            if packet.size:
+                packet.stream = stream
+                output.mux(packet)
+    assert told(tmp_path / "long.flv") == []
+
+
+def sixths(content: bytes) -> list[bytes]:
+    step = -(-len(content) // 6)
+    return [content[place : place + step] for place in range(0, len(content), step)]
+
+
+# A sixth is zeros, a sixth is not there, the file ends at three fifths, or within its last packet.
+DAMAGES: dict[str, Callable[[bytes, int], bytes]] = {
+    "zeros": lambda content, _: b"".join(
+        bytes(len(part)) if number == 2 else part for number, part in enumerate(sixths(content))
+    ),
+    "hole": lambda content, _: b"".join(part for number, part in enumerate(sixths(content)) if number != 2),
+    "cut": lambda content, _: content[: len(content) * 3 // 5],
+    "end": lambda content, last: content[:last],
+}
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_damage_that_pyav_tells_is_told_by_opencv(
+    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = of_kind(tmp_path, name)
+    content, last = path.read_bytes(), max((place, size) for place, size, _ in packets(path) if place)
+    by_pyav, by_opencv = [], []
+    for kind, change in DAMAGES.items():
+        path.write_bytes(change(content, last[0] + last[1] // 2))
+        by_pyav += [kind] if told(path) else []
+        with monkeypatch.context() as hidden:
+            hidden.setitem(sys.modules, "av", None)
+            by_opencv += [kind] if told(path) else []
+    assert by_pyav and set(by_pyav) <= set(by_opencv)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_what_opencv_would_read_in_silence_is_refused(tmp_path: Path, opencv_only: None) -> None:
+    path = write(tmp_path / "walk.apng", [grey(i) for i in range(6)], codec="apng", pixels="rgb24")
+    with pytest.raises(
+        InputError, match=r"walk\.apng is of a format in which OpenCV does not notice damage: pip install"
+    ):
+        open_source(path)
+
+
+def test_a_codec_whose_damage_opencv_does_not_tell_is_named(tmp_path: Path, opencv_only: None) -> None:
+    path = write(tmp_path / "walk.mov", [grey(i) for i in range(6)], codec="prores_ks", pixels="yuv422p10le")
+    assert "walk.mov is ProRes, of which OpenCV does not notice damage" in open_source(path).notes[0]
+
+
+def test_errors_that_opencv_cannot_hear_are_told(
+    tmp_path: Path, opencv_only: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write(tmp_path / "walk.mp4", [grey(i) for i in range(6)])
+    monkeypatch.setenv("OPENCV_FFMPEG_DEBUG", "1")
+    (note,) = open_source(path).notes
+    assert note.endswith("decoded by OpenCV, whose errors cannot be read while OPENCV_FFMPEG_DEBUG is set: unset it")
+    monkeypatch.delenv("OPENCV_FFMPEG_DEBUG")
+    # As with an OpenCV that was built on its own.
+    monkeypatch.setattr(opencv_messages, "_library", lambda: None)
+    (note,) = open_source(path).notes
+    assert "an OpenCV that does not tell of parts which it fills by guesses" in note
 
 
 def test_a_gif_that_is_damaged_between_its_pictures_says_so(tmp_path: Path, library: str) -> None:
@@ -1147,7 +1314,7 @@ def test_a_transport_stream_cut_within_a_packet_says_so(tmp_path: Path, library:
     assert f"walk.{suffix} lacks its end" in open_source(path).notes[0]
 
 
-def test_packets_that_a_transport_stream_lost_are_told(tmp_path: Path) -> None:
+def test_packets_that_a_transport_stream_lost_are_told(tmp_path: Path, library: str) -> None:
     """The library marks the frames in which they are missing, whatever the codec."""
     options = {"g": "40", "b": "2000k"}
     path = write(tmp_path / "walk.ts", [busy(i) for i in range(40)], codec="mpeg2video", options=options)
@@ -1354,7 +1521,7 @@ def test_an_early_end_is_told_of_a_part_as_well(tmp_path: Path, library: str, su
         list(open_source(path, most_broken=1.0))
 
 
-def test_the_library_prints_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_the_library_prints_nothing(tmp_path: Path, library: str, capfd: pytest.CaptureFixture[str]) -> None:
     path, _ = damaged(tmp_path / "noise.mp4", [7, 15])
     list(open_source(path))
     assert capfd.readouterr() == ("", "")
@@ -1657,9 +1824,9 @@ def test_parameters_are_read_once_where_they_stay_the_same(
 def test_what_threads_print_comes_back_to_the_terminal(capfd: pytest.CaptureFixture[str]) -> None:
     def capture() -> None:
         for _ in range(20):
-            with opencv_messages.captured_stderr() as messages:
-                os.write(2, b"hidden")
-                assert messages() == "hidden"
+            with opencv_messages.captured_messages() as messages:
+                os.write(2, b"[h264 @ 0x5581] hidden\nothers")
+                assert opencv_messages.errors_of_ffmpeg(messages()) == ["hidden"]
 
     threads = [threading.Thread(target=capture) for _ in range(4)]
     for thread in threads:
@@ -1667,7 +1834,7 @@ def test_what_threads_print_comes_back_to_the_terminal(capfd: pytest.CaptureFixt
     for thread in threads:
         thread.join()
     os.write(2, b"shown")
-    assert capfd.readouterr().err == "shown"
+    assert capfd.readouterr().err == 80 * "others" + "shown"
 
 
 def test_digits_name_a_camera_unless_they_are_a_path(

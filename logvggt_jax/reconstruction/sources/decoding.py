@@ -63,6 +63,13 @@ class Damage(NamedTuple):
     reason: str
 
 
+class Complaint(NamedTuple):
+    """What the library says of damage on the way to what follows: pictures about it may be wrong in parts, or missing.
+    It stands for no frame."""
+
+    text: str
+
+
 class CodecChange(NamedTuple):
     """What follows is coded otherwise than what came before, and is not decoded; `seconds` as in `Picture`."""
 
@@ -81,6 +88,6 @@ class VideoDecoder(Protocol):
           InputError: it cannot be opened, holds no video, or nothing of it can be decoded.
         """
 
-    def pictures(self) -> Iterator[Picture | Damage | CodecChange]:
+    def pictures(self) -> Iterator[Picture | Damage | Complaint | CodecChange]:
         """The frames in the order in which they are shown; nothing follows a change of the codec. Raises InputError as
         `header` does."""

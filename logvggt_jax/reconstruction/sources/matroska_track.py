@@ -1,16 +1,17 @@
-"""How the pictures of a Matroska or WebM file are to be shown, as its first video track says (RFC 9559)."""
+"""What a Matroska or WebM file says (RFC 9559): where it ends, and how pictures of its first video are to be shown."""
 
 from __future__ import annotations
 
 import re
 import struct
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 
 from logvggt_jax.reconstruction.sources.mp4_track import TrackView
 
-_START, _CLUSTER = b"\x1a\x45\xdf\xa3", b"\x1f\x43\xb6\x75"
+_START, _SEGMENT, _CLUSTER = b"\x1a\x45\xdf\xa3", b"\x18\x53\x80\x67", b"\x1f\x43\xb6\x75"
 # Bytes within which tracks are described.
 _HEAD = 1 << 20
 # The element Projection, short enough for a length of one byte.
@@ -18,6 +19,26 @@ _PROJECTION = re.compile(rb"\x76\x70([\x80-\xfe])")
 _TYPE, _YAW, _PITCH, _ROLL = b"\x76\x71", b"\x76\x73", b"\x76\x74", b"\x76\x75"
 _TYPES = {1: "equirectangular", 2: "a cube map", 3: "a mesh"}
 _FLOATS = {4: ">f", 8: ">d"}
+
+
+def lacks_end(stream: IO[bytes]) -> bool:
+    """Whether a file is shorter than it says; one that was written without going back does not say."""
+    stream.seek(0)
+    if stream.read(len(_START)) != _START:
+        return False
+    stream.seek(_length(stream) or 0, 1)
+    if stream.read(len(_SEGMENT)) != _SEGMENT:
+        return False
+    length = _length(stream)
+    return length is not None and stream.tell() + length > stream.seek(0, 2)
+
+
+def _length(stream: IO[bytes]) -> int | None:
+    """The length of an element, whose first bit that is set tells how many bytes it takes; None where it is open."""
+    first = stream.read(1) or b"\0"
+    more = 8 - first[0].bit_length()
+    number = int.from_bytes(first + stream.read(more), "big") - (1 << 7 * (more + 1))
+    return None if number == (1 << 7 * (more + 1)) - 1 else max(0, number)
 
 
 def read_matroska_view(path: Path) -> TrackView | None:

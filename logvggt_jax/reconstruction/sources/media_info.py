@@ -30,6 +30,7 @@ class MediaHeader:
       transfer: PQ or HLG, as HDR is coded; None for neither.
       bare: the file is a stream of a codec and nothing else, which states no times.
       rate: frames a second of the first; None where it is not known.
+      sound: there is some.
     """
 
     sizes: list[tuple[int, int]]
@@ -39,6 +40,7 @@ class MediaHeader:
     transfer: str | None
     bare: bool
     rate: float | None
+    sound: bool
 
 
 def media_info_is_there() -> bool:
@@ -72,6 +74,7 @@ def read_media_header(path: Path) -> MediaHeader | None:
         transfer=next((each for each in _HDR_TRANSFERS if first.transfer_characteristics == each), None),
         bare=file.format == first.format,
         rate=_number(first.frame_rate),
+        sound=bool(information.audio_tracks),
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import re
 import time
@@ -15,11 +14,18 @@ import cv2
 import numpy as np
 
 from logvggt_jax.errors import InputError, install_line
-from logvggt_jax.reconstruction.sources.decoding import Damage, Picture, VideoHeader
+from logvggt_jax.reconstruction.sources.containers import AVI, FLASH, IVF, MP4, MXF, WINDOWS_MEDIA, container_of
+from logvggt_jax.reconstruction.sources.decoding import Complaint, Damage, Picture, VideoHeader
 from logvggt_jax.reconstruction.sources.matroska_track import read_matroska_view
 from logvggt_jax.reconstruction.sources.media_info import MediaHeader, media_info_is_there, read_media_header
 from logvggt_jax.reconstruction.sources.mp4_track import TrackView, read_mp4_view
-from logvggt_jax.reconstruction.sources.opencv_messages import captured_stderr, quiet
+from logvggt_jax.reconstruction.sources.opencv_messages import (
+    captured_messages,
+    errors_of_ffmpeg,
+    hears_all,
+    quiet,
+    redirected,
+)
 from logvggt_jax.reconstruction.sources.orientation import matrix_of, shown_size, turn
 from logvggt_jax.reconstruction.sources.packet_follower import PacketFollower, TimeStamps, look_at_times
 from logvggt_jax.reconstruction.sources.sampling import likely_frames
@@ -38,6 +44,12 @@ _MOST_FAILURES = 64
 _FIRST_FRAMES = 16
 # The codec by which FFmpeg draws text as a terminal would.
 _TEXT = "ansi"
+# Formats that state how many frames there are, MXF by its duration; of others OpenCV multiplies duration and rate.
+_STATE_FRAMES = (MP4, AVI, IVF, MXF)
+# Of these, formats whose header states the duration of the video; FFmpeg guesses that of others.
+_STATE_SECONDS = (WINDOWS_MEDIA, MXF)
+# What begins the names of codecs of which damage within a picture draws no word: ProRes.
+_SAY_NOTHING = "ap"
 _PYAV = install_line("video")
 _UNDECODED = "cannot be decoded"
 
@@ -55,20 +67,22 @@ class OpenCVDecoder:
         self._source, self._name, self._timeout = source, name, timeout
         self._file = None if isinstance(source, int) or timeout is not None else str(source)
         self._looked = False
+        self._container: str | None = None
         self._view = TrackView()
         self._media: MediaHeader | None = None
         self._matrix: np.ndarray | None = None
-        self._times = TimeStamps(exist=True, as_stored=False)
+        self._times = TimeStamps(exist=True, as_stored=False, begin=0.0)
 
     def header(self) -> VideoHeader:
         """See `VideoDecoder.header`."""
         self._look_at_file()
-        with captured_stderr() as messages:
+        with captured_messages() as messages:
             capture = self._open()
             read = any(capture.grab() for _ in range(_MOST_FAILURES))
             image = capture.retrieve()[1] if read else None
             count = capture.get(cv2.CAP_PROP_FRAME_COUNT)
             stated = int(count) if 0 < count <= self._bytes() else None
+            begins = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
             single = stated is None and not capture.grab()
             said = messages()
         codec = _fourcc(capture)
@@ -81,6 +95,11 @@ class OpenCVDecoder:
         if single or codec == _TEXT:
             kind = "text" if codec == _TEXT else "a single image"
             raise InputError(f"{self._name} is {kind}, not a video: give a video or the folder that holds the images")
+        if self._file is not None and self._container is None:
+            raise InputError(
+                f"{self._name} is of a format in which OpenCV does not notice damage: {_PYAV}, or re-encode "
+                "it, for example to H.264 mp4"
+            )
         frequency = capture.get(cv2.CAP_PROP_FPS)
         rate = frequency if math.isfinite(frequency) and frequency > 0 else None
         if self._media is not None and self._media.bare:
@@ -95,30 +114,39 @@ class OpenCVDecoder:
         if follower is not None:
             follower.close()
         seconds = self._view.seconds or (self._media.seconds if self._media else None)
+        if self._container == AVI and seconds is not None:
+            seconds -= begins
+        if stated and rate and self._states_seconds():
+            seconds = stated / rate - (self._times.begin if self._container == WINDOWS_MEDIA else 0.0)
         return VideoHeader(
             size=shown_size(image.shape[:2], matrix),
             rate=rate,
             frames=likely_frames(stated, seconds, rate),
-            announced=stated if self._states_frames() else None,
+            announced=stated if self._container in _STATE_FRAMES else None,
             seconds=seconds,
             notes=notes,
             lead=follower.lead if follower else 0,
             lead_seconds=follower.lead_seconds if follower else 0.0,
         )
 
-    def pictures(self) -> Iterator[Picture | Damage]:
+    def pictures(self) -> Iterator[Picture | Damage | Complaint]:
         """See `VideoDecoder.pictures`."""
         self._look_at_file()
-        capture = self._open()
+        with captured_messages() as messages:
+            capture = self._open()
+            said = errors_of_ffmpeg(messages())
         follower = self._follower(capture.get(cv2.CAP_PROP_FPS))
         try:
-            yield from self._follow(capture, follower)
+            yield from self._follow(capture, follower, said)
         finally:
             capture.release()
             if follower is not None:
                 follower.close()
 
-    def _follow(self, capture: cv2.VideoCapture, follower: PacketFollower | None) -> Iterator[Picture | Damage]:
+    def _follow(
+        self, capture: cv2.VideoCapture, follower: PacketFollower | None, said: list[str]
+    ) -> Iterator[Picture | Damage | Complaint]:
+        """`said` is what was said of damage when the file was opened."""
         failures = 0
         rate = capture.get(cv2.CAP_PROP_FPS)
         step = 1.0 / rate if math.isfinite(rate) and rate > 0 else math.inf
@@ -127,8 +155,10 @@ class OpenCVDecoder:
         first_size: tuple[int, int] | None = None
         while failures < _MOST_FAILURES:
             asked = time.monotonic()
-            with contextlib.nullcontext() if self._timeout is None else quiet():
+            # A camera or stream may take long, and nobody else could print meanwhile.
+            with quiet() if self._file is None else captured_messages() as messages:
                 decoded, image = capture.retrieve() if capture.grab() else (False, None)
+                said += errors_of_ffmpeg(messages()) if messages else []
             if not decoded or image is None or not image.size:
                 failures += 1
                 # A stream that has fallen silent fails but once in that time.
@@ -148,14 +178,16 @@ class OpenCVDecoder:
                     ordered = follower.next_in_order()
                     seconds = ordered if self._times.as_stored else None
                 elif follower.precedes_key_frame(stamp := round(1e6 * seconds)):
-                    failures = 0
+                    failures, said = 0, []
                     continue
                 else:
                     yield from follower.before(stamp)
-            failures = 0
+            if said and not failures:
+                yield Complaint(said[0])
+            failures, said = 0, []
             if before is not None and np.array_equal(image, before):
                 # Either nothing moves, or the picture was not converted and the buffer holds the one before.
-                with captured_stderr() as messages:
+                with captured_messages() as messages:
                     capture.retrieve()
                     self._check_converted(messages())
             last, before = seconds, image
@@ -168,6 +200,8 @@ class OpenCVDecoder:
             yield Picture(seconds, size, convert, alone=alone, follows_loss=follows_loss)
         if follower is not None:
             yield from follower.rest() if self._times.exist and not self._times.as_stored else follower.failures()
+        if said:
+            yield Complaint(said[0])
 
     def _turned(self, follower: PacketFollower | None) -> np.ndarray | None:
         """The display matrix of the picture at hand: what its camera noted comes before what the file says of all."""
@@ -185,12 +219,21 @@ class OpenCVDecoder:
                 f"{self._name} is decoded by OpenCV, which without MediaInfo, whose library is not there for this "
                 f"system, does not notice HDR, or interlacing that only the header tells: {_PYAV}"
             )
+        if not hears_all():
+            yield (
+                f"{self._name} is decoded by an OpenCV that does not tell of parts which it fills by guesses, or of "
+                f"packets that a stream lacks: {_PYAV}"
+            )
+        if variable := redirected():
+            yield f"{self._name} is decoded by OpenCV, whose errors cannot be read while {variable} is set: unset it"
         if media is not None and len(media.sizes) > 1:
             names = [f"v:{number}" for number in range(len(media.sizes))]
             read = media.sizes.index(size) if size in media.sizes else 0
             yield several_videos(self._name, media.sizes, names, names[read])
         if not self._times.exist or (media is not None and media.bare):
             yield no_times(self._name, rate or 1.0)
+        if _fourcc(capture).lower().startswith(_SAY_NOTHING):
+            yield f"{self._name} is ProRes, of which OpenCV does not notice damage within a picture: {_PYAV}"
         if self._view.projection is not None:
             yield all_around(self._name, self._view.projection)
         if media is not None and media.transfer is not None:
@@ -210,11 +253,13 @@ class OpenCVDecoder:
         if self._file is None or self._looked:
             return
         self._looked = True
-        capture = self._open()
+        self._container = container_of(Path(self._file))
         shown: list[int] = []
-        while len(shown) < _FIRST_FRAMES and capture.grab():
-            shown.append(round(1000 * capture.get(cv2.CAP_PROP_POS_MSEC)))
-        capture.release()
+        with captured_messages():
+            capture = self._open()
+            while len(shown) < _FIRST_FRAMES and capture.grab():
+                shown.append(round(1000 * capture.get(cv2.CAP_PROP_POS_MSEC)))
+            capture.release()
         self._times = look_at_times(self._file, shown)
         self._view = read_matroska_view(Path(self._file)) or read_mp4_view(Path(self._file))
         self._media = read_media_header(Path(self._file))
@@ -227,9 +272,9 @@ class OpenCVDecoder:
             return None
         return PacketFollower(self._file, rate, timed=self._times.exist, edited=self._view.edited)
 
-    def _check_converted(self, said: str) -> None:
+    def _check_converted(self, said: bytes) -> None:
         """Raises InputError if OpenCV handed out a buffer into which it could not convert the picture."""
-        if "interlaced to progressive" in said:
+        if b"interlaced to progressive" in said:
             self._refuse_interlaced()
 
     def _refuse_interlaced(self) -> NoReturn:
@@ -242,13 +287,11 @@ class OpenCVDecoder:
         """Size of the file, which has no more frames: headers that were never filled in say more."""
         return math.inf if self._file is None else Path(self._file).stat().st_size
 
-    def _states_frames(self) -> bool:
-        """Whether the count is the file's own (mp4, mov, avi); OpenCV multiplies duration and rate elsewhere."""
-        if self._file is None:
-            return False
-        with Path(self._file).open("rb") as file:
-            head = file.read(8)
-        return head[4:] == b"ftyp" or head[:4] == b"RIFF"
+    def _states_seconds(self) -> bool:
+        """Whether the duration that OpenCV knows is that of the video, as the file states it."""
+        # Flash states one for sound and pictures together.
+        silent = self._media is not None and not self._media.sound
+        return self._container in _STATE_SECONDS or (self._container == FLASH and silent)
 
     def _stamp(self, capture: cv2.VideoCapture, last: float | None, follower: PacketFollower | None) -> float | None:
         if isinstance(self._source, int):
@@ -268,8 +311,10 @@ class OpenCVDecoder:
         if re.search("[\ud800-\udfff]", str(self._source)):
             # A name that is no Unicode ends the process.
             raise InputError(f"{self._name!r}: OpenCV cannot open a file of this name: rename it, or {_PYAV}")
+        # What threads say of damage beside the call that reads their picture could not be read.
+        backend, alone = (cv2.CAP_ANY, []) if self._file is None else (cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, 1])
         with quiet():
-            capture = cv2.VideoCapture(self._source, cv2.CAP_ANY, parameters)
+            capture = cv2.VideoCapture(self._source, backend, parameters + alone)
         if capture.isOpened():
             if self._matrix is not None:
                 capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)

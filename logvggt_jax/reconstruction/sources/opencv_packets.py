@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import io
 import itertools
+import math
 import re
 import struct
 import tempfile
 import warnings
+from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -16,7 +18,7 @@ import cv2
 from PIL import Image
 
 from logvggt_jax.reconstruction.sources.h264_frame_numbers import FrameNumbers
-from logvggt_jax.reconstruction.sources.opencv_messages import quiet
+from logvggt_jax.reconstruction.sources.opencv_messages import captured_messages, tells_corrupt_packet
 from logvggt_jax.reconstruction.sources.orientation import noted_orientation
 
 # Where the parameters of a stream begin, by which FFmpeg recognises it, and how many bytes of them state the size; for
@@ -52,8 +54,12 @@ _FRAME_A_PACKET = (
 # Codecs that are stored in the order in which they are shown; a packet need not show a frame.
 _AS_SHOWN = (b"vp80", b"vp90", b"av01")
 _EMPTY_PACKET = 8
+# What a description begins with of a stream whose units have their lengths before them, which OpenCV replaces.
+_WITH_LENGTHS = b"\1"
 # What files begin with that may lack presentation times: AVI and MXF.
 _LACK_TIMES = (b"RIFF", b"\x06\x0e\x2b\x34")
+# FFmpeg reads so many packets ahead of the one that it hands out.
+_AHEAD = 3
 # Errors in a row after which nothing more is to be read.
 _MOST_ERRORS = 64
 
@@ -67,6 +73,7 @@ class Packet(NamedTuple):
       key: decoding can begin with it.
       size: (H, W) before rotation, as the key frames so far state it; None where none does.
       orientation: EXIF's, that the camera noted in a JPEG; 1 for none.
+      whole: nothing of it is missing, nor anything just before it, as far as the container tells.
       follows_loss: see `Picture`.
     """
 
@@ -75,6 +82,7 @@ class Packet(NamedTuple):
     key: bool
     size: tuple[int, int] | None
     orientation: int
+    whole: bool
     follows_loss: bool
 
 
@@ -84,30 +92,57 @@ class PacketReader:
     Attributes:
       frame_each: each is known to show one frame. AVI states no presentation times, nor does MXF without its index.
       as_shown: they are stored in the order in which frames are shown.
+      begin: seconds from the file's beginning to the first, once that is read.
 
     Args:
       source: the file's absolute path.
     """
 
     def __init__(self, source: str) -> None:
-        self._capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
+        # What it says of damage is said to the decoder as well.
+        with captured_messages():
+            self._capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
         self._codec = (int(self._capture.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF).to_bytes(4, "little").lower()
+        self._told_corrupt = False
+        self.begin = 0.0
         with Path(source).open("rb") as file:
             self.as_shown = self._codec in _AS_SHOWN
             self.frame_each = self._codec in _FRAME_A_PACKET and file.read(4) not in _LACK_TIMES
 
     def __iter__(self) -> Iterator[Packet | None]:
         """None stands for one that cannot be read."""
-        size, head, errors = None, b"", 0
-        numbers = FrameNumbers() if self._codec in _H264_NAMES else None
+        held: deque[Packet | None] = deque()
+        for packet in self._read():
+            held.append(packet)
+            if len(held) > _AHEAD:
+                yield self._checked(held)
+        if self._told_corrupt and held and (last := held.pop()) is not None:
+            held.append(last._replace(whole=False))
+        while held:
+            yield self._checked(held)
+
+    def _checked(self, held: deque[Packet | None]) -> Packet | None:
+        """The first of these packets. One that is not whole just before a key frame is where recordings are joined."""
+        packet = held.popleft()
+        if packet is None or packet.whole or any(each is not None and each.key for each in held):
+            return packet
+        return packet._replace(follows_loss=True)
+
+    def _read(self) -> Iterator[Packet | None]:
+        size, head, errors, first = None, b"", 0, True
+        numbers = FrameNumbers(self._description()) if self._codec in _H264_NAMES else None
         while self._capture.isOpened() and errors < _MOST_ERRORS:
-            read, content = self._capture.retrieve() if self._capture.grab() else (False, None)
+            with captured_messages() as messages:
+                read, content = self._capture.retrieve() if self._capture.grab() else (False, None)
+                self._told_corrupt = tells_corrupt_packet(messages()) or self._told_corrupt
             if not read or content is None:
                 errors += 1
                 continue
             # At the end there are only errors.
             yield from itertools.repeat(None, errors)
             errors = 0
+            if first:
+                first, self.begin = False, self._since_beginning()
             stamp = round(1000 * self._capture.get(cv2.CAP_PROP_POS_MSEC))
             key = bool(self._capture.get(cv2.CAP_PROP_LRF_HAS_KEY_FRAME))
             data = content.tobytes()
@@ -118,7 +153,22 @@ class PacketReader:
                 if parameters[:length] != head:
                     head, size = parameters[:length], _stated_size(parameters, self._codec) or size
             lossy = numbers is not None and numbers.follows_loss(data, key)
-            yield Packet(stamp, content.size > _EMPTY_PACKET, key, size, orientation, lossy)
+            whole, self._told_corrupt = not self._told_corrupt, False
+            yield Packet(stamp, content.size > _EMPTY_PACKET, key, size, orientation, whole, lossy)
+
+    def _since_beginning(self) -> float:
+        """Seconds of the packet at hand. Milliseconds count from the first packet, but where presentation times, which
+        the least number there is stands for if there are none, are not known."""
+        frames, rate = self._capture.get(cv2.CAP_PROP_PTS), self._capture.get(cv2.CAP_PROP_FPS)
+        known = frames >= 0 and math.isfinite(rate) and rate > 0
+        return frames / rate if known else self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+
+    def _description(self) -> bytes:
+        """What the container knows of the stream, where packets begin with start codes; else it is in the packets."""
+        place = round(self._capture.get(cv2.CAP_PROP_CODEC_EXTRADATA_INDEX))
+        read, content = self._capture.retrieve(flag=place) if place > 0 else (False, None)
+        described = content.tobytes() if read and content is not None else b""
+        return b"" if described.startswith(_WITH_LENGTHS) else described
 
     def close(self) -> None:
         """Closes the file."""
@@ -158,7 +208,7 @@ def _stated_size(parameters: bytes, codec: bytes) -> tuple[int, int] | None:
         parameters = head + struct.pack("<IQ", len(parameters), 0) + parameters
     try:
         # From memory OpenCV reads as well, but has been seen to end the process.
-        with tempfile.TemporaryDirectory() as folder, quiet():
+        with tempfile.TemporaryDirectory() as folder, captured_messages():
             path = Path(folder) / "packet"
             path.write_bytes(parameters)
             alone = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)

@@ -32,10 +32,12 @@ class TimeStamps(NamedTuple):
       exist: the file states some; a bare stream of a codec states none.
       as_stored: those of the packets only grow, and those of the frames do not. The k-th frame is then shown at the
         k-th time, though frames are shown in another order than stored.
+      begin: seconds from the file's beginning to the first packet.
     """
 
     exist: bool
     as_stored: bool
+    begin: float
 
 
 def look_at_times(source: str, shown: list[int]) -> TimeStamps:
@@ -52,7 +54,7 @@ def look_at_times(source: str, shown: list[int]) -> TimeStamps:
     if head.startswith(_ASF) and shown:
         # Frames come with the times of the packets that follow theirs.
         late = late or 1000 * shown[0] > next((packet.stamp for packet in packets if packet.key), math.inf)
-    return TimeStamps(exist, stamps == sorted(set(stamps)) and late)
+    return TimeStamps(exist, stamps == sorted(set(stamps)) and late, reader.begin)
 
 
 class PacketFollower:

@@ -16,10 +16,18 @@ import numpy as np
 from logvggt_jax.errors import InputError, disk_errors
 from logvggt_jax.frames import same_proportions
 from logvggt_jax.reconstruction.sources.appended_files import another_follows
-from logvggt_jax.reconstruction.sources.decoding import CodecChange, Damage, Picture, VideoDecoder, VideoHeader
+from logvggt_jax.reconstruction.sources.decoding import (
+    CodecChange,
+    Complaint,
+    Damage,
+    Picture,
+    VideoDecoder,
+    VideoHeader,
+)
 from logvggt_jax.reconstruction.sources.gif_blocks import breaks_off
 from logvggt_jax.reconstruction.sources.listing import some
 from logvggt_jax.reconstruction.sources.masks import Masked, Masks
+from logvggt_jax.reconstruction.sources.matroska_track import lacks_end
 from logvggt_jax.reconstruction.sources.media_boxes import boxes
 from logvggt_jax.reconstruction.sources.opencv_decoder import OpenCVDecoder
 from logvggt_jax.reconstruction.sources.pauses import Pauses
@@ -31,6 +39,7 @@ from logvggt_jax.reconstruction.sources.source import (
     SourceOptions,
     fingerprint,
 )
+from logvggt_jax.reconstruction.sources.y4m_frames import is_broken
 
 _SCHEMES = ("rtsp", "rtsps", "rtmp", "rtmps", "http", "https", "udp", "tcp", "rtp", "srt", "mms")
 # A `Path` keeps one slash only.
@@ -45,6 +54,10 @@ _STREAM_RATE = 30.0
 # Brands of files that are built like an mp4 but hold pictures.
 _PICTURES = (b"heic", b"heix", b"hevc", b"mif1", b"msf1", b"avif", b"avis")
 _LONGEST_PACKET = 192
+# Frames by which one may be decoded earlier than it is shown.
+_MOST_REORDERED = 16
+# Letters of what a library says that are repeated.
+_LONGEST_COMPLAINT = 80
 # Options that say nothing of a video.
 _OF_IMAGES = ("pattern", "size_mismatch")
 
@@ -153,7 +166,9 @@ class VideoSource(Source):
         pauses = Pauses()
         lost, doubtful = False, 0  # whether a frame is missing since the last that refers to no other
         losses: list[str] = []  # frames before which some are not in the stream
-        for position, picture in enumerate(self._decoder.pictures()):
+        complaints: dict[int, str] = {}
+        troubles: list[int] = []  # where frames are missing
+        for position, picture in self._numbered(complaints):
             name, seconds = f"frame-{position:06d}", clock.time(picture.seconds)
             if selection.is_over(seconds):
                 break
@@ -167,6 +182,7 @@ class VideoSource(Source):
                 pauses.add(seconds, None if isinstance(picture, Damage) else picture.lasts)
             if isinstance(picture, Damage):
                 lost = True
+                troubles.append(position)
                 if wanted:
                     self._skip(name, picture.reason, taken)
             else:
@@ -176,6 +192,9 @@ class VideoSource(Source):
                 guessed += picture.damaged
                 if picture.follows_loss and not lost:
                     losses.append(name)
+                    troubles.append(position)
+                elif lost and complaints.get(position):
+                    troubles.append(position)
                 lost = (lost or picture.follows_loss) and picture.alone is False
                 if wanted:
                     doubtful += lost
@@ -189,6 +208,12 @@ class VideoSource(Source):
             self._check_end(position + 1, seconds, lasts)
         if guessed:
             self._add_note(f"{self.name}: frames with damaged parts, which the decoder filled by guesses: {guessed}")
+        if told := {at: text for at, text in complaints.items() if not _explained(at, troubles)}:
+            places = some(f"frame-{at:06d}" for at in told)
+            self._add_note(
+                f"{self.name} is damaged about {places} ({_short(next(iter(told.values())))}): pictures there may be "
+                "wrong in parts, or missing"
+            )
         if losses:
             self._add_note(
                 f"{self.name} lacks frames before {some(losses)}, to which later ones refer, or part of these: it was "
@@ -207,6 +232,16 @@ class VideoSource(Source):
                 f"{self.name} gave no frame between {self.options.start or 0:g} s and "
                 f"{'its end' if self.options.end is None else f'{self.options.end:g} s'}"
             )
+
+    def _numbered(self, complaints: dict[int, str]) -> Iterator[tuple[int, Picture | Damage | CodecChange]]:
+        """What is decoded, with its position; fills in what is complained of by the position of what follows."""
+        position = 0
+        for each in self._decoder.pictures():
+            if isinstance(each, Complaint):
+                complaints.setdefault(position, each.text)
+            else:
+                yield position, each
+                position += 1
 
     def _frame(self, name: str, seconds: float, picture: Picture) -> SourceFrame:
         image = picture.convert()
@@ -278,6 +313,15 @@ class VideoSource(Source):
             self.notes.append(note)
 
 
+def _explained(position: int, troubles: list[int]) -> bool:
+    """Whether what is complained of before this frame is that one soon after it, decoded earlier, is missing."""
+    return any(0 <= trouble - position <= _MOST_REORDERED for trouble in troubles)
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= _LONGEST_COMPLAINT else f"{text[:_LONGEST_COMPLAINT]}…"
+
+
 def _decoder(source: str | Path, name: str, timeout: float | None = None) -> VideoDecoder:
     """PyAV's decoder where a release is installed whose interface is known, else OpenCV's."""
     # FFmpeg takes `a:b.mp4` for a protocol, not so an absolute path.
@@ -310,6 +354,10 @@ def _check_file(path: Path) -> Iterator[str]:
             if file.read(30)[8:].startswith(b"WEBPVP8X") and file.read(4) == b"ANIM":
                 raise InputError(f"{path} is an animated WebP, which cannot be decoded: convert it to mp4 or GIF")
             yield from _check_index(path, file, status.st_size)
+            if lacks_end(file):
+                yield _broken_off(path)
+            if is_broken(file):
+                yield f"{path} is damaged, or lacks its end: frames from there on are not read; copy it anew"
             if another_follows(file):
                 yield _read_in_part(path, "several")
             file.seek(0)
