@@ -5,6 +5,7 @@ therefore walked to their end marker first. Where this walk does not find a JPEG
 decoder made up, Pillow decides whether it is whole (`jpeg.py`), which takes half as long again.
 """
 
+import io
 import re
 import struct
 import zlib
@@ -14,10 +15,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from PIL import TiffImagePlugin
 
 from logvggt_jax.data.errors import BrokenPicture, missing_file
 from logvggt_jax.data.formats.file_kinds import SIGNATURE_BYTES, kind_of
 from logvggt_jax.data.formats.jpeg import JPEG_START, LOST, decode_jpeg, ends_flat
+from logvggt_jax.data.formats.tiff import misread
 from logvggt_jax.errors import InputError, one_line
 
 PNG_START = b"\x89PNG\r\n\x1a\n"
@@ -30,8 +33,8 @@ _DECODED = ("JPEG", "PNG", "WebP", "TIFF", "BMP", "GIF picture", "JPEG 2000 pict
 
 
 def read_rgb(path: str | Path) -> np.ndarray:
-    """Colour picture [H, W, 3] uint8 RGB; grey is repeated, alpha is composited over white, of PNG's 16 bits a channel
-    the upper 8 are taken.
+    """Colour picture [H, W, 3] uint8 RGB; grey is repeated, alpha is composited over white, of 16 bits a channel
+    (PNG, TIFF) the upper 8 are taken.
 
     Orientation tags are ignored: calibrations belong to the pixels as stored. Raises MissingFiles, or InputError naming
     the file: truncated, damaged or undecodable, of another type, or a depth map by its values.
@@ -39,7 +42,9 @@ def read_rgb(path: str | Path) -> np.ndarray:
     path = Path(path)
     data = _content(path)
     picture = _decode(path, data)
-    if picture.dtype == np.uint16 and data.startswith(PNG_START):
+    if picture.dtype == np.uint16 and data.startswith((PNG_START, *_TIFF_ORDERS)):
+        if fault := _misread_tiff(data):
+            raise BrokenPicture(f"{path}: a TIFF of {fault}, which is not read: convert it to PNG")
         if looks_like_depth(picture):
             raise BrokenPicture(
                 f"{path}: expected colour, got grey with 16 bits whose values (up to {picture.max()}) look like depth: "
@@ -141,6 +146,17 @@ def _not_decoded(data: bytes) -> str:
     if kind in _DECODED:
         return f"damaged, or a {kind} of a kind that OpenCV does not decode: fetch it again, or convert it to PNG"
     return f"no picture but a {kind}: fetch it again" if kind else "no picture: fetch it again"
+
+
+def _misread_tiff(data: bytes) -> str | None:
+    """See `misread`; None for other formats, too."""
+    if data[:4] not in _TIFF_ORDERS:
+        return None
+    stream = io.BytesIO(data)
+    tags = TiffImagePlugin.ImageFileDirectory_v2(stream.read(8))
+    stream.seek(tags.next)
+    tags.load(stream)
+    return misread(tags)
 
 
 def _as_stored(data: bytes) -> bytes | bytearray:

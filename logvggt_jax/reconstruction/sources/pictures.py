@@ -23,6 +23,7 @@ from logvggt_jax.data.errors import BrokenPicture
 from logvggt_jax.data.formats.file_kinds import SIGNATURE_BYTES, kind_of
 from logvggt_jax.data.formats.image import decoding_errors, looks_like_depth, over_white, png_is_whole
 from logvggt_jax.data.formats.jpeg import decode_jpeg
+from logvggt_jax.data.formats.tiff import misread
 from logvggt_jax.errors import InputError, MissingPackage, disk_errors, one_line
 
 IMAGE_SUFFIXES = (
@@ -140,8 +141,8 @@ def open_picture(path: Path, stream: IO[bytes]) -> tuple[str, ImageFile.ImageFil
             raise BrokenPicture(
                 f"{path}: damaged, or a {kind} of a kind that is not read ({reason}): fetch it again, or convert it"
             ) from error
-    if isinstance(picture, TiffImagePlugin.TiffImageFile) and (misread := _misread(picture.tag_v2)):
-        raise InputError(f"{path}: a TIFF of {misread}, which is not read: convert it to PNG")
+    if isinstance(picture, TiffImagePlugin.TiffImageFile) and (fault := misread(picture.tag_v2)):
+        raise InputError(f"{path}: a TIFF of {fault}, which is not read: convert it to PNG")
     return kind, picture
 
 
@@ -186,18 +187,6 @@ def _heic_reader(path: Path) -> type[ImageFile.ImageFile]:
     except ImportError as error:
         raise MissingPackage(f"{path} is HEIC: install logvggt-jax[heic], or convert it to JPEG") from error
     return HeifImageFile
-
-
-def _misread(tags: TiffImagePlugin.ImageFileDirectory_v2) -> str | None:
-    """What Pillow and OpenCV would decode to other colours without an error; None for the others."""
-    if 16 not in tags.get(TiffImagePlugin.BITSPERSAMPLE, ()):
-        return None
-    if tags.get(TiffImagePlugin.PHOTOMETRIC_INTERPRETATION) == 0:
-        return "16 bits whose 0 is white"
-    planes = tags.get(TiffImagePlugin.PLANAR_CONFIGURATION) == 2 and tags.get(TiffImagePlugin.SAMPLESPERPIXEL, 1) > 1
-    if planes and tags.get(TiffImagePlugin.COMPRESSION, 1) == 1:
-        return "16 bits in planes (planar) and without compression"
-    return None
 
 
 def _is_floating_point(stream: IO[bytes]) -> bool:

@@ -1,5 +1,6 @@
 """Whole pictures are read as they are; truncated, damaged and mistyped ones are named."""
 
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 from PIL import Image
 
 from logvggt_jax.data.formats.image import read_depth, read_rgb
+from logvggt_jax.errors import InputError
 
 PICTURE = np.random.default_rng(0).integers(0, 256, (40, 60, 3), np.uint8)
 DEPTH = np.random.default_rng(1).integers(0, 65536, (40, 60), np.uint16)
@@ -71,19 +73,32 @@ def test_depth_keeps_its_sixteen_bits(tmp_path: Path):
     assert np.array_equal(read_depth(write(tmp_path / "d.png", DEPTH)), DEPTH)
 
 
-def test_sixteen_bits_of_a_png_become_the_upper_eight(tmp_path: Path):
+@pytest.mark.parametrize("suffix", ["png", "tif"])
+def test_sixteen_bits_become_the_upper_eight(tmp_path: Path, suffix: str):
     deep = np.random.default_rng(0).integers(0, 65536, (40, 60, 4), np.uint16)
     deep[0, 0], deep[..., 3] = (65535, 255, 256, 0), 65535
-    assert np.array_equal(read_rgb(write(tmp_path / "rgb.png", deep[..., 2::-1])), deep[..., :3] >> 8)
-    assert np.array_equal(read_rgb(write(tmp_path / "rgba.png", deep[..., [2, 1, 0, 3]])), deep[..., :3] >> 8)
-    assert np.array_equal(read_rgb(write(tmp_path / "grey.png", DEPTH)), (DEPTH[..., None] >> 8).repeat(3, 2))
+    assert np.array_equal(read_rgb(write(tmp_path / f"rgb.{suffix}", deep[..., 2::-1])), deep[..., :3] >> 8)
+    assert np.array_equal(read_rgb(write(tmp_path / f"rgba.{suffix}", deep[..., [2, 1, 0, 3]])), deep[..., :3] >> 8)
+    assert np.array_equal(read_rgb(write(tmp_path / f"grey.{suffix}", DEPTH)), (DEPTH[..., None] >> 8).repeat(3, 2))
+
+
+@pytest.mark.parametrize(("changed", "told"), [({262: 0}, "0 is white"), ({262: 2, 277: 3, 284: 2}, "planar")])
+def test_a_tiff_that_opencv_would_read_wrong_is_refused(tmp_path: Path, changed: dict[int, int], told: str):
+    tags = {256: 6, 257: 5, 258: 16, 259: 1, 262: 1, 273: 200, 277: 1, 278: 5, 279: 60, 284: 1} | changed
+    entries = b"".join(struct.pack("<HHII", name, 4, 1, content) for name, content in tags.items())
+    head = b"II*\0" + struct.pack("<IH", 8, len(tags)) + entries
+    (tmp_path / "a.tif").write_bytes(head.ljust(200, b"\0") + bytes(range(180)))
+    with pytest.raises(InputError, match=rf"a\.tif: .*{told}.* convert it to PNG"):
+        read_rgb(tmp_path / "a.tif")
 
 
 def test_depth_in_the_place_of_colour_is_named(tmp_path: Path):
     with pytest.raises(ValueError, match=r"d\.png.*look like depth"):
         read_rgb(write(tmp_path / "d.png", DEPTH // 16))
-    with pytest.raises(ValueError, match=r"t\.tif.*uint16"):
-        read_rgb(write(tmp_path / "t.tif", DEPTH))
+    with pytest.raises(ValueError, match=r"t\.tif.*look like depth"):
+        read_rgb(write(tmp_path / "t.tif", DEPTH // 16))
+    with pytest.raises(ValueError, match=r"signed\.tif.*int16"):
+        read_rgb(write(tmp_path / "signed.tif", (DEPTH // 16).astype(np.int16)))
 
 
 @pytest.mark.parametrize("keep", [0.0, 0.05, 0.3, 0.5, 0.9, 0.999])
