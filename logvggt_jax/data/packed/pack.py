@@ -123,15 +123,21 @@ def _pack(
     console = Console(stderr=True, quiet=not progress)
     plan = json_digest([dict(reader.identity), dict(options), split, frames_per_shard, list(reader.sequences)])
     path = output / PLAN
-    begun = read_json_object(path) if path.exists() else {"digest": plan}
+    begun = read_json_object(path) if path.exists() else {"digest": plan, "last": None}
+    if "last" not in begun:
+        raise InputError(
+            f"{output} was packed in an older format, on which no run goes on: choose another output, or delete it"
+        )
     if begun.get("digest") != plan:
         raise InputError(
             f"{output} was begun with other data or settings (split, options, frames per shard; or the data set has "
             "other sequences by now): choose another output, or delete this one"
         )
     with console.status("Listing sequences"):
-        sequences, contents = _placed(reader, frames_per_shard, begun.get("last"))
-    last = begun.get("last", [each.name for each in sequences if each.error is not None])
+        sequences, contents = _placed(reader, frames_per_shard, begun["last"])
+    last = begun["last"]
+    if last is None:
+        last = [each.name for each in sequences if each.error is not None]
     write_text(path, json.dumps({"digest": plan, "name": reader.name, "split": split, "last": last}) + "\n")
     for scratch in output.glob(".shard-*"):  # of runs that were killed
         scratch.unlink(missing_ok=True)

@@ -1,5 +1,6 @@
 """A packed data set is the data set that was packed: its frames, its errors, its clips."""
 
+import json
 import pickle
 import shutil
 import sys
@@ -282,6 +283,14 @@ def test_another_set_split_option_or_plan_is_refused(scenes: Path, packed: Path,
         open_dataset(NAME, packed, "test")
     with pytest.raises(InputError, match="begun with other data or settings"):
         pack(NAME, scenes, packed, frames_per_shard=4)
+    older = damaged_copy(packed, tmp_path / "older")
+    plan = json.loads((older / "plan.json").read_text())
+    del plan["last"]
+    (older / "plan.json").write_text(json.dumps(plan))
+    with pytest.raises(
+        InputError, match=r"older was packed in an older format, .* choose another output, or delete it"
+    ):
+        pack(NAME, scenes, older, frames_per_shard=8)
     (tmp_path / "mine.txt").touch()
     with pytest.raises(OutputExists, match="is not empty"):
         pack(NAME, scenes, tmp_path)
