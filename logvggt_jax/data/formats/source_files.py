@@ -24,10 +24,20 @@ class SourceFiles:
     Only regular files, and links to them, are opened: a pipe in the place of a file would be waited for without end.
     All methods raise InputError naming the path where its name cannot be one, and DiskError where the operating system
     refuses to look at it.
+
+    Attributes:
+      states: of what has been looked at, by path.
+      remarks: what has been said, to be said again where the listing is taken from an index.
     """
 
     def __init__(self) -> None:
         self.states: dict[str, list[int]] = {}
+        self.remarks: list[str] = []
+
+    def remark(self, text: str) -> None:
+        """Says what whoever uses the listing should know, one line."""
+        self.remarks.append(text)
+        logging.warning("%s", text)
 
     def names(self, folder: Path, expected: str) -> list[str]:
         """Sorted names in `folder`; MissingFiles saying what was `expected` there."""
@@ -79,7 +89,7 @@ class SourceFiles:
         try:
             path.stat()
         except PermissionError as error:
-            logging.warning("%s: %s: nothing in it counts", path.parent, error.strerror)
+            self.remark(f"{path.parent}: {error.strerror}: nothing in it counts")
         except OSError:
             pass
         return False

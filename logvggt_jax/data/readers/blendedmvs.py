@@ -84,7 +84,7 @@ class BlendedMVS(FolderDataset):
         for name in listed:
             if not _SCENE.fullmatch(name):
                 raise InputError(f"{path}: expected lines of 24 hexadecimal digits, got {name!r}: restore the file")
-        return {name: scenes[name] for name in sequences_present(listed, scenes, path)}
+        return {name: scenes[name] for name in sequences_present(listed, scenes, path, files)}
 
     def _frames(self, sequence: str, folder: Path, files: SourceFiles) -> Iterator[FrameRecord | Dropped]:
         kinds = (("blended_images", "{:08d}.jpg"), ("rendered_depth_maps", "{:08d}.pfm"), ("cams", "{:08d}_cam.txt"))

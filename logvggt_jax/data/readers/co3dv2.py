@@ -109,7 +109,9 @@ class Co3Dv2(FolderDataset):
             listed = self._listed_frames(category, files)
             if listed is not None:
                 lists_name_any |= bool(listed)
-                chosen = set(sequences_present({name for name, _ in listed} & good, chosen, category / "set_lists"))
+                chosen = set(
+                    sequences_present({name for name, _ in listed} & good, chosen, category / "set_lists", files)
+                )
             places |= {f"{category.name}/{name}": category / name for name in sorted(chosen)}
         if categories and not places and self.split != "all":
             error = EmptySplit if lists_name_any else MissingFiles

@@ -15,7 +15,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
-from absl import logging
 
 from logvggt_jax.data.dataset import EVALUATION, TRAINING, About
 from logvggt_jax.data.formats.calibration import in_pixels, relative
@@ -75,7 +74,7 @@ class Colmap(FolderDataset):
         sparse, pictures = folder / "sparse", folder / "images"
         model, said = choose_model(files, sparse)
         if said:
-            logging.warning(said)
+            files.remark(said)
         camera_file, cameras = read_cameras(files, model)
         image_file, images = read_images(files, model)
         images = [images[position] for position in natural_order([image.name for image in images])]

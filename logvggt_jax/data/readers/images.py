@@ -10,7 +10,6 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
-from absl import logging
 
 from logvggt_jax.data.dataset import TRAINING, About
 from logvggt_jax.data.errors import MissingFiles
@@ -51,11 +50,9 @@ class Images(FolderDataset):
 
         found = find_recordings(self.root, files, self.expects, is_recording)
         if self.root in found.values() and (hidden := self._hidden_recordings(files)):
-            logging.warning(
-                "%s is a sequence itself, of %s and others: folders of pictures in it are not looked into (%s)",
-                self.root,
-                _pictures(self.root, files)[0],
-                ", ".join(hidden[:3]) + (" …" if len(hidden) > 3 else ""),
+            files.remark(
+                f"{self.root} is a sequence itself, of {_pictures(self.root, files)[0]} and others: folders of "
+                f"pictures in it are not looked into ({', '.join(hidden[:3])}{' …' if len(hidden) > 3 else ''})"
             )
         return found
 

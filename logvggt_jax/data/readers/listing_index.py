@@ -1,8 +1,9 @@
 """Listings of data sets kept on disk: the second start does not walk a million files again.
 
-A listing remembers the code that made it and the state of every folder and file that it was made from. While those
-are unchanged it is taken from the index, else made anew; an open data set asks once for each listing, not at each
-read. The index is a cache: where it cannot be written, data sets work without it.
+A listing remembers the code that made it, the state of every folder and file that it was made from, and what was
+remarked of them. While code and state are unchanged it is taken from the index, and what was remarked is said again,
+else it is made anew; an open data set asks once for each listing, not at each read. The index is a cache: where it
+cannot be written, data sets work without it.
 """
 
 import hashlib
@@ -19,10 +20,11 @@ from absl import logging
 from logvggt_jax.data.formats.source_files import SourceFiles, file_state
 from logvggt_jax.files import user_cache_folder
 
-_FORMAT = 3  # of the table
+_FORMAT = 4  # of the table
 _TIMEOUT = 30.0  # seconds to wait for another process that writes
 _TABLE = (
-    "CREATE TABLE IF NOT EXISTS listings (key TEXT PRIMARY KEY, code TEXT, count INTEGER, sources TEXT, payload BLOB)"
+    "CREATE TABLE IF NOT EXISTS listings "
+    "(key TEXT PRIMARY KEY, code TEXT, count INTEGER, sources TEXT, remarks TEXT, payload BLOB)"
 )
 _PACKAGE = __name__.partition(".")[0]
 
@@ -54,12 +56,12 @@ class ListingIndex:
 
     def put(self, key: str, payload: bytes, count: int, sources: SourceFiles) -> None:
         """Keeps a listing and the state of its sources, replacing an older one."""
-        row = (_as_text(key), self._code, count, json.dumps(sources.states), payload)
+        row = (_as_text(key), self._code, count, json.dumps(sources.states), json.dumps(sources.remarks), payload)
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             with closing(self._connect()) as connection, connection:
                 connection.execute(_TABLE)
-                connection.execute("INSERT OR REPLACE INTO listings VALUES (?, ?, ?, ?, ?)", row)
+                connection.execute("INSERT OR REPLACE INTO listings VALUES (?, ?, ?, ?, ?, ?)", row)
             self._checked.add(key)
         except (OSError, sqlite3.Error) as error:
             logging.log_first_n(logging.WARNING, "listings are not kept (%s: %s)", 1, self.path, error)
@@ -67,7 +69,7 @@ class ListingIndex:
     def _current(self, column: str, key: str) -> int | bytes | None:
         if not self.path.is_file():
             return None
-        query = f"SELECT {column}, sources FROM listings WHERE key = ? AND code = ?"
+        query = f"SELECT {column}, sources, remarks FROM listings WHERE key = ? AND code = ?"
         try:
             with closing(self._connect()) as connection:
                 row = connection.execute(query, (_as_text(key), self._code)).fetchone()
@@ -83,6 +85,8 @@ class ListingIndex:
             if any(file_state(Path(path)) != state for path, state in json.loads(row[1]).items()):
                 return None
             self._checked.add(key)
+            for remark in json.loads(row[2]):
+                logging.warning("%s", remark)
         return row[0]
 
     def _connect(self) -> sqlite3.Connection:

@@ -18,7 +18,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from absl import logging
 
 from logvggt_jax.data.dataset import EVALUATION, TRAINING, About
 from logvggt_jax.data.errors import AbsurdIntrinsics, MissingFiles, UnequalSizes
@@ -71,7 +70,7 @@ class ScanNet(FolderDataset):
         for scene, folder in sorted(self._chosen_scenes(files).items()):
             if not _is_calibrated(folder, files):
                 left_out.append(folder)
-                logging.warning("%s is left out: its intrinsics are not finite", folder)
+                files.remark(f"{folder} is left out: its intrinsics are not finite")
                 continue
             names = files.names(folder, "color, depth, pose and intrinsic")
             prepared = [name for name in names if _PREPARED.fullmatch(name)]

@@ -11,7 +11,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from absl import logging
 
 from logvggt_jax.data.dataset import EVALUATION, LICENCE_NOT_READ, About, check_indices
 from logvggt_jax.data.errors import MissingFiles, missing_files
@@ -88,12 +87,9 @@ class SevenScenes(FolderDataset):
         kinds: dict[str, set[str]] = {}
         names = files.names(folder, "a sequence's frames")
         if _OTHER_CAMERA in names:
-            logging.warning(
-                "%s: holds %s, as what `logvggt render-room` writes; it is not read: frames have the camera of %s. "
-                "Rendered rooms are the data set `rooms`",
-                folder,
-                _OTHER_CAMERA,
-                self.title,
+            files.remark(
+                f"{folder}: holds {_OTHER_CAMERA}, as what `logvggt render-room` writes; it is not read: frames have "
+                f"the camera of {self.title}. Rendered rooms are the data set `rooms`"
             )
         for name in names:
             if match := _FRAME_FILE.fullmatch(name):

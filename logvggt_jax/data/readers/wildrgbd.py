@@ -63,7 +63,7 @@ class WildRGBD(FolderDataset):
             if self.split != "all":
                 training = _training_scenes(self.root / category, files)
                 if self.split == "train":
-                    present &= set(sequences_present(training - _EXCLUDED, present, self.root / category))
+                    present &= set(sequences_present(training - _EXCLUDED, present, self.root / category, files))
                 else:
                     present -= training
             places |= {name: scenes / name.partition("/")[2] for name in sorted(present, key=_number)}

@@ -73,6 +73,10 @@ def test_of_several_models_the_largest_is_read_and_said(
     assert dataset.frame_names(tmp_path.name) == list(NAMES[1:])
     assert dataset.dropped_frames(tmp_path.name) == {"no pose": 1}
     assert "sparse holds 3 models" in caplog.text and "(0: 1, 1: 3, 10: 2) those of 1, the largest" in caplog.text
+    caplog.clear()
+    again = Colmap(tmp_path)  # from the index
+    assert again.read(tmp_path.name, [0, 1]).images.shape[0] == 2 and again.extrinsics(tmp_path.name).shape[0] == 3
+    assert caplog.text.count("sparse holds 3 models") == 1
 
 
 def test_an_undistorted_folder_without_maps_yet_has_no_depth(tmp_path: Path):
