@@ -1159,6 +1159,7 @@ KINDS: dict[str, tuple[str, str, dict[str, str], dict[str, str]]] = {
     "wmv2.wmv": ("wmv2", "yuv420p", {"g": "12"}, {}),
     "flv1.flv": ("flv", "yuv420p", {"g": "12"}, {}),
     "mpeg2.mpg": ("mpeg2video", "yuv420p", GROUP, {}),
+    "mpeg2.asf": ("mpeg2video", "yuv420p", GROUP, {}),
     "mpeg2.mxf": ("mpeg2video", "yuv420p", GROUP, {}),
     "bare.m2v": ("mpeg2video", "yuv420p", GROUP, {}),
     "vp8.webm": ("libvpx", "yuv420p", QUICK, {}),

@@ -56,8 +56,9 @@ _AS_SHOWN = (b"vp80", b"vp90", b"av01")
 _EMPTY_PACKET = 8
 # What a description begins with of a stream whose units have their lengths before them, which OpenCV replaces.
 _WITH_LENGTHS = b"\1"
-# What files begin with that may lack presentation times: AVI and MXF.
-_LACK_TIMES = (b"RIFF", b"\x06\x0e\x2b\x34")
+# What files begin with that may lack presentation times: AVI, MXF, ASF; and streams of programs, but for MPEG's own.
+_LACK_TIMES = (b"RIFF", b"\x06\x0e\x2b\x34", b"\x30\x26\xb2\x75")
+_PROGRAMS, _OF_PROGRAMS = b"\0\0\1\xba", (b"mpg1", b"mpg2")
 # FFmpeg reads so many packets ahead of the one that it hands out.
 _AHEAD = 3
 # Errors in a row after which nothing more is to be read.
@@ -90,7 +91,7 @@ class PacketReader:
     """The packets of a file in the order in which they are stored.
 
     Attributes:
-      frame_each: each is known to show one frame. AVI states no presentation times, nor does MXF without its index.
+      frame_each: each is known to show one frame, at a time that is known.
       as_shown: they are stored in the order in which frames are shown.
       begin: seconds from the file's beginning to the first, once that is read.
 
@@ -107,7 +108,9 @@ class PacketReader:
         self.begin = 0.0
         with Path(source).open("rb") as file:
             self.as_shown = self._codec in _AS_SHOWN
-            self.frame_each = self._codec in _FRAME_A_PACKET and file.read(4) not in _LACK_TIMES
+            head = file.read(4)
+            timed = head not in _LACK_TIMES and (head != _PROGRAMS or self._codec in _OF_PROGRAMS)
+            self.frame_each = self._codec in _FRAME_A_PACKET and timed
 
     def __iter__(self) -> Iterator[Packet | None]:
         """None stands for one that cannot be read."""
