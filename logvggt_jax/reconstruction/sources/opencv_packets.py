@@ -94,6 +94,7 @@ class PacketReader:
       frame_each: each is known to show one frame, at a time that is known.
       as_shown: they are stored in the order in which frames are shown.
       begin: seconds from the file's beginning to the first, once that is read.
+      change: names of the codec so far and of the one that follows, once that is reached; no packet of that is read.
 
     Args:
       source: the file's absolute path.
@@ -103,7 +104,8 @@ class PacketReader:
         # What it says of damage is said to the decoder as well.
         with captured_messages():
             self._capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
-        self._codec = (int(self._capture.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF).to_bytes(4, "little").lower()
+        self._codec = self._codec_now()
+        self.change: tuple[str, str] | None = None
         self._told_corrupt = False
         self.begin = 0.0
         with Path(source).open("rb") as file:
@@ -141,6 +143,9 @@ class PacketReader:
             if not read or content is None:
                 errors += 1
                 continue
+            if (codec := self._codec_now()) != self._codec and not {codec, self._codec} <= set(_OF_PROGRAMS):
+                self.change = _name(self._codec), _name(codec)
+                return
             # At the end there are only errors.
             yield from itertools.repeat(None, errors)
             errors = 0
@@ -159,6 +164,9 @@ class PacketReader:
             whole, self._told_corrupt = not self._told_corrupt, False
             yield Packet(stamp, content.size > _EMPTY_PACKET, key, size, orientation, whole, lossy)
 
+    def _codec_now(self) -> bytes:
+        return (int(self._capture.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF).to_bytes(4, "little").lower()
+
     def _since_beginning(self) -> float:
         """Seconds of the packet at hand. Milliseconds count from the first packet, but where presentation times, which
         the least number there is stands for if there are none, are not known."""
@@ -176,6 +184,11 @@ class PacketReader:
     def close(self) -> None:
         """Closes the file."""
         self._capture.release()
+
+
+def _name(codec: bytes) -> str:
+    """As FFmpeg calls a codec."""
+    return "mpeg2video" if codec in _OF_PROGRAMS else codec.decode("latin-1").strip("\0 ")
 
 
 def _parameters(packet: bytes, codec: bytes) -> tuple[bytes, int]:

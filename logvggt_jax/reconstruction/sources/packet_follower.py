@@ -17,6 +17,8 @@ from logvggt_jax.reconstruction.sources.opencv_packets import Packet, PacketRead
 _MICROSECOND = Fraction(1, 1_000_000)
 # Packets that are read before a frame is looked at: none is stored so far from the place where it is shown.
 _AHEAD = 48
+# Frames that a decoder keeps when another codec follows.
+_MOST_KEPT = 2
 # Some formats mark no key frames: after so many packets the first begins the video.
 _LONGEST_LEAD = 300
 # What files begin with that number packets as they are stored.
@@ -113,6 +115,12 @@ class PacketFollower:
     def begins_part(self) -> bool:
         """Whether the next frame can be the first of a part, whose time begins anew."""
         return self._joint is not None and not self._missing.anything_waits()
+
+    def codec_change(self, failures: int) -> tuple[str, str] | None:
+        """The codec so far and the one that follows, where nothing else is left than what so many failures, and frames
+        that the decoder never gives, stand for."""
+        left = self._stored - self._shown - failures
+        return self._reader.change if left <= _MOST_KEPT else None
 
     def fail(self, reason: str) -> None:
         """A frame could not be decoded."""

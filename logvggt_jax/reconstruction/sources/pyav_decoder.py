@@ -324,6 +324,9 @@ class PyAVDecoder:
                         packet.pts = packet.dts
                     yield packet
                     errors = 0
+                # Of some codecs no key frame is known as one while those of another are looked for.
+                if (now := self._codec(container, stream)) != codec:
+                    yield CodecChange(None, codec, now)
                 return
             except av.FFmpegError as error:
                 errors += 1
