@@ -611,7 +611,7 @@ CODECS: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize(("before", "after"), itertools.permutations(CODECS, 2))
+@pytest.mark.parametrize(("before", "after"), list(itertools.permutations(CODECS, 2)))
 def test_a_change_of_codec_is_named(tmp_path: Path, library: str, before: str, after: str) -> None:
     path = tmp_path / "both.ts"
     parts = [
