@@ -7,7 +7,9 @@ import io
 import itertools
 import os
 import re
+import shlex
 import socket
+import subprocess
 import sys
 import threading
 import time
@@ -1818,6 +1820,18 @@ def test_parameters_are_read_once_where_they_stay_the_same(
     packets_read = [packet for packet in opencv_packets.PacketReader(str(path)) if packet is not None]
     assert [packet.key for packet in packets_read] == [True] * 12 and len(asked) == 1
     assert {packet.size for packet in packets_read} == {(HEIGHT, WIDTH)}
+
+
+@pytest.mark.parametrize("errors", ["2>&-", "2>/dev/full"])
+def test_a_terminal_that_takes_no_errors_is_no_obstacle(tmp_path: Path, errors: str) -> None:
+    path = write(tmp_path / "walk.mp4", [grey(i) for i in range(6)])
+    program = (
+        "import sys; sys.modules['av'] = None; from logvggt_jax.reconstruction.sources import open_source; "
+        f"print(len(list(open_source({str(path)!r}))))"
+    )
+    command = f"{shlex.quote(sys.executable)} -c {shlex.quote(program)} {errors}"
+    done = subprocess.run(["sh", "-c", command], stdout=subprocess.PIPE, timeout=60, check=True)
+    assert done.stdout == b"6\n"
 
 
 def test_what_threads_print_comes_back_to_the_terminal(capfd: pytest.CaptureFixture[str]) -> None:

@@ -63,8 +63,13 @@ def captured_messages() -> Iterator[Callable[[], bytes]]:
     """
     # The descriptor is the whole process's: two threads would restore it out of turn.
     with _STDERR:
-        sys.stderr.flush()
-        kept = os.dup(2)
+        with contextlib.suppress(OSError):
+            if sys.stderr is not None:
+                sys.stderr.flush()
+        try:
+            kept = os.dup(2)
+        except OSError:  # of a process that was started without
+            kept = os.open(os.devnull, os.O_WRONLY)
         try:
             with tempfile.TemporaryFile(buffering=0) as file:
 
@@ -78,7 +83,8 @@ def captured_messages() -> Iterator[Callable[[], bytes]]:
                 finally:
                     os.dup2(kept, 2)
                     if others := _HIDDEN.sub(b"", _OF_FFMPEG.sub(b"", printed())):
-                        os.write(kept, others)
+                        with contextlib.suppress(OSError):  # nobody listens
+                            os.write(kept, others)
         finally:
             os.close(kept)
 
