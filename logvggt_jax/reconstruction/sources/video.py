@@ -15,6 +15,7 @@ import numpy as np
 
 from logvggt_jax.errors import InputError, disk_errors
 from logvggt_jax.frames import same_proportions
+from logvggt_jax.reconstruction.sources.alternate_lines import AlternateLines
 from logvggt_jax.reconstruction.sources.appended_files import another_follows
 from logvggt_jax.reconstruction.sources.decoding import (
     CodecChange,
@@ -39,6 +40,7 @@ from logvggt_jax.reconstruction.sources.source import (
     SourceOptions,
     fingerprint,
 )
+from logvggt_jax.reconstruction.sources.video_notes import looks_interlaced
 from logvggt_jax.reconstruction.sources.y4m_frames import is_broken
 
 _SCHEMES = ("rtsp", "rtsps", "rtmp", "rtmps", "http", "https", "udp", "tcp", "rtp", "srt", "mms")
@@ -163,7 +165,7 @@ class VideoSource(Source):
         clock, selection = FrameClock(header.rate if header else _STREAM_RATE), FrameSelection(self.options)
         size = header.size if header else None
         taken, guessed, position, seconds, lasts = 0, 0, -1, 0.0, None
-        pauses = Pauses()
+        pauses, lines = Pauses(), AlternateLines()
         lost, doubtful = False, 0  # whether a frame is missing since the last that refers to no other
         losses: list[str] = []  # frames before which some are not in the stream
         complaints: dict[int, str] = {}
@@ -190,6 +192,9 @@ class VideoSource(Source):
                 if selection.has_begun(seconds) and picture.size != size:
                     self._refuse_size(position, picture.size, size)
                 guessed += picture.damaged
+                # A camera's or stream's pictures are not converted for nothing, nor are those of a run that goes on.
+                if header is not None and not first and lines.wants(position):
+                    lines.add(position, picture.convert())
                 if picture.follows_loss and not lost:
                     losses.append(name)
                     troubles.append(position)
@@ -227,6 +232,8 @@ class VideoSource(Source):
         if found := pauses.found():
             places = some(f"{length:.3g} s after frame-{place:06d}" for place, length in found)
             self._add_note(f"{self.name} shows nothing for {places}: the recording was paused, or is damaged there")
+        if lines.found():
+            self._add_note(looks_interlaced(self.name))
         if not taken:
             raise InputError(
                 f"{self.name} gave no frame between {self.options.start or 0:g} s and "

@@ -43,3 +43,11 @@ def oblong_pixels(name: str, width: int, height: int) -> str:
 def begins_late(name: str, frames: int) -> str:
     """So many frames refer to one that is not in the file."""
     return f"{name} begins in the middle: {frames} frames before its first key frame are left out"
+
+
+def looks_interlaced(name: str) -> str:
+    """Pictures that show two moments, of which nothing in the file says so."""
+    return (
+        f"{name} looks interlaced, though nothing in it says so: its pictures show two moments in alternate lines; "
+        "deinterlace it beforehand with ffmpeg -i INPUT -vf bwdif=send_frame OUTPUT.mp4"
+    )
