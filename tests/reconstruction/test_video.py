@@ -816,6 +816,38 @@ def test_frames_that_a_copy_lost_are_told_where_others_refer_to_them(
     assert "intra-refresh" in parameters or int(counted.rsplit(" ", 1)[1]) >= len(wrong)
 
 
+@pytest.mark.parametrize("codec", ["mpeg1video", "mpeg2video"])
+@pytest.mark.parametrize(
+    ("between", "lost"), [("0", [13]), ("0", [13, 14]), ("2", [10]), ("2", [16]), ("2", [16, 17, 18]), ("2", [25])]
+)
+def test_frames_of_mpeg_that_a_copy_lost_are_told(
+    tmp_path: Path, library: str, codec: str, between: str, lost: list[int]
+) -> None:
+    """In the order of decoding I P B B P B B … and, every 24 frames, a key frame."""
+    images = [np.roll(busy(0), 2 * i, 1) for i in range(48)]
+    path = write(tmp_path / "a.mkv", images, codec=codec, rate=25, options={"g": "24", "bf": between})
+    whole = open_source(path)
+    truth = {round(frame.timestamp, 2): frame.image for frame in whole}
+    assert len(truth) == 48 and not whole.notes
+    source = open_source(rewritten(tmp_path / "b.mkv", path, lambda n, packet: None if n in lost else packet))
+    frames = list(source)
+    wrong = [
+        frame.name
+        for frame in frames
+        if np.abs(truth.get(round(frame.timestamp, 2), frame.image).astype(int) - frame.image).mean() > 1
+    ]
+    assert wrong and any("may lack what it showed" in note for note in source.notes)
+
+
+@pytest.mark.parametrize("lost", [[5], [6], [5, 6], [8, 12]])
+def test_frames_of_mpeg_to_which_no_other_refers_are_lost_without_harm(
+    tmp_path: Path, library: str, lost: list[int]
+) -> None:
+    path = write(tmp_path / "a.mkv", [busy(i) for i in range(24)], codec="mpeg2video", options={"g": "12", "bf": "2"})
+    source = open_source(rewritten(tmp_path / "b.mkv", path, lambda n, packet: None if n in lost else packet))
+    assert len(list(source)) == 24 - len(lost) and not source.notes and not source.skipped
+
+
 def test_frames_to_which_no_other_refers_are_lost_without_harm(tmp_path: Path, library: str) -> None:
     path = write(tmp_path / "a.mp4", [busy(i) for i in range(20)], options={"bf": "2", "b-adapt": "0"})
     # The second of the two that lie between frames which others refer to.

@@ -18,6 +18,7 @@ import cv2
 from PIL import Image
 
 from logvggt_jax.reconstruction.sources.h264_frame_numbers import FrameNumbers
+from logvggt_jax.reconstruction.sources.mpeg_picture_numbers import PictureNumbers
 from logvggt_jax.reconstruction.sources.opencv_messages import captured_messages, tells_corrupt_packet
 from logvggt_jax.reconstruction.sources.orientation import noted_orientation
 
@@ -135,7 +136,11 @@ class PacketReader:
 
     def _read(self) -> Iterator[Packet | None]:
         size, head, errors, first = None, b"", 0, True
-        numbers = FrameNumbers(self._description()) if self._codec in _H264_NAMES else None
+        numbers: FrameNumbers | PictureNumbers | None = None
+        if self._codec in _H264_NAMES:
+            numbers = FrameNumbers(self._description())
+        elif self._codec in _OF_PROGRAMS:
+            numbers = PictureNumbers()
         while self._capture.isOpened() and errors < _MOST_ERRORS:
             with captured_messages() as messages:
                 read, content = self._capture.retrieve() if self._capture.grab() else (False, None)

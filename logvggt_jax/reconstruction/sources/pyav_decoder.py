@@ -19,6 +19,7 @@ from logvggt_jax.reconstruction.sources.decoding import CodecChange, Damage, Pic
 from logvggt_jax.reconstruction.sources.deinterlacing import Deinterlacer, is_interlaced
 from logvggt_jax.reconstruction.sources.h264_frame_numbers import FrameNumbers
 from logvggt_jax.reconstruction.sources.missing_frames import MissingFrames
+from logvggt_jax.reconstruction.sources.mpeg_picture_numbers import PictureNumbers
 from logvggt_jax.reconstruction.sources.orientation import matrix_of, noted_orientation, shown_size, turn
 from logvggt_jax.reconstruction.sources.pyav_header import (
     STORE_DECODING_TIMES,
@@ -49,6 +50,7 @@ _LARGE = 1920 * 1088
 # stand for no change. A decoder may drop a damaged packet of theirs without an error. The last two decode AV1.
 _FRAME_A_PACKET = ("mpeg4", "h264", "hevc", "mjpeg", "mpeg1video", "mpeg2video", "av1", "libdav1d")
 _EMPTY_PACKET = 8
+_OF_MPEG = ("mpeg1video", "mpeg2video")
 # Codecs of which a packet that ends too soon gives a picture that is half grey, unless any error is to be one.
 _EASILY_PLEASED = ("mjpeg",)
 # Codecs of which a packet is a picture as a camera writes it, and gives its frame at once.
@@ -206,8 +208,11 @@ class PyAVDecoder:
         self._lead, self._lead_begins = 0, None
         started, key = False, None  # the time stamp of the first key frame; what is shown before refers to lost frames
         joined, last = False, -math.inf  # whether time goes back, as where recordings are joined
-        is_h264 = stream.codec_context.name == "h264"
-        numbers = FrameNumbers(stream.codec_context.extradata or b"") if is_h264 else None
+        numbers: FrameNumbers | PictureNumbers | None = None
+        if stream.codec_context.name == "h264":
+            numbers = FrameNumbers(stream.codec_context.extradata or b"")
+        elif stream.codec_context.name in _OF_MPEG:
+            numbers = PictureNumbers()
         after_loss: set[int | None] = set()  # time stamps of frames before which some are missing
         each = False  # whether every packet is known to show a frame of its own
         for packet, before_key in self._before_what(container, stream):
