@@ -49,7 +49,7 @@ _STATE_FRAMES = (MP4, AVI, IVF, MXF)
 # Of these, formats whose header states the duration of the video; FFmpeg guesses that of others.
 _STATE_SECONDS = (WINDOWS_MEDIA, MXF)
 # What begins the names of codecs of which damage within a picture draws no word: ProRes.
-_SAY_NOTHING = "ap"
+_SAY_NOTHING = ("apc", "ap4", "apr")
 _PYAV = install_line("video")
 _UNDECODED = "cannot be decoded"
 

@@ -169,7 +169,7 @@ class VideoSource(Source):
         lost, doubtful = False, 0  # whether a frame is missing since the last that refers to no other
         losses: list[str] = []  # frames before which some are not in the stream
         complaints: dict[int, str] = {}
-        troubles: list[int] = []  # where frames are missing
+        explained: set[int] = set()  # positions at which what is complained of comes of frames that are told as missing
         for position, picture in self._numbered(complaints):
             name, seconds = f"frame-{position:06d}", clock.time(picture.seconds)
             if selection.is_over(seconds):
@@ -184,7 +184,7 @@ class VideoSource(Source):
                 pauses.add(seconds, None if isinstance(picture, Damage) else picture.lasts)
             if isinstance(picture, Damage):
                 lost = True
-                troubles.append(position)
+                explained.update(_decoded_about(position))
                 if wanted:
                     self._skip(name, picture.reason, taken)
             else:
@@ -197,9 +197,8 @@ class VideoSource(Source):
                     lines.add(position, picture.convert())
                 if picture.follows_loss and not lost:
                     losses.append(name)
-                    troubles.append(position)
-                elif lost and complaints.get(position):
-                    troubles.append(position)
+                if lost or picture.follows_loss:
+                    explained.update(_decoded_about(position))
                 lost = (lost or picture.follows_loss) and picture.alone is False
                 if wanted:
                     doubtful += lost
@@ -213,7 +212,7 @@ class VideoSource(Source):
             self._check_end(position + 1, seconds, lasts)
         if guessed:
             self._add_note(f"{self.name}: frames with damaged parts, which the decoder filled by guesses: {guessed}")
-        if told := {at: text for at, text in complaints.items() if not _explained(at, troubles)}:
+        if told := {at: text for at, text in complaints.items() if at not in explained}:
             places = some(f"frame-{at:06d}" for at in told)
             self._add_note(
                 f"{self.name} is damaged about {places} ({_short(next(iter(told.values())))}): pictures there may be "
@@ -320,9 +319,9 @@ class VideoSource(Source):
             self.notes.append(note)
 
 
-def _explained(position: int, troubles: list[int]) -> bool:
-    """Whether what is complained of before this frame is that one soon after it, decoded earlier, is missing."""
-    return any(0 <= trouble - position <= _MOST_REORDERED for trouble in troubles)
+def _decoded_about(position: int) -> range:
+    """Positions of frames that may come out while this one is decoded, which may be before it is shown."""
+    return range(position - _MOST_REORDERED, position + 1)
 
 
 def _short(text: str) -> str:
