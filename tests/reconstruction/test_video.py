@@ -15,6 +15,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -1319,15 +1320,11 @@ def test_a_codec_whose_damage_opencv_does_not_tell_is_named(tmp_path: Path, open
 def test_errors_that_opencv_cannot_hear_are_told(
     tmp_path: Path, opencv_only: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """As with an OpenCV that holds its FFmpeg within itself."""
     path = write(tmp_path / "walk.mp4", [grey(i) for i in range(6)])
-    monkeypatch.setenv("OPENCV_FFMPEG_DEBUG", "1")
-    (note,) = open_source(path).notes
-    assert note.endswith("decoded by OpenCV, whose errors cannot be read while OPENCV_FFMPEG_DEBUG is set: unset it")
-    monkeypatch.delenv("OPENCV_FFMPEG_DEBUG")
-    # As with an OpenCV that was built on its own.
     monkeypatch.setattr(opencv_messages, "_library", lambda: None)
     (note,) = open_source(path).notes
-    assert "an OpenCV that does not tell of parts which it fills by guesses" in note
+    assert "an OpenCV whose FFmpeg cannot be asked what it says of damage" in note
 
 
 def test_a_gif_that_is_damaged_between_its_pictures_says_so(tmp_path: Path, library: str) -> None:
@@ -1866,20 +1863,30 @@ def test_a_terminal_that_takes_no_errors_is_no_obstacle(tmp_path: Path, errors: 
     assert done.stdout == b"6\n"
 
 
-def test_what_threads_print_comes_back_to_the_terminal(capfd: pytest.CaptureFixture[str]) -> None:
-    def capture() -> None:
-        for _ in range(20):
-            with opencv_messages.captured_messages() as messages:
-                os.write(2, b"[h264 @ 0x5581] hidden\nothers")
-                assert opencv_messages.errors_of_ffmpeg(messages()) == ["hidden"]
-
-    threads = [threading.Thread(target=capture) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    os.write(2, b"shown")
-    assert capfd.readouterr().err == 80 * "others" + "shown"
+def test_messages_go_to_the_thread_that_reads(
+    tmp_path: Path, opencv_only: None, capfd: pytest.CaptureFixture[str]
+) -> None:
+    broken = of_kind(tmp_path, "h264.ts")
+    content = broken.read_bytes()
+    broken.write_bytes(DAMAGES["zeros"](content, 0))
+    whole = tmp_path / "whole.ts"
+    whole.write_bytes(content)
+    alone = told(broken)
+    assert alone and capfd.readouterr() == ("", "")
+    with warnings.catch_warnings(), ThreadPoolExecutor(6) as pool:
+        warnings.simplefilter("ignore")
+        sources = [open_source(path, most_broken=1.0) for path in 3 * [broken, whole]]
+        read = list(pool.map(lambda source: len(list(source)), sources))
+    assert capfd.readouterr() == ("", "")
+    assert len(set(read[::2])) == len(set(read[1::2])) == 1
+    for source, path in zip(sources, 3 * [broken, whole], strict=True):
+        notes = [note for note in source.notes if not any(each in note for each in _OF_KIND)]
+        assert set(notes) <= set(alone) and bool(notes) == (path is broken)
+    # What nobody listens to is printed as ever.
+    capture = cv2.VideoCapture(str(broken), cv2.CAP_FFMPEG)
+    while capture.grab():
+        pass
+    assert "[h264 @ " in capfd.readouterr().err
 
 
 def test_digits_name_a_camera_unless_they_are_a_path(

@@ -20,11 +20,11 @@ from logvggt_jax.reconstruction.sources.matroska_track import read_matroska_view
 from logvggt_jax.reconstruction.sources.media_info import MediaHeader, media_info_is_there, read_media_header
 from logvggt_jax.reconstruction.sources.mp4_track import TrackView, read_mp4_view
 from logvggt_jax.reconstruction.sources.opencv_messages import (
+    Message,
     captured_messages,
     errors_of_ffmpeg,
     hears_all,
     quiet,
-    redirected,
 )
 from logvggt_jax.reconstruction.sources.orientation import matrix_of, shown_size, turn
 from logvggt_jax.reconstruction.sources.packet_follower import PacketFollower, TimeStamps, look_at_times
@@ -76,7 +76,7 @@ class OpenCVDecoder:
     def header(self) -> VideoHeader:
         """See `VideoDecoder.header`."""
         self._look_at_file()
-        with captured_messages() as messages:
+        with captured_messages() as said:
             capture = self._open()
             read = any(capture.grab() for _ in range(_MOST_FAILURES))
             image = capture.retrieve()[1] if read else None
@@ -84,7 +84,6 @@ class OpenCVDecoder:
             stated = int(count) if 0 < count <= self._bytes() else None
             begins = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
             single = stated is None and not capture.grab()
-            said = messages()
         codec = _fourcc(capture)
         self._check_converted(said)
         if image is None:
@@ -134,7 +133,7 @@ class OpenCVDecoder:
         self._look_at_file()
         with captured_messages() as messages:
             capture = self._open()
-            said = errors_of_ffmpeg(messages())
+        said = errors_of_ffmpeg(messages)
         follower = self._follower(capture.get(cv2.CAP_PROP_FPS))
         try:
             yield from self._follow(capture, follower, said)
@@ -155,10 +154,9 @@ class OpenCVDecoder:
         first_size: tuple[int, int] | None = None
         while failures < _MOST_FAILURES:
             asked = time.monotonic()
-            # A camera or stream may take long, and nobody else could print meanwhile.
             with quiet() if self._file is None else captured_messages() as messages:
                 decoded, image = capture.retrieve() if capture.grab() else (False, None)
-                said += errors_of_ffmpeg(messages()) if messages else []
+            said += errors_of_ffmpeg(messages or [])
             if not decoded or image is None or not image.size:
                 failures += 1
                 if follower is not None and (change := follower.codec_change(failures)):
@@ -192,7 +190,7 @@ class OpenCVDecoder:
                 # Either nothing moves, or the picture was not converted and the buffer holds the one before.
                 with captured_messages() as messages:
                     capture.retrieve()
-                    self._check_converted(messages())
+                self._check_converted(messages)
             last, before = seconds, image
             stated = follower.size if follower else None
             first_size = first_size or stated
@@ -224,11 +222,9 @@ class OpenCVDecoder:
             )
         if not hears_all():
             yield (
-                f"{self._name} is decoded by an OpenCV that does not tell of parts which it fills by guesses, or of "
-                f"packets that a stream lacks: {_PYAV}"
+                f"{self._name} is decoded by an OpenCV whose FFmpeg cannot be asked what it says of damage, and of "
+                f"interlaced pictures: {_PYAV}"
             )
-        if variable := redirected():
-            yield f"{self._name} is decoded by OpenCV, whose errors cannot be read while {variable} is set: unset it"
         if media is not None and len(media.sizes) > 1:
             names = [f"v:{number}" for number in range(len(media.sizes))]
             read = media.sizes.index(size) if size in media.sizes else 0
@@ -275,9 +271,9 @@ class OpenCVDecoder:
             return None
         return PacketFollower(self._file, rate, timed=self._times.exist, edited=self._view.edited)
 
-    def _check_converted(self, said: bytes) -> None:
+    def _check_converted(self, said: list[Message]) -> None:
         """Raises InputError if OpenCV handed out a buffer into which it could not convert the picture."""
-        if b"interlaced to progressive" in said:
+        if any("interlaced to progressive" in message.text for message in said):
             self._refuse_interlaced()
 
     def _refuse_interlaced(self) -> NoReturn:
@@ -314,7 +310,7 @@ class OpenCVDecoder:
         if re.search("[\ud800-\udfff]", str(self._source)):
             # A name that is no Unicode ends the process.
             raise InputError(f"{self._name!r}: OpenCV cannot open a file of this name: rename it, or {_PYAV}")
-        # What threads say of damage beside the call that reads their picture could not be read.
+        # What other threads than the one that reads say of damage is not heard.
         backend, alone = (cv2.CAP_ANY, []) if self._file is None else (cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, 1])
         with quiet():
             capture = cv2.VideoCapture(self._source, backend, parameters + alone)

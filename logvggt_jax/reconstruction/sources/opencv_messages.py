@@ -1,135 +1,143 @@
-"""What OpenCV and FFmpeg within it print: hidden where it says nothing new, read where it is said in no other way."""
+"""What FFmpeg within OpenCV says of damage, which it hands out in no other way, and OpenCV's own warnings."""
 
+import atexit
 import contextlib
 import ctypes
 import functools
 import os
-import re
-import sys
-import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 
-_STDERR = threading.RLock()
-# A line of FFmpeg begins with the part of it that speaks and where that lies in memory, then how serious it is.
-_COLOUR = rb"(?:\x1b\[[\d;]*m)*"
-_OF_FFMPEG = re.compile(
-    _COLOUR
-    + rb"(?:(?:\[[^\]\n]+ @ (?:0x)?[0-9a-fA-F]+\] )+|(?=\[[a-z]+\] ))"
-    + _COLOUR
-    + rb"(?:\[(info|warning|error|fatal|panic)\] )?"
-    + _COLOUR
-    + rb"([^\n\x1b]*)\n?"
-    + _COLOUR
-)
-_MILD = (b"info", b"warning")
+# FFmpeg's numbers: the less, the more serious. What is less serious than the second is about its inner life.
+_ERROR, _INFO = 16, 32
 # What is said without being called an error of a packet that is not whole, and of parts that a decoder guesses.
-_CORRUPT, _GUESSED = b"Packet corrupt", b"concealing "
-# FFmpeg's numbers of a level, and of the wish that lines state theirs.
-_INFO, _WITH_LEVEL = 32, 2
-# A line of OpenCV, and one of FFmpeg that goes on from the one before.
-_HIDDEN = re.compile(
-    rb"\[ ?(?:FATAL|ERROR|WARN|INFO|DEBUG):\d+@[\d.]+\][^\n]*\n?|Consider increasing the value for the 'ana[^\n]*\n?"
-)
-# By either of these, which are read once, FFmpeg's errors are printed elsewhere.
-_REDIRECTED = ("OPENCV_FFMPEG_LOGLEVEL", "OPENCV_FFMPEG_DEBUG")
+_CORRUPT, _GUESSED = "Packet corrupt", "concealing "
+_LONGEST = 1024
+# Where Linux lists the files of which this process has code.
+_LOADED = Path("/proc/self/maps")
 
 
-def redirected() -> str | None:
-    """The environment variable for which FFmpeg's errors cannot be read; None for none."""
-    return next((name for name in _REDIRECTED if name in os.environ), None)
+class Message(NamedTuple):
+    """A line that FFmpeg says.
+
+    Attributes:
+      level: how serious it is by FFmpeg's numbers, of which a smaller one is more so.
+      text: without the name of the part that says it.
+    """
+
+    level: int
+    text: str
+
+
+class _Ears(threading.local):
+    """Where the messages of each thread go; None for the terminal."""
+
+    found: list[Message] | None = None
+
+
+_ears = _Ears()
+
+
+class _Silence:
+    """OpenCV's level of logging is the whole process's: the first thread lowers it, the last one restores it."""
+
+    def __init__(self) -> None:
+        self._lock, self._inside, self._before = threading.Lock(), 0, 0
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if not self._inside:
+                self._before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+            self._inside += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._inside -= 1
+            if not self._inside:
+                cv2.utils.logging.setLogLevel(self._before)
+
+
+_silence = _Silence()
 
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """Without OpenCV's warnings: an error says the same."""
-    level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
-    try:
+    """Without what OpenCV prints: whoever calls it says the same."""
+    with _silence:
         yield
-    finally:
-        cv2.utils.logging.setLogLevel(level)
 
 
 @contextlib.contextmanager
-def captured_messages() -> Iterator[Callable[[], bytes]]:
-    """What OpenCV and FFmpeg print to standard error in the block: they hand out errors in no other way.
+def captured_messages() -> Iterator[list[Message]]:
+    """What FFmpeg says in the block to this thread, line by line as it comes, instead of printing it; OpenCV is quiet.
 
-    Gives a function that returns what has been printed so far. None of their lines reaches the terminal; what others
-    print meanwhile does behind the block.
+    Nothing is heard where `hears_all` says so. A decoder has to work in the thread that calls it.
     """
-    # The descriptor is the whole process's: two threads would restore it out of turn.
-    with _STDERR:
-        with contextlib.suppress(OSError):
-            if sys.stderr is not None:
-                sys.stderr.flush()
-        try:
-            kept = os.dup(2)
-        except OSError:  # of a process that was started without
-            kept = os.open(os.devnull, os.O_WRONLY)
-        try:
-            with tempfile.TemporaryFile(buffering=0) as file:
-
-                def printed() -> bytes:
-                    return os.pread(file.fileno(), os.fstat(file.fileno()).st_size, 0)
-
-                os.dup2(file.fileno(), 2)
-                try:
-                    with _all_told():
-                        yield printed
-                finally:
-                    os.dup2(kept, 2)
-                    if others := _HIDDEN.sub(b"", _OF_FFMPEG.sub(b"", printed())):
-                        with contextlib.suppress(OSError):  # nobody listens
-                            os.write(kept, others)
-        finally:
-            os.close(kept)
+    found: list[Message] = []
+    before, _ears.found = _ears.found, found
+    library = _library()
+    if library is not None:
+        # Each time: OpenCV may set its own when it opens the first video.
+        library.av_log_set_callback(_LISTENER)
+    try:
+        with _silence:
+            yield found
+    finally:
+        _ears.found = before
 
 
-def errors_of_ffmpeg(printed: bytes) -> list[str]:
-    """What FFmpeg says of damage in `captured_messages`, one line each."""
-    found = (line.groups() for line in _OF_FFMPEG.finditer(printed))
-    return [
-        text.decode(errors="replace").strip()
-        for level, text in found
-        if level not in _MILD or text.startswith(_GUESSED)
-    ]
+def errors_of_ffmpeg(messages: list[Message]) -> list[str]:
+    """Of what was said in `captured_messages` that which tells of damage."""
+    return [each.text for each in messages if each.level <= _ERROR or each.text.startswith(_GUESSED)]
 
 
-def tells_corrupt_packet(printed: bytes) -> bool:
-    """Whether FFmpeg says in `captured_messages` that a packet is not whole, or that some before it are missing."""
-    return any(line[2].startswith(_CORRUPT) for line in _OF_FFMPEG.finditer(printed))
+def tells_corrupt_packet(messages: list[Message]) -> bool:
+    """Whether FFmpeg said in `captured_messages` that a packet is not whole, or that some before it are missing."""
+    return any(each.text.startswith(_CORRUPT) for each in messages)
 
 
 def hears_all() -> bool:
-    """Whether FFmpeg can be asked for all that it notices; else it tells what it calls an error alone."""
+    """Whether FFmpeg's messages can be heard: its library is there for itself, not within OpenCV."""
     return _library() is not None
 
 
 @functools.cache
 def _library() -> ctypes.CDLL | None:
-    """The part of OpenCV's FFmpeg that knows how much is to be printed; None where OpenCV did not bring it along."""
+    """The part of OpenCV's FFmpeg through which all of it speaks; None where it cannot be found."""
     home = Path(cv2.__file__).parent
-    for path in (*home.parent.glob("opencv*.libs/libavutil*"), *home.glob(".dylibs/libavutil*")):
+    for path in (*home.parent.glob("opencv*.libs/libavutil*"), *home.glob(".dylibs/libavutil*"), *_loaded_ones()):
         with contextlib.suppress(OSError):  # of another OpenCV, which is not loaded
-            return ctypes.CDLL(str(path), mode=os.RTLD_LAZY | os.RTLD_NOLOAD)
+            library = ctypes.CDLL(str(path), mode=os.RTLD_LAZY | os.RTLD_NOLOAD)
+            # No message comes when there is no interpreter any more.
+            atexit.register(library.av_log_set_callback, library.av_log_default_callback)
+            return library
     return None
 
 
-@contextlib.contextmanager
-def _all_told() -> Iterator[None]:
+def _loaded_ones() -> list[Path]:
+    """Those that an OpenCV which was built on its own shares with other programs; not PyAV's own."""
+    lines = _LOADED.read_text().splitlines() if _LOADED.exists() else []
+    paths = {Path(line.split(maxsplit=5)[-1]) for line in lines if "/libavutil" in line}
+    return sorted(path for path in paths if path.parent.name != "av.libs")
+
+
+def _listen(speaker: int | None, level: int, form: bytes, values: int | None) -> None:
     library = _library()
-    if library is None:
-        yield
+    assert library is not None  # it is who calls
+    if _ears.found is None:
+        library.av_log_default_callback(ctypes.c_void_p(speaker), level, form, ctypes.c_void_p(values))
         return
-    before = library.av_log_get_level(), library.av_log_get_flags()
-    library.av_log_set_level(_INFO)
-    library.av_log_set_flags(_WITH_LEVEL)
-    try:
-        yield
-    finally:
-        library.av_log_set_level(before[0])
-        library.av_log_set_flags(before[1])
+    if level > _INFO:
+        return
+    line = ctypes.create_string_buffer(_LONGEST)
+    library.av_log_format_line(
+        ctypes.c_void_p(speaker), level, form, ctypes.c_void_p(values), line, _LONGEST, ctypes.byref(ctypes.c_int(0))
+    )
+    _ears.found.append(Message(level, line.value.decode(errors="replace").strip()))
+
+
+_LISTENER = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_void_p)(_listen)

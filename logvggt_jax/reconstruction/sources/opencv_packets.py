@@ -144,7 +144,7 @@ class PacketReader:
         while self._capture.isOpened() and errors < _MOST_ERRORS:
             with captured_messages() as messages:
                 read, content = self._capture.retrieve() if self._capture.grab() else (False, None)
-                self._told_corrupt = tells_corrupt_packet(messages()) or self._told_corrupt
+            self._told_corrupt = tells_corrupt_packet(messages) or self._told_corrupt
             if not read or content is None:
                 errors += 1
                 continue
