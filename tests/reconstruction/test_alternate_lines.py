@@ -42,13 +42,22 @@ def judged(pictures: list[np.ndarray]) -> bool:
     return lines.found()
 
 
-@pytest.mark.parametrize(("down", "right"), [(0, 1), (0, 3), (1, 0), (1, 2)])
+@pytest.mark.parametrize(("down", "right"), [(0, 1), (0, 3), (1, 2)])
 def test_two_moments_are_told_from_one(down: int, right: int) -> None:
     taken = moments(160, down, right)
     assert judged(of_two(taken, "even"))
     assert judged(of_two(taken, "odd"))
     assert not judged(taken) and not judged(taken[::2])
     assert not judged(taken[:1] * 80), "nothing moves"
+
+
+@pytest.mark.parametrize("size", [2, 8])
+@pytest.mark.parametrize(("down", "right"), [(2, 0), (2, 3), (0, 2)])
+def test_enlarged_pictures_are_whole(size: int, down: int, right: int) -> None:
+    """Their edges lie between the same lines, as those of games and of screens do."""
+    blocks = np.random.default_rng(1).integers(0, 256, (400 // size, 640 // size), np.uint8)
+    enlarged = np.repeat(np.repeat(blocks, size, axis=0), size, axis=1)[..., None].repeat(3, axis=2)
+    assert not judged([enlarged[down * i : down * i + 96, right * i : right * i + 128] for i in range(80)])
 
 
 def test_films_that_became_television_are_told() -> None:

@@ -20,7 +20,12 @@ _MOTION, _LEAST_MOVING = 12, 0.005
 # How much more one comparison differs than the other where pictures show two moments. Of whole pictures it was 1.13 at
 # most; a movement that is longer than its own texture takes that of two moments down to 1.
 _APART = 1.25
-# Pairs that tell, and their share of those that move: where films were turned into television, two in five.
+# How much more lines may differ from those of the other picture than from their neighbours where there are two moments.
+_WHOLE = 1.5
+# How much more lines that go in pairs differ from one side than from the other, as in pictures that were enlarged. What
+# these show can move just like one of two moments, which is why they are left out; so is what moves straight up or down.
+_PAIRED = 2.0
+# Pairs that tell, and their share of those that move: where a film became television, it is two in five.
 _FEWEST, _LEAST_SHARE = 3, 0.3
 
 
@@ -55,13 +60,26 @@ class AlternateLines:
 
 
 def _ratio(before: np.ndarray, after: np.ndarray) -> float | None:
-    """How much more even lines differ from the odd ones of the picture after theirs than odd lines from the even ones;
-    None where too little moves. Pictures are [H, W] int16 with an even number of lines."""
+    """How much more even lines differ from the odd ones of the picture after theirs than odd lines from the even ones.
+
+    None where too little moves, or where lines go in pairs. 1 where lines of one picture go together better than with
+    those of the other. Pictures are [H, W] int16 with an even number of lines.
+    """
     moving = np.abs(after - before) > _MOTION
     # A field moves where either of its neighbours in the other picture does.
     even, odd = moving[2::2] | moving[1:-1:2] | moving[3::2], moving[1:-1:2] | moving[0:-2:2] | moving[2::2]
     if min(even.mean(), odd.mean()) < _LEAST_MOVING:
         return None
-    odd_to_even = np.abs(before[1:-1:2] - (after[0:-2:2] + after[2::2]) // 2)[odd].mean()
-    even_to_odd = np.abs(before[2::2] - (after[1:-1:2] + after[3::2]) // 2)[even].mean()
-    return float((even_to_odd + 1) / (odd_to_even + 1))
+    paired, unpaired = _apart(before[0:-2:2] - before[1:-1:2]), _apart(before[1:-1:2] - before[2::2])
+    if not 1 / _PAIRED < paired / unpaired < _PAIRED:
+        return None
+    odd_to_even, odd_within = (_apart((before[1:-1:2] - (x[0:-2:2] + x[2::2]) // 2)[odd]) for x in (after, before))
+    even_to_odd, even_within = (_apart((before[2::2] - (x[1:-1:2] + x[3::2]) // 2)[even]) for x in (after, before))
+    if min(odd_to_even / odd_within, even_to_odd / even_within) > _WHOLE:
+        return 1.0
+    return even_to_odd / odd_to_even
+
+
+def _apart(differences: np.ndarray) -> float:
+    """Their mean size; never zero."""
+    return float(np.abs(differences).mean()) + 1.0
