@@ -22,8 +22,8 @@ _MOTION, _LEAST_MOVING = 12, 0.005
 _APART = 1.25
 # How much more lines may differ from those of the other picture than from their neighbours where there are two moments.
 _WHOLE = 1.5
-# How much more lines that go in pairs differ from one side than from the other, as in pictures that were enlarged. What
-# these show can move just like one of two moments, which is why they are left out; so is what moves straight up or down.
+# How much more lines that go in pairs differ on one side than on the other, as in pictures that were enlarged. What
+# these show can move just as two moments do, which is why they are left out; so is what moves straight up or down.
 _PAIRED = 2.0
 # Pairs that tell, and their share of those that move: where a film became television, it is two in five.
 _FEWEST, _LEAST_SHARE = 3, 0.3

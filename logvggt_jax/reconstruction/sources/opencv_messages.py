@@ -8,7 +8,7 @@ import os
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 
@@ -82,7 +82,7 @@ def captured_messages() -> Iterator[list[Message]]:
     library = _library()
     if library is not None:
         # Each time: OpenCV may set its own when it opens the first video.
-        library.av_log_set_callback(_LISTENER)
+        library.av_log_set_callback(_listener(library))
     try:
         with _silence:
             yield found
@@ -125,19 +125,17 @@ def _loaded_ones() -> list[Path]:
     return sorted(path for path in paths if path.parent.name != "av.libs")
 
 
-def _listen(speaker: int | None, level: int, form: bytes, values: int | None) -> None:
-    library = _library()
-    assert library is not None  # it is who calls
-    if _ears.found is None:
-        library.av_log_default_callback(ctypes.c_void_p(speaker), level, form, ctypes.c_void_p(values))
-        return
-    if level > _INFO:
-        return
-    line = ctypes.create_string_buffer(_LONGEST)
-    library.av_log_format_line(
-        ctypes.c_void_p(speaker), level, form, ctypes.c_void_p(values), line, _LONGEST, ctypes.byref(ctypes.c_int(0))
-    )
-    _ears.found.append(Message(level, line.value.decode(errors="replace").strip()))
+@functools.cache
+def _listener(library: ctypes.CDLL) -> Any:
+    """What FFmpeg calls with a message: who speaks, how serious it is, a form and the values that fill it."""
 
+    def listen(speaker: int | None, level: int, form: bytes, values: int | None) -> None:
+        called = ctypes.c_void_p(speaker), level, form, ctypes.c_void_p(values)
+        if _ears.found is None:
+            library.av_log_default_callback(*called)
+        elif level <= _INFO:
+            line, unfinished = ctypes.create_string_buffer(_LONGEST), ctypes.c_int(0)
+            library.av_log_format_line(*called, line, _LONGEST, ctypes.byref(unfinished))
+            _ears.found.append(Message(level, line.value.decode(errors="replace").strip()))
 
-_LISTENER = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_void_p)(_listen)
+    return ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_void_p)(listen)
