@@ -1,6 +1,5 @@
 """Whole pictures are read as they are; truncated, damaged and mistyped ones are named."""
 
-import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -8,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
+from tiff_by_hand import write_tiff
 
 from logvggt_jax.data.formats.image import read_depth, read_rgb
 from logvggt_jax.errors import InputError
@@ -84,12 +84,8 @@ def test_sixteen_bits_become_the_upper_eight(tmp_path: Path, suffix: str):
 
 @pytest.mark.parametrize(("changed", "told"), [({262: 0}, "0 is white"), ({262: 2, 277: 3, 284: 2}, "planar")])
 def test_a_tiff_that_opencv_would_read_wrong_is_refused(tmp_path: Path, changed: dict[int, int], told: str):
-    tags = {256: 6, 257: 5, 258: 16, 259: 1, 262: 1, 273: 200, 277: 1, 278: 5, 279: 60, 284: 1} | changed
-    entries = b"".join(struct.pack("<HHII", name, 4, 1, content) for name, content in tags.items())
-    head = b"II*\0" + struct.pack("<IH", 8, len(tags)) + entries
-    (tmp_path / "a.tif").write_bytes(head.ljust(200, b"\0") + bytes(range(180)))
     with pytest.raises(InputError, match=rf"a\.tif: .*{told}.* convert it to PNG"):
-        read_rgb(tmp_path / "a.tif")
+        read_rgb(write_tiff(tmp_path / "a.tif", changed))
 
 
 def test_depth_in_the_place_of_colour_is_named(tmp_path: Path):
