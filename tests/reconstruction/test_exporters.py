@@ -684,3 +684,7 @@ def test_names_of_files_have_no_blanks_and_stay_apart() -> None:
         "école",
         "a_b-4",
     ]
+
+
+def test_names_of_files_differ_where_capitals_do_not_count() -> None:
+    assert file_stems(["IMG_1", "img_1", "Img 1", "img_1-2"]) == ["IMG_1", "img_1-3", "Img_1-4", "img_1-2"]
