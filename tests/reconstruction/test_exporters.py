@@ -170,6 +170,22 @@ def test_transforms_json_has_the_cameras_in_opengls_axes(result: Reconstruction,
     assert len(points) == 600 and colours.std() > 10
 
 
+def test_transforms_json_has_one_lens_for_all_frames_where_they_share_it(
+    result: Reconstruction, exports: Path, tmp_path: Path
+) -> None:
+    """nerfstudio takes the file's own lens for every frame; LichtFeld Studio (64cf588) looks nowhere else."""
+    lens = ("fl_x", "fl_y", "cx", "cy", "w", "h")
+    document = json.loads((exports / "nerfstudio" / "transforms.json").read_text())
+    assert all(document[name] == frame[name] for frame in document["frames"] for name in lens)
+    other = write_room_result(tmp_path, count=3)
+    cameras = json.loads((other.folder / "cameras.json").read_text())
+    cameras["frames"][1]["intrinsics"][0][0] += 1.0
+    (other.folder / "cameras.json").write_text(json.dumps(cameras))
+    (folder,) = export(Reconstruction.open(other.folder), ["nerfstudio"], point_filter=FEW_POINTS, progress=False)
+    document = json.loads((folder / "transforms.json").read_text())
+    assert not set(lens) & set(document) and all(set(lens) < set(frame) for frame in document["frames"])
+
+
 def splats_of(path: Path) -> np.ndarray:
     trimesh = pytest.importorskip("trimesh", reason="extra `formats` is not installed")
     return trimesh.load(path).metadata["_ply_raw"]["vertex"]["data"]

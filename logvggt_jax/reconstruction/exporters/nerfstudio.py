@@ -29,7 +29,8 @@ def export_nerfstudio(
     where nothing is to be seen.
 
     Cameras are camera-to-world with OpenGL axes, in the world of the points; the centre of the first pixel is at
-    (0.5, 0.5). `point_filter` None gives 100,000 points.
+    (0.5, 0.5). Where all frames have one lens the file has it once for all besides: some readers look nowhere else, and
+    nerfstudio takes it for every frame. `point_filter` None gives 100,000 points.
     """
     pictures = Pictures.of(result)
     height, width = pictures.size
@@ -40,20 +41,22 @@ def export_nerfstudio(
         write_masks(result, path / "masks", [f"{stem}.png" for stem in stems], pictures.size)
         masks = [{"mask_path": f"masks/{stem}.png"} for stem in stems]
     poses = np.asarray(invert(result.extrinsics)) @ OPENGL_AXES
-    frames = [
+    lenses = [
         {
-            "file_path": f"images/{file}",
-            **mask,
             "fl_x": matrix[0, 0],
             "fl_y": matrix[1, 1],
             "cx": matrix[0, 2] + 0.5,
             "cy": matrix[1, 2] + 0.5,
             "w": width,
             "h": height,
-            "transform_matrix": pose.tolist(),
         }
-        for file, mask, matrix, pose in zip(files, masks, pictures.intrinsics, poses, strict=True)
+        for matrix in pictures.intrinsics
     ]
+    frames = [
+        {"file_path": f"images/{file}", **mask, **lens, "transform_matrix": pose.tolist()}
+        for file, mask, lens, pose in zip(files, masks, lenses, poses, strict=True)
+    ]
+    shared = lenses[0] if all(lens == lenses[0] for lens in lenses) else {}
     export_ply(result, path / _POINTS, point_filter=point_filter or result.filtered(NUM_POINTS), progress=progress)
-    document = {"camera_model": "OPENCV", "ply_file_path": _POINTS, "frames": frames}
+    document = {"camera_model": "OPENCV", **shared, "ply_file_path": _POINTS, "frames": frames}
     write_text(path / TRANSFORMS_FILE, json.dumps(document, indent=1) + "\n")
