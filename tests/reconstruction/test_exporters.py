@@ -92,6 +92,21 @@ def test_colmap_reads_cameras_points_and_their_observations(result: Reconstructi
     assert np.mean(lengths) > 2, "points are seen by several frames"
 
 
+def test_the_text_model_has_the_fields_that_other_readers_count(exports: Path) -> None:
+    """Brush, LichtFeld Studio and SuperSplat split its lines at single blanks and take images by two lines each."""
+    pytest.importorskip("pycolmap", reason="extra `colmap` is not installed")
+    folder = exports / "colmap-text" / "sparse" / "0"
+    lines = {
+        name: [line for line in (folder / f"{name}.txt").read_text().splitlines() if not line.startswith("#")]
+        for name in ("cameras", "images", "points3D")
+    }
+    assert [len(line.split(" ")) for line in lines["cameras"]] == [8]
+    assert [len(line.split(" ")) for line in lines["images"][::2]] == [10] * COUNT
+    assert len(lines["images"]) == 2 * COUNT and all(len(line.split()) % 3 == 0 for line in lines["images"][1::2])
+    assert len(lines["points3D"]) == 600
+    assert all((fields := len(line.split())) >= 8 and fields % 2 == 0 for line in lines["points3D"])
+
+
 def test_colmap_adjusts_the_model(exports: Path) -> None:
     pycolmap = pytest.importorskip("pycolmap", reason="extra `colmap` is not installed")
     model = pycolmap.Reconstruction(exports / "colmap" / "sparse" / "0")
