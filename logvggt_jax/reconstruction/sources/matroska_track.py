@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import struct
 from pathlib import Path
@@ -19,6 +20,18 @@ _PROJECTION = re.compile(rb"\x76\x70([\x80-\xfe])")
 _TYPE, _YAW, _PITCH, _ROLL = b"\x76\x71", b"\x76\x73", b"\x76\x74", b"\x76\x75"
 _TYPES = {1: "equirectangular", 2: "a cube map", 3: "a mesh"}
 _FLOATS = {4: ">f", 8: ">d"}
+# A track's own number, where it is described and where something is said of it; and a track's kind.
+_TRACK, _OF_TRACK = re.compile(rb"\x73\xc5([\x81-\x88])"), re.compile(rb"\x63\xc5([\x81-\x88])")
+_KIND, _VIDEO = b"\x83\x81", b"\1"
+# How long a track is, as is said of it, behind its number in so many bytes; and how long the file is, in milliseconds
+# but where another unit is stated.
+_TAG, _TAG_LENGTH = re.compile(rb"DURATION\x44\x87[\x80-\xff](\d+):(\d\d):(\d\d\.\d+)"), 64
+_DURATION, _UNIT = re.compile(rb"\x44\x89([\x84\x88])"), re.compile(rb"\x2a\xd7\xb1([\x81-\x88])")
+# How long the last frame is shown, behind it and before the index or the end, where it says so itself.
+_LAST = re.compile(
+    rb"\x9b(?:\x81(.)|\x82(..)|\x83(...)|\x84(....))(?:(?:\xfb|\x75\xa2).{2,9})?(?:\x1c\x53\xbb\x6b|\Z)", re.DOTALL
+)
+_TAIL = 1 << 16
 
 
 def lacks_end(stream: IO[bytes]) -> bool:
@@ -45,17 +58,45 @@ def read_matroska_view(path: Path) -> TrackView | None:
     """None for files of other formats."""
     with path.open("rb") as file:
         head = file.read(_HEAD)
+        file.seek(-min(_TAIL, file.seek(0, 2)), 2)
+        tail = file.read()
     if not head.startswith(_START):
         return None
     head = head.partition(_CLUSTER)[0]
+    seconds = _seconds(head, tail)
     for found in _PROJECTION.finditer(head):
         values = _values(head[found.end() : found.end() + found[1][0] - 0x80])
         if values:
             projection = _TYPES.get(int(values.get(_TYPE, 0)))
             # A pinhole's picture is turned by its roll, and mirrored where it is seen from behind.
             turned = _matrix(values.get(_YAW, 0.0), values.get(_PITCH, 0.0), values.get(_ROLL, 0.0))
-            return TrackView(None if projection else turned, projection)
-    return TrackView()
+            return TrackView(None if projection else turned, projection, seconds)
+    return TrackView(seconds=seconds)
+
+
+def _seconds(head: bytes, tail: bytes) -> float | None:
+    """From the file's beginning to the end of the first video, or to the beginning of its last frame where that says
+    how long it is shown; None where that is not stated."""
+    tracks = list(_TRACK.finditer(head))
+    videos = [each for each in tracks if head[each.end() :].partition(_KIND)[2].startswith(_VIDEO)]
+    unit = next((_number(head, found) for found in _UNIT.finditer(head)), 1_000_000) / 1e9
+    last = _LAST.search(tail)
+    shown = unit * int.from_bytes(last[last.lastindex or 0], "big") if last else 0.0
+    for found in _OF_TRACK.finditer(head):
+        said = _TAG.search(head, found.end(), found.end() + _TAG_LENGTH)
+        if said and videos and _number(head, found) == _number(head, videos[0]):
+            hours, minutes, seconds = map(float, said.groups())
+            return 3600 * hours + 60 * minutes + seconds - shown or None
+    duration = _DURATION.search(head)
+    if duration is None or len(tracks) != 1:
+        return None
+    (length,) = struct.unpack_from(_FLOATS[duration[1][0] - 0x80], head.ljust(duration.end() + 8), duration.end())
+    return length * unit - shown if math.isfinite(length) and length > 0 else None
+
+
+def _number(head: bytes, found: re.Match[bytes]) -> int:
+    """What follows a name and its length."""
+    return int.from_bytes(head[found.end() : found.end() + found[1][0] - 0x80], "big")
 
 
 def _values(content: bytes) -> dict[bytes, float]:

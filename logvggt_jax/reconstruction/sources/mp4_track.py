@@ -27,7 +27,7 @@ class TrackView(NamedTuple):
     Attributes:
       matrix: see `orientation`; None where nothing is turned.
       projection: of a view all around; None for that of a pinhole camera.
-      seconds: that are shown; None where the track does not say.
+      seconds: that are shown, of Matroska from the beginning of the file; None where the track does not say.
       edited: not all of the track is shown.
     """
 

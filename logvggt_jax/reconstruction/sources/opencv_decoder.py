@@ -14,17 +14,27 @@ import cv2
 import numpy as np
 
 from logvggt_jax.errors import InputError, install_line
-from logvggt_jax.reconstruction.sources.containers import AVI, FLASH, IVF, MP4, MXF, WINDOWS_MEDIA, container_of
+from logvggt_jax.reconstruction.sources.containers import (
+    AVI,
+    FLASH,
+    MATROSKA,
+    MP4,
+    WINDOWS_MEDIA,
+    container_of,
+)
 from logvggt_jax.reconstruction.sources.decoding import CodecChange, Complaint, Damage, Picture, VideoHeader
 from logvggt_jax.reconstruction.sources.matroska_track import read_matroska_view
 from logvggt_jax.reconstruction.sources.media_info import MediaHeader, media_info_is_there, read_media_header
 from logvggt_jax.reconstruction.sources.mp4_track import TrackView, read_mp4_view
+from logvggt_jax.reconstruction.sources.opencv_codecs import codec_name, codec_of
 from logvggt_jax.reconstruction.sources.opencv_messages import (
     Message,
     captured_messages,
     errors_of_ffmpeg,
+    guessed_frames,
     hears_all,
     quiet,
+    tells_half_jpeg,
 )
 from logvggt_jax.reconstruction.sources.orientation import matrix_of, shown_size, turn
 from logvggt_jax.reconstruction.sources.packet_follower import PacketFollower, TimeStamps, look_at_times
@@ -43,13 +53,11 @@ _MOST_FAILURES = 64
 # Frames at the beginning whose order is looked at.
 _FIRST_FRAMES = 16
 # The codec by which FFmpeg draws text as a terminal would.
-_TEXT = "ansi"
-# Formats that state how many frames there are, MXF by its duration; of others OpenCV multiplies duration and rate.
-_STATE_FRAMES = (MP4, AVI, IVF, MXF)
-# Of these, formats whose header states the duration of the video; FFmpeg guesses that of others.
-_STATE_SECONDS = (WINDOWS_MEDIA, MXF)
-# What begins the names of codecs of which damage within a picture draws no word: ProRes.
-_SAY_NOTHING = ("apc", "ap4", "apr")
+_TEXT = b"ansi"
+# Formats that state how many frames there are; of others OpenCV multiplies duration and rate.
+_STATE_FRAMES = (MP4, AVI)
+# How FFmpeg calls frames that refer to others, and those of which it does not know.
+_REFER = "PB?"
 _PYAV = install_line("video")
 _UNDECODED = "cannot be decoded"
 
@@ -84,20 +92,22 @@ class OpenCVDecoder:
             stated = int(count) if 0 < count <= self._bytes() else None
             begins = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
             single = stated is None and not capture.grab()
-        codec = _fourcc(capture)
+        codec = codec_name(capture)
+        called = _called(codec)
         self._check_converted(said)
         if image is None:
             raise InputError(
-                f"{self._name} holds no frame that OpenCV can decode (codec {codec}): {_PYAV}, or re-encode it, for "
+                f"{self._name} holds no frame that OpenCV can decode (codec {called}): {_PYAV}, or re-encode it, for "
                 "example to H.264 mp4"
             )
         if single or codec == _TEXT:
             kind = "text" if codec == _TEXT else "a single image"
             raise InputError(f"{self._name} is {kind}, not a video: give a video or the folder that holds the images")
         if self._file is not None and self._container is None:
-            raise InputError(
-                f"{self._name} is of a format in which OpenCV does not notice damage: {_PYAV}, or re-encode "
-                "it, for example to H.264 mp4"
+            self._refuse_unchecked("a format in which OpenCV does not notice all damage")
+        if self._file is not None and codec_of(codec) is None:
+            self._refuse_unchecked(
+                f"a codec ({called}) of which OpenCV does not notice all damage, or a change of size"
             )
         frequency = capture.get(cv2.CAP_PROP_FPS)
         rate = frequency if math.isfinite(frequency) and frequency > 0 else None
@@ -115,6 +125,8 @@ class OpenCVDecoder:
         seconds = self._view.seconds or (self._media.seconds if self._media else None)
         if self._container == AVI and seconds is not None:
             seconds -= begins
+        if self._container == MATROSKA and seconds is not None:
+            seconds -= self._times.begin
         if stated and rate and self._states_seconds():
             seconds = stated / rate - (self._times.begin if self._container == WINDOWS_MEDIA else 0.0)
         return VideoHeader(
@@ -146,18 +158,20 @@ class OpenCVDecoder:
         self, capture: cv2.VideoCapture, follower: PacketFollower | None, said: list[str]
     ) -> Iterator[Picture | Damage | Complaint | CodecChange]:
         """`said` is what was said of damage when the file was opened."""
-        failures = 0
+        failures = guessed = 0
         rate = capture.get(cv2.CAP_PROP_FPS)
         step = 1.0 / rate if math.isfinite(rate) and rate > 0 else math.inf
         last: float | None = None
         before: np.ndarray | None = None
         first_size: tuple[int, int] | None = None
-        while failures < _MOST_FAILURES:
+        while failures < _MOST_FAILURES or (follower is not None and not follower.is_over(failures)):
             asked = time.monotonic()
             with quiet() if self._file is None else captured_messages() as messages:
                 decoded, image = capture.retrieve() if capture.grab() else (False, None)
-            said += errors_of_ffmpeg(messages or [])
-            if not decoded or image is None or not image.size:
+            messages = messages or []
+            said += errors_of_ffmpeg(messages)
+            guessed += guessed_frames(messages)
+            if not decoded or image is None or not image.size or tells_half_jpeg(messages):
                 failures += 1
                 if follower is not None and (change := follower.codec_change(failures)):
                     yield CodecChange(None, *change)
@@ -167,6 +181,7 @@ class OpenCVDecoder:
                     break
                 continue
             seconds = self._stamp(capture, last, follower)
+            refers = follower is not None and chr(int(capture.get(cv2.CAP_PROP_FRAME_TYPE))) in _REFER
             if follower is None:
                 while failures and last is not None and seconds is not None and seconds - last > 1.5 * step:
                     failures, last = failures - 1, last + step
@@ -178,7 +193,7 @@ class OpenCVDecoder:
                     yield from follower.failures()
                     ordered = follower.next_in_order()
                     seconds = ordered if self._times.as_stored else None
-                elif follower.precedes_key_frame(stamp := round(1e6 * seconds)):
+                elif follower.precedes_key_frame(stamp := round(1e6 * seconds), refers):
                     failures, said = 0, []
                     continue
                 else:
@@ -197,10 +212,15 @@ class OpenCVDecoder:
             matrix = self._turned(follower)
             size = shown_size(_stored_size(image.shape[:2], stated, first_size), matrix)
             alone, follows_loss = (follower.key, follower.follows_loss) if follower else (None, False)
+            if follower is not None:
+                # Some files mark every packet as a key frame's, and of some it is not known which is this frame's.
+                alone = not refers and (follower.key or not follower.known)
             convert = partial(_convert, image, matrix)
-            yield Picture(seconds, size, convert, alone=alone, follows_loss=follows_loss)
+            yield Picture(seconds, size, convert, damaged=guessed > 0, alone=alone, follows_loss=follows_loss)
+            guessed = max(0, guessed - 1)
         if follower is not None:
-            yield from follower.rest() if self._times.exist and not self._times.as_stored else follower.failures()
+            in_order = self._times.exist and not self._times.as_stored
+            yield from follower.rest() if in_order or not follower.reordered else follower.failures()
         if said:
             yield Complaint(said[0])
 
@@ -231,8 +251,6 @@ class OpenCVDecoder:
             yield several_videos(self._name, media.sizes, names, names[read])
         if not self._times.exist or (media is not None and media.bare):
             yield no_times(self._name, rate or 1.0)
-        if _fourcc(capture).lower().startswith(_SAY_NOTHING):
-            yield f"{self._name} is ProRes, of which OpenCV does not notice damage within a picture: {_PYAV}"
         if self._view.projection is not None:
             yield all_around(self._name, self._view.projection)
         if media is not None and media.transfer is not None:
@@ -244,8 +262,6 @@ class OpenCVDecoder:
             yield oblong_pixels(self._name, width, height)
         if follower is not None and follower.lead:
             yield begins_late(self._name, follower.lead)
-        if follower is not None and not follower.states_size:
-            yield f"{self._name}: OpenCV does not notice where pictures of its codec change their size; {_PYAV}"
 
     def _look_at_file(self) -> None:
         """Learns what OpenCV does not tell: how pictures are turned, what their header says, and which times hold."""
@@ -276,6 +292,9 @@ class OpenCVDecoder:
         if any("interlaced to progressive" in message.text for message in said):
             self._refuse_interlaced()
 
+    def _refuse_unchecked(self, kind: str) -> NoReturn:
+        raise InputError(f"{self._name} is of {kind}: {_PYAV}, or re-encode it, for example to H.264 mp4")
+
     def _refuse_interlaced(self) -> NoReturn:
         raise InputError(
             f"{self._name} is interlaced, which OpenCV cannot convert: {_PYAV}, or deinterlace it with "
@@ -290,7 +309,7 @@ class OpenCVDecoder:
         """Whether the duration that OpenCV knows is that of the video, as the file states it."""
         # Flash states one for sound and pictures together.
         silent = self._media is not None and not self._media.sound
-        return self._container in _STATE_SECONDS or (self._container == FLASH and silent)
+        return self._container == WINDOWS_MEDIA or (self._container == FLASH and silent)
 
     def _stamp(self, capture: cv2.VideoCapture, last: float | None, follower: PacketFollower | None) -> float | None:
         if isinstance(self._source, int):
@@ -344,6 +363,5 @@ def _convert(image: np.ndarray, matrix: np.ndarray | None) -> np.ndarray:
     return rgb if matrix is None else turn(rgb, matrix)
 
 
-def _fourcc(capture: cv2.VideoCapture) -> str:
-    code = int(capture.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF
-    return re.sub(r"[^\w.-]", "", code.to_bytes(4, "little").decode("latin-1")) or "unknown"
+def _called(codec: bytes) -> str:
+    return re.sub(r"[^\w.-]", "", codec.decode("latin-1")) or "unknown"

@@ -5,6 +5,7 @@ import contextlib
 import ctypes
 import functools
 import os
+import re
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,7 +17,11 @@ import cv2
 _ERROR, _INFO = 16, 32
 # What is said without being called an error of a packet that is not whole, and of parts that a decoder guesses.
 _CORRUPT, _GUESSED = "Packet corrupt", "concealing "
+# The decoder of JPEG, and how begins what it says of coefficients that are missing or wrong.
+_JPEG, _HALF_JPEG = "mjpeg", re.compile(r"overread|error (?:count|dc|y=)|mjpeg_decode_dc")
 _LONGEST = 1024
+# What a line begins with: who speaks, behind those on whose behalf.
+_SPEAKERS = re.compile(r"(?:\[(\S+) @ \w+\]\s*)+")
 # Where Linux lists the files of which this process has code.
 _LOADED = Path("/proc/self/maps")
 
@@ -27,10 +32,12 @@ class Message(NamedTuple):
     Attributes:
       level: how serious it is by FFmpeg's numbers, of which a smaller one is more so.
       text: without the name of the part that says it.
+      speaker: that part, such as a codec; empty for none.
     """
 
     level: int
     text: str
+    speaker: str
 
 
 class _Ears(threading.local):
@@ -91,8 +98,20 @@ def captured_messages() -> Iterator[list[Message]]:
 
 
 def errors_of_ffmpeg(messages: list[Message]) -> list[str]:
-    """Of what was said in `captured_messages` that which tells of damage."""
-    return [each.text for each in messages if each.level <= _ERROR or each.text.startswith(_GUESSED)]
+    """Of what was said in `captured_messages` that which tells of damage, but for what is said of frames whose damaged
+    parts are guessed: these are counted."""
+    guessing = {each.speaker for each in messages if each.text.startswith(_GUESSED)}
+    return [each.text for each in messages if each.level <= _ERROR and each.speaker not in guessing]
+
+
+def tells_half_jpeg(messages: list[Message]) -> bool:
+    """Whether FFmpeg said in `captured_messages` that it could not decode all of a JPEG, which is then half grey."""
+    return any(each.speaker == _JPEG and _HALF_JPEG.match(each.text) for each in messages)
+
+
+def guessed_frames(messages: list[Message]) -> int:
+    """Of how many frames FFmpeg said in `captured_messages` that damaged parts are filled by guesses: once of each."""
+    return sum(each.text.startswith(_GUESSED) for each in messages)
 
 
 def tells_corrupt_packet(messages: list[Message]) -> bool:
@@ -134,8 +153,13 @@ def _listener(library: ctypes.CDLL) -> Any:
         if _ears.found is None:
             library.av_log_default_callback(*called)
         elif level <= _INFO:
-            line, unfinished = ctypes.create_string_buffer(_LONGEST), ctypes.c_int(0)
-            library.av_log_format_line(*called, line, _LONGEST, ctypes.byref(unfinished))
-            _ears.found.append(Message(level, line.value.decode(errors="replace").strip()))
+            line, named = ctypes.create_string_buffer(_LONGEST), ctypes.c_int(1)
+            library.av_log_format_line(*called, line, _LONGEST, ctypes.byref(named))
+            _ears.found.append(_message(level, line.value.decode(errors="replace").strip()))
 
     return ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_void_p)(listen)
+
+
+def _message(level: int, line: str) -> Message:
+    begin = _SPEAKERS.match(line)
+    return Message(level, line[begin.end() :] if begin else line, begin[1] if begin else "")

@@ -2,64 +2,29 @@
 
 from __future__ import annotations
 
-import io
 import itertools
 import math
-import re
-import struct
-import tempfile
-import warnings
 from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import cv2
-from PIL import Image
 
 from logvggt_jax.reconstruction.sources.h264_frame_numbers import FrameNumbers
 from logvggt_jax.reconstruction.sources.mpeg_picture_numbers import PictureNumbers
+from logvggt_jax.reconstruction.sources.opencv_codecs import codec_name, codec_of, shows_frame
 from logvggt_jax.reconstruction.sources.opencv_messages import captured_messages, tells_corrupt_packet
 from logvggt_jax.reconstruction.sources.orientation import noted_orientation
+from logvggt_jax.reconstruction.sources.stated_sizes import stated_size
 
-# Where the parameters of a stream begin, by which FFmpeg recognises it, and how many bytes of them state the size; for
-# None, those up to the next start code.
-_START_CODE = b"\x00\x00\x01"
-_H264 = re.compile(rb"\x00\x00\x01[\x07\x27\x47\x67]"), None
-_HEVC = re.compile(rb"\x00\x00\x01\x40.*?\x00\x00\x01\x42", re.DOTALL), None
-_MPEG = re.compile(rb"\x00\x00\x01\xb3"), 12
-_PARAMETERS: dict[bytes, tuple[re.Pattern[bytes], int | None]] = {
-    b"h264": _H264,
-    b"avc1": _H264,
-    b"hevc": _HEVC,
-    b"hvc1": _HEVC,
-    b"hev1": _HEVC,
-    b"mpg1": _MPEG,
-    b"mpg2": _MPEG,
-    b"vp80": (re.compile(rb"...\x9d\x01\x2a....", re.DOTALL), 10),
-    b"vp90": (re.compile(rb""), 12),
-    b"av01": (re.compile(rb""), 32),
-    b"mjpg": (re.compile(rb"\xff\xd8"), 1 << 16),
-    b"mpng": (re.compile(rb"\x89PNG"), 24),
-}
-_H264_NAMES = (b"h264", b"avc1")
-_PICTURES = (b"mjpg", b"mpng")
-_OF_CAMERAS = b"mjpg"
-# Codecs that FFmpeg recognises in the container IVF only.
-_IN_IVF = (b"vp90", b"av01")
-# Codecs of which every packet shows a frame of its own, but for empty ones, which stand for no change.
-_FRAME_A_PACKET = (
-    *(b"h264", b"avc1", b"hevc", b"hvc1", b"hev1", b"mjpg", b"fmp4", b"mp4v", b"xvid", b"divx", b"dx50"),
-    *(b"mpg1", b"mpg2"),
-)
-# Codecs that are stored in the order in which they are shown; a packet need not show a frame.
-_AS_SHOWN = (b"vp80", b"vp90", b"av01")
-_EMPTY_PACKET = 8
+_H264, _OF_CAMERAS, _OF_MPEG = b"h264", b"mjpg", (b"mpg1", b"mpg2")
 # What a description begins with of a stream whose units have their lengths before them, which OpenCV replaces.
 _WITH_LENGTHS = b"\1"
-# What files begin with that may lack presentation times: AVI, MXF, ASF; and streams of programs, but for MPEG's own.
-_LACK_TIMES = (b"RIFF", b"\x06\x0e\x2b\x34", b"\x30\x26\xb2\x75")
-_PROGRAMS, _OF_PROGRAMS = b"\0\0\1\xba", (b"mpg1", b"mpg2")
+STORE_DECODING_TIMES = (b"RIFF", b"\x30\x26\xb2\x75")
+"""What files begin with that state when packets are decoded, not when their frames are shown: AVI and ASF."""
+# Microseconds below which a time stands for none, in a part of the file that is damaged.
+_NO_TIME = -1 << 62
 # FFmpeg reads so many packets ahead of the one that it hands out.
 _AHEAD = 3
 # Errors in a row after which nothing more is to be read.
@@ -71,7 +36,7 @@ class Packet(NamedTuple):
 
     Attributes:
       stamp: presentation time in microseconds from the stream's start.
-      holds_frame: it is not empty.
+      holds_frame: it shows a frame of its own.
       key: decoding can begin with it.
       size: (H, W) before rotation, as the key frames so far state it; None where none does.
       orientation: EXIF's, that the camera noted in a JPEG; 1 for none.
@@ -93,7 +58,7 @@ class PacketReader:
 
     Attributes:
       frame_each: each is known to show one frame, at a time that is known.
-      as_shown: they are stored in the order in which frames are shown.
+      reordered, holds_one: see `Codec`.
       begin: seconds from the file's beginning to the first, once that is read.
       change: names of the codec so far and of the one that follows, once that is reached; no packet of that is read.
 
@@ -105,15 +70,15 @@ class PacketReader:
         # What it says of damage is said to the decoder as well.
         with captured_messages():
             self._capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
-        self._codec = self._codec_now()
+        self._codec = codec_name(self._capture)
         self.change: tuple[str, str] | None = None
         self._told_corrupt = False
         self.begin = 0.0
         with Path(source).open("rb") as file:
-            self.as_shown = self._codec in _AS_SHOWN
-            head = file.read(4)
-            timed = head not in _LACK_TIMES and (head != _PROGRAMS or self._codec in _OF_PROGRAMS)
-            self.frame_each = self._codec in _FRAME_A_PACKET and timed
+            kind = codec_of(self._codec)
+            self._empty = kind.empty if kind else 0
+            self.frame_each = kind is not None and not (kind.reordered and file.read(4) in STORE_DECODING_TIMES)
+            self.reordered, self.holds_one = (kind.reordered, kind.holds_one) if kind else (True, False)
 
     def __iter__(self) -> Iterator[Packet | None]:
         """None stands for one that cannot be read."""
@@ -135,11 +100,12 @@ class PacketReader:
         return packet._replace(follows_loss=True)
 
     def _read(self) -> Iterator[Packet | None]:
-        size, head, errors, first = None, b"", 0, True
+        description = self._description()
+        size, errors, first = stated_size(description, self._codec), 0, True
         numbers: FrameNumbers | PictureNumbers | None = None
-        if self._codec in _H264_NAMES:
-            numbers = FrameNumbers(self._description())
-        elif self._codec in _OF_PROGRAMS:
+        if self._codec == _H264:
+            numbers = FrameNumbers(description)
+        elif self._codec in _OF_MPEG:
             numbers = PictureNumbers()
         while self._capture.isOpened() and errors < _MOST_ERRORS:
             with captured_messages() as messages:
@@ -148,7 +114,7 @@ class PacketReader:
             if not read or content is None:
                 errors += 1
                 continue
-            if (codec := self._codec_now()) != self._codec and not {codec, self._codec} <= set(_OF_PROGRAMS):
+            if (codec := codec_name(self._capture)) != self._codec and not {codec, self._codec} <= set(_OF_MPEG):
                 self.change = _name(self._codec), _name(codec)
                 return
             # At the end there are only errors.
@@ -157,20 +123,19 @@ class PacketReader:
             if first:
                 first, self.begin = False, self._since_beginning()
             stamp = round(1000 * self._capture.get(cv2.CAP_PROP_POS_MSEC))
+            if stamp < _NO_TIME:
+                yield None
+                continue
             key = bool(self._capture.get(cv2.CAP_PROP_LRF_HAS_KEY_FRAME))
             data = content.tobytes()
             orientation = 1
             if key:
                 orientation = noted_orientation(data) if self._codec == _OF_CAMERAS else 1
-                parameters, length = _parameters(data, self._codec)
-                if parameters[:length] != head:
-                    head, size = parameters[:length], _stated_size(parameters, self._codec) or size
+                size = stated_size(data, self._codec) or size
             lossy = numbers is not None and numbers.follows_loss(data, key)
             whole, self._told_corrupt = not self._told_corrupt, False
-            yield Packet(stamp, content.size > _EMPTY_PACKET, key, size, orientation, whole, lossy)
-
-    def _codec_now(self) -> bytes:
-        return (int(self._capture.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF).to_bytes(4, "little").lower()
+            shows = content.size > self._empty and shows_frame(data, self._codec)
+            yield Packet(stamp, shows, key, size, orientation, whole, lossy)
 
     def _since_beginning(self) -> float:
         """Seconds of the packet at hand. Milliseconds count from the first packet, but where presentation times, which
@@ -193,48 +158,4 @@ class PacketReader:
 
 def _name(codec: bytes) -> str:
     """As FFmpeg calls a codec."""
-    return "mpeg2video" if codec in _OF_PROGRAMS else codec.decode("latin-1").strip("\0 ")
-
-
-def _parameters(packet: bytes, codec: bytes) -> tuple[bytes, int]:
-    """A key frame from where it states the size, and within how many bytes; empty where that is not known."""
-    begins, length = _PARAMETERS.get(codec, (None, None))
-    found = begins.search(packet) if begins else None
-    if found is None:
-        return b"", 0
-    if length is None:
-        end = packet.find(_START_CODE, found.end())
-        length = (end if end >= 0 else len(packet)) - found.start()
-    return packet[found.start() :], length
-
-
-def _stated_size(parameters: bytes, codec: bytes) -> tuple[int, int] | None:
-    """(H, W) by what `_parameters` gave; None where it cannot be told."""
-    if not parameters:
-        return None
-    if codec in _PICTURES:
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # of odd camera data
-                with Image.open(io.BytesIO(parameters)) as picture:
-                    return picture.height, picture.width
-        except (OSError, ValueError):
-            return None
-    if codec == b"vp80":
-        # Two bits of each number tell how to enlarge it.
-        width, height = (each & 0x3FFF for each in struct.unpack_from("<HH", parameters, 6))
-        return height, width
-    if codec in _IN_IVF:
-        head = b"DKIF" + struct.pack("<HH4sHHIIII", 0, 32, codec.upper(), 16, 16, 25, 1, 1, 0)
-        parameters = head + struct.pack("<IQ", len(parameters), 0) + parameters
-    try:
-        # From memory OpenCV reads as well, but has been seen to end the process.
-        with tempfile.TemporaryDirectory() as folder, captured_messages():
-            path = Path(folder) / "packet"
-            path.write_bytes(parameters)
-            alone = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-            size = (round(alone.get(cv2.CAP_PROP_FRAME_HEIGHT)), round(alone.get(cv2.CAP_PROP_FRAME_WIDTH)))
-            alone.release()
-    except OSError:  # no place for a temporary file
-        return None
-    return size if min(size) > 0 else None
+    return "mpeg2video" if codec in _OF_MPEG else codec.decode("latin-1").strip("\0 ")

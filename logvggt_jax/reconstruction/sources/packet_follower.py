@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from logvggt_jax.reconstruction.sources.decoding import Damage
 from logvggt_jax.reconstruction.sources.missing_frames import MissingFrames
-from logvggt_jax.reconstruction.sources.opencv_packets import Packet, PacketReader
+from logvggt_jax.reconstruction.sources.opencv_packets import STORE_DECODING_TIMES, Packet, PacketReader
 
 _MICROSECOND = Fraction(1, 1_000_000)
 # Packets that are read before a frame is looked at: none is stored so far from the place where it is shown.
@@ -21,8 +21,9 @@ _AHEAD = 48
 _MOST_KEPT = 2
 # Some formats mark no key frames: after so many packets the first begins the video.
 _LONGEST_LEAD = 300
-# What files begin with that number packets as they are stored.
-_ASF = bytes.fromhex("3026b2758e66cf11")
+# Bytes by which a format is known.
+_HEAD = 4
+_ASF = STORE_DECODING_TIMES[1]
 # What streams of MPEG-1, MPEG-2 and JPEG begin with that no container gives times; of others all time stamps are 0.
 _BARE = (b"\0\0\1\xb3", b"\xff\xd8")
 
@@ -48,12 +49,14 @@ def look_at_times(source: str, shown: list[int]) -> TimeStamps:
     packets = [packet for packet in itertools.islice(reader, _AHEAD) if packet is not None]
     reader.close()
     with Path(source).open("rb") as file:
-        head = file.read(len(_ASF))
+        head = file.read(_HEAD)
     stamps = [packet.stamp for packet in packets]
     # The only frame of a file is shown at its beginning.
     exist = (any(stamps) or any(shown) or len(shown) < 2) and not head.startswith(_BARE)
-    late = shown != sorted(shown)
-    if head.startswith(_ASF) and shown:
+    # Of the last frames of a short file OpenCV may know no time, for which 0 stands.
+    known = [*shown[:1], *(each for each in shown[1:] if each)]
+    late = known != sorted(known)
+    if shown and (head.startswith(_ASF) or (head.startswith(STORE_DECODING_TIMES) and not reader.holds_one)):
         # Frames come with the times of the packets that follow theirs.
         late = late or 1000 * shown[0] > next((packet.stamp for packet in packets if packet.key), math.inf)
     return TimeStamps(exist, stamps == sorted(set(stamps)) and late, reader.begin)
@@ -68,10 +71,11 @@ class PacketFollower:
       size: (H, W) before rotation, as stated for the picture at hand; None where nothing states it.
       orientation: EXIF's, that the camera noted in the picture at hand, or in the first where none is; 1 for none.
       key: decoding could begin with the picture at hand.
+      known: it is known which packet a picture is of.
+      reordered: see `Codec`.
       follows_loss: see `Picture`, of that at hand.
       lead: frames before the first key frame, which refer to some that are not there.
       lead_seconds: how long these would be shown.
-      states_size: whether a packet so far states a size.
 
     Args:
       source: the file's absolute path.
@@ -86,13 +90,16 @@ class PacketFollower:
         self._missing = MissingFrames(_MICROSECOND)
         self._step = round(1e6 / rate) if math.isfinite(rate) and rate > 0 else None
         self._timed, self._edited = timed, edited
-        # Whether all time stamps of frames so far were those of packets.
-        self._trusted = timed and not edited
+        self.known, self.reordered = self._reader.frame_each, self._reader.reordered
+        # Whether all time stamps of frames so far were those of packets. Without times packets are numbered.
+        self._trusted = (timed or not self.reordered) and not edited
         # Time stamps of key frames, and of frames before which some are missing.
         self._keys: set[int] = set()
         self._after_loss: set[int] = set()
-        # What is stated of a picture, from which on.
-        self._stated: deque[tuple[int, tuple[int, int] | None, int]] = deque()
+        # Those of frames that were said to be missing.
+        self._given_up: set[int] = set()
+        # What is stated of pictures from one on, of which the first says when it is stored and shown.
+        self._stated: deque[tuple[int, int, tuple[int, int] | None, int]] = deque()
         self._stored = self._shown = self._unreadable = 0
         self._is_first_part = True
         self._joint: Packet | None = None
@@ -101,16 +108,16 @@ class PacketFollower:
         self.key = self.follows_loss = False
         self.lead, self.lead_seconds = 0, 0.0
         self._lead_begins = math.inf
-        self.states_size = False
         self._begin()
         self._fill(_AHEAD)
         if self._stated:
-            self.orientation = self._stated[0][2]
+            self.orientation = self._stated[0][3]
 
-    def precedes_key_frame(self, stamp: int) -> bool:
-        """Whether a frame that is shown at this time comes before the first key frame."""
-        begins = not self._shown and not self._edited and bool(self.lead)
-        return begins and self._key is not None and stamp < self._key
+    def precedes_key_frame(self, stamp: int, refers: bool) -> bool:
+        """Whether a frame that is shown at this time, and may refer to others, comes before the first key frame."""
+        if self._shown or self._edited or not self.lead:
+            return False
+        return refers if not self.known else self._key is not None and stamp < self._key
 
     def begins_part(self) -> bool:
         """Whether the next frame can be the first of a part, whose time begins anew."""
@@ -122,6 +129,11 @@ class PacketFollower:
         left = self._stored - self._shown - failures
         return self._reader.change if left <= _MOST_KEPT else None
 
+    def is_over(self, failures: int) -> bool:
+        """Whether nothing is left but what so many failures stand for."""
+        self._fill(failures + 1)
+        return self._stored - self._shown <= failures
+
     def fail(self, reason: str) -> None:
         """A frame could not be decoded."""
         self._missing.fail(reason)
@@ -131,9 +143,9 @@ class PacketFollower:
         if self._joint is not None and stamp < self._last:
             yield from self._part_ends()
         self._fill(_AHEAD)
-        self._trusted = self._trusted and self._missing.waits_for(stamp)
-        yield from self._count(self._missing.before(stamp, self._since()))
-        yield from self._count(self._in_gap(stamp))
+        # What was said to be missing may yet come.
+        self._trusted = self._trusted and (self._missing.waits_for(stamp) or stamp in self._given_up)
+        yield from self._count(self._missing_before(stamp))
         self._show(stamp)
 
     def failures(self) -> Iterator[Damage]:
@@ -163,10 +175,13 @@ class PacketFollower:
         """A part whose time stamps have nothing to do with those before."""
         self._key: int | None = None
         self._last = self._highest = -1
+        self._given_up.clear()
         self._in_part = 0
 
     def _part_ends(self) -> Iterator[Damage]:
         yield from self._all_missing()
+        while self._stated:
+            *_, self.size, self.orientation = self._stated.popleft()
         first, self._joint = self._joint, None
         self._is_first_part = False
         self._begin()
@@ -174,12 +189,19 @@ class PacketFollower:
             self._take(first)
 
     def _all_missing(self) -> Iterator[Damage]:
-        # Of what is stored as it is shown, no more waits than what follows the last picture.
-        if self._since() is not None or (self._trusted and self._reader.as_shown):
+        if self._since() is not None:
             self._missing.fail_all("gives no picture")
         yield from self._count(self._missing.failures())
         while self._missing.take_next() is not None:
             pass
+
+    def _missing_before(self, stamp: int) -> Iterator[Damage]:
+        for damage in self._missing.before(stamp, self._since()):
+            at = _microseconds(damage)
+            yield from self._in_gap(at)
+            self._given_up.add(at)
+            yield damage
+        yield from self._in_gap(stamp)
 
     def _in_gap(self, stamp: int) -> Iterator[Damage]:
         """Failures that no packet explains, as it could not be read either: they are known by the gaps they leave."""
@@ -188,8 +210,7 @@ class PacketFollower:
             if failure is None and not self._unreadable:
                 return
             self._unreadable = max(0, self._unreadable - 1)
-            self._last += self._step
-            yield Damage(float(self._last * _MICROSECOND), failure or "cannot be read")
+            yield Damage(float((self._last + self._step) * _MICROSECOND), failure or "cannot be read")
 
     def _since(self) -> int | None:
         return self._key if self._trusted and self._reader.frame_each else None
@@ -197,15 +218,18 @@ class PacketFollower:
     def _count(self, damages: Iterator[Damage]) -> Iterator[Damage]:
         for damage in damages:
             self._shown += 1
+            if damage.seconds is not None:
+                self._last = max(self._last, _microseconds(damage))
             yield damage if self._timed else damage._replace(seconds=None)
 
     def _show(self, stamp: int) -> None:
-        self._last = stamp
+        self._last = max(self._last, stamp)
         self.key, self.follows_loss = stamp in self._keys, stamp in self._after_loss
         self._keys.discard(stamp)
         self._after_loss.discard(stamp)
-        while self._stated and self._stated[0][0] <= self._shown:
-            _, self.size, self.orientation = self._stated.popleft()
+        by_time = self._since() is not None or (self._timed and self._reader.holds_one)
+        while self._stated and (self._stated[0][1] <= stamp if by_time else self._stated[0][0] <= self._shown):
+            *_, self.size, self.orientation = self._stated.popleft()
         self._shown += 1
 
     def _fill(self, ahead: int | None) -> None:
@@ -215,6 +239,8 @@ class PacketFollower:
                 packet = next(self._packets)
             except StopIteration:
                 return
+            if packet is not None and not self._timed:
+                packet = packet._replace(stamp=self.lead + self._stored)
             if packet is None:
                 self._unreadable += 1
             elif self._is_joint(packet):
@@ -239,9 +265,8 @@ class PacketFollower:
             self.lead += 1
             self._lead_begins = min(self._lead_begins, packet.stamp)
             return
-        self.states_size = self.states_size or packet.size is not None
-        if not self._stated or self._stated[-1][1:] != (packet.size, packet.orientation):
-            self._stated.append((self._stored, packet.size, packet.orientation))
+        if not self._stated or self._stated[-1][2:] != (packet.size, packet.orientation):
+            self._stated.append((self._stored, packet.stamp, packet.size, packet.orientation))
         if packet.key:
             self._keys.add(packet.stamp)
         if packet.follows_loss:
@@ -249,3 +274,7 @@ class PacketFollower:
         if packet.holds_frame:
             self._missing.expect(packet.stamp)
             self._stored += 1
+
+
+def _microseconds(damage: Damage) -> int:
+    return round(1e6 * (damage.seconds or 0.0))
