@@ -1022,6 +1022,16 @@ def test_long_damage_is_no_end(tmp_path: Path, library: str) -> None:
     assert [frame.name for frame in source.skipped] == [f"frame-{number:06d}" for number in lost]
 
 
+def test_a_damaged_beginning_of_avi_shifts_no_frame(tmp_path: Path, library: str) -> None:
+    """It states no times of presentation: what is decoded is put into order, also where the first frames fail."""
+    whole = write(tmp_path / "whole.avi", [busy(i) for i in range(24)], options={"bf": "2", "b-adapt": "0", "g": "12"})
+    path = rewritten(tmp_path / "walk.avi", whole, lambda n, packet: bytes(len(packet)) if n == 2 else packet)
+    source = open_source(path)
+    frames = list(source)
+    assert len(frames) + len(source.skipped) == 24 and len(source.skipped) == 1
+    assert (np.diff(times(frames)) > 0.05).all()
+
+
 def test_the_first_damaged_frame_is_an_error_when_strict(tmp_path: Path, library: str) -> None:
     path, broken = damaged(tmp_path / "noise.mp4", [7, 15])
     frames = iter(open_source(path, strict=True))
@@ -1131,6 +1141,16 @@ def test_flv_whose_clock_goes_back_goes_on_in_time(tmp_path: Path, library: str)
     frames = list(open_source(path, strict=True))
     np.testing.assert_allclose(times(frames), np.arange(16) / 10, atol=1e-3)
     np.testing.assert_allclose([frame.image.mean() for frame in frames], [40 + 8 * (i % 8) for i in range(16)], atol=3)
+
+
+@pytest.mark.parametrize("codec", ["mpeg4", "mpeg2video", "libvpx"])
+def test_matroska_files_that_were_appended_go_on_in_time(tmp_path: Path, library: str, codec: str) -> None:
+    options = {} if codec == "libvpx" else {"bf": "2"}
+    path = write(tmp_path / "walk.mkv", [busy(i) for i in range(24)], codec=codec, rate=25, options=options)
+    path.write_bytes(path.read_bytes() * 2)
+    source = open_source(path)
+    assert names(source) == list(range(48))
+    assert not source.skipped and not source.notes
 
 
 def test_an_index_that_is_repeated_before_a_fragment_is_no_second_video(tmp_path: Path, library: str) -> None:

@@ -208,6 +208,8 @@ class PyAVDecoder:
         self._lead, self._lead_begins = 0, None
         started, key = False, None  # the time stamp of the first key frame; what is shown before refers to lost frames
         joined, last = False, -math.inf  # whether time goes back, as where recordings are joined
+        # Of Matroska the library works out when packets are decoded, which goes back where one is missing.
+        highest, states_decoding = -math.inf, "matroska" not in container.format.name
         numbers: FrameNumbers | PictureNumbers | None = None
         if stream.codec_context.name == "h264":
             numbers = FrameNumbers(stream.codec_context.extradata or b"")
@@ -230,7 +232,9 @@ class PyAVDecoder:
                 self._lead_begins = min(stamps, default=None)
                 continue
             if packet.dts is not None:
-                joined, last = joined or packet.dts < last, packet.dts
+                joined, last = joined or (packet.dts < last and states_decoding), packet.dts
+            if packet.pts is not None:
+                joined, highest = joined or (packet.is_keyframe and packet.pts < highest), max(highest, packet.pts)
             key = packet.pts if key is None else key
             holds_frame = packet.size > (0 if self._numbered_as_stored else _EMPTY_PACKET)
             if holds_frame and packet.pts is not None and not packet.is_discard:
@@ -292,7 +296,7 @@ class PyAVDecoder:
                 try:
                     stamps = [frame.pts for frame in packet.decode() if frame.pts is not None]
                 except av.FFmpegError:
-                    return False
+                    continue
                 for stamp in stamps:
                     if stamp < shown:
                         return True
