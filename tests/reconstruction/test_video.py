@@ -1595,6 +1595,19 @@ def test_of_several_videos_in_a_file_the_one_that_is_read_is_named(tmp_path: Pat
     )
 
 
+def test_a_video_beside_one_that_cannot_be_decoded_is_read(tmp_path: Path, library: str) -> None:
+    path = tmp_path / "two.mkv"
+    with av.open(str(path), "w") as container:
+        streams = [container.add_stream(codec, rate=10) for codec in ("mpeg4", "libvpx")]
+        for stream in streams:
+            stream.height, stream.width, stream.pix_fmt = HEIGHT, WIDTH, "yuv420p"
+        for index in range(4):
+            for stream in streams:
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(grey(index), "rgb24") if index < 3 else None))
+    path.write_bytes(path.read_bytes().replace(b"V_VP8", b"V_???"))
+    assert names(open_source(path)) == [0, 1, 2]
+
+
 def test_a_recording_that_begins_in_the_middle(tmp_path: Path, library: str) -> None:
     path = write(tmp_path / "whole.ts", [busy(i) for i in range(24)], codec="mpeg2video", options={"g": "12"})
     cut = tmp_path / "cut.ts"

@@ -45,7 +45,8 @@ def notes_on(
     name: str, container: av.container.InputContainer, stream: av.video.stream.VideoStream, frame: av.VideoFrame
 ) -> Iterator[str]:
     """What the user should know of a video, as far as it shows in the header and the first frame."""
-    streams = moving_streams(container)
+    # Of one that no decoder is there for, as damage may feign one, no size is known.
+    streams = [each for each in moving_streams(container) if each.codec_context is not None]
     if len(streams) > 1:
         sizes = [(each.height, each.width) for each in streams]
         yield several_videos(name, sizes, [str(each.index) for each in streams], str(stream.index))
