@@ -1405,6 +1405,7 @@ def test_damage_that_pyav_tells_is_told_by_opencv(
     ("name", "codec", "pixels"),
     [
         ("walk.apng", "apng", "rgb24"),
+        ("walk.ogv", "libvpx", "yuv420p"),
         ("prores.mov", "prores_ks", "yuv422p10le"),
         ("jpeg2000.mov", "jpeg2000", "yuv420p"),
         ("svq1.mov", "svq1", "yuv410p"),

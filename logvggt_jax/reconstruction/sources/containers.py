@@ -13,7 +13,6 @@ _BEGINNINGS = (
     (FLASH, re.compile(rb"FLV")),
     (WINDOWS_MEDIA, re.compile(re.escape(bytes.fromhex("3026b275 8e66cf11")))),
     (MATROSKA, re.compile(re.escape(bytes.fromhex("1a45dfa3")))),
-    ("ogg", re.compile(rb"OggS")),
     ("gif", re.compile(rb"GIF8")),
     # Of MPEG-1 and MPEG-2 decoders drop pictures in silence, which without times are not missed.
     ("a bare stream", re.compile(rb"\x00{2,3}\x01(?![\xb3\xba])|\xff\xd8")),
