@@ -43,6 +43,7 @@ from logvggt_jax.reconstruction.sources.decoding import Picture
 from logvggt_jax.reconstruction.sources.pauses import Pauses
 from logvggt_jax.reconstruction.sources.sampling import FrameClock, expected_frames
 from logvggt_jax.reconstruction.sources.source import SkippedFrame
+from logvggt_jax.reconstruction.sources.vp9_frames import FrameSizes
 
 HEIGHT, WIDTH = 48, 64
 COLOURS = np.array([[[230, 30, 30], [30, 200, 30]], [[30, 30, 230], [220, 220, 60]]], np.uint8)
@@ -632,6 +633,38 @@ def test_a_change_of_size_is_noticed_in_every_usual_codec(
         frames += source
     assert {image.image.shape for image in frames} == {(288, 352, 3)}
     assert names(frames) == list(range(frame - len(source.skipped)))
+
+
+def bits(*numbers: tuple[int, int]) -> bytes:
+    """Numbers of so many bits each."""
+    text = "".join(f"{number:0{count}b}" for number, count in numbers)
+    return int(text.ljust(192, "0"), 2).to_bytes(24, "big")
+
+
+def test_frames_of_vp9_may_change_the_size_without_a_key_frame() -> None:
+    """As browsers do in a call; no encoder here does so on request."""
+    begin, key, inter = (2, 2), (0b00_0_0_1_0, 6), (0b00_0_1_1_0, 6)
+    stated = (175, 16), (143, 16)
+    sizes = FrameSizes()
+    assert sizes.follow(bits(begin, key, (0x498342, 24), (0b001_0, 4), (351, 16), (287, 16))) == (True, (288, 352))
+    # It is not kept, refers to three frames, and takes over the size of the first, or none's.
+    assert sizes.follow(bits(begin, inter, (0, 2), (0, 8), (0, 12), (1, 1))) == (True, (288, 352))
+    # It is kept in the second place.
+    assert sizes.follow(bits(begin, inter, (0, 2), (0b10, 8), (0, 12), (0, 3), *stated)) == (True, (144, 176))
+    assert sizes.follow(bits(begin, inter, (0, 2), (0, 8), (0b000_0_001_0_000_0, 12), (0b01, 2))) == (True, (144, 176))
+    assert sizes.follow(bits(begin, inter, (0, 2), (0, 8), (0b000_0_001_0_000_0, 12), (1, 1))) == (True, (288, 352))
+    assert sizes.follow(bits(begin, (0b00_1, 3), (1, 3))) == (True, (144, 176))  # shown again
+    assert sizes.follow(bits(begin, (0b00_0_1_0_0, 6), (0, 1), (0, 2), (0, 8), (0, 12), (1, 1))) == (False, None)
+    assert sizes.follow(b"\xff" * 24) == (True, None)  # damaged
+
+
+@pytest.mark.parametrize("options", [{"lag-in-frames": "16", "auto-alt-ref": "1"}, {"error-resilient": "1"}, {}])
+def test_packets_of_vp9_show_a_frame_each_of_one_size(tmp_path: Path, options: dict[str, str]) -> None:
+    path = write(tmp_path / "walk.webm", [busy(i // 4) for i in range(40)], codec="libvpx-vp9", options=options)
+    sizes = FrameSizes()
+    with av.open(str(path)) as container:
+        stored = [sizes.follow(bytes(packet)) for packet in container.demux(video=0) if packet.size]
+    assert stored == [(True, (HEIGHT, WIDTH))] * 40
 
 
 CODECS: dict[str, dict[str, Any]] = {

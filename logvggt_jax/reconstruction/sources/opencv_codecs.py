@@ -6,9 +6,7 @@ from typing import NamedTuple
 
 import cv2
 
-from logvggt_jax.reconstruction.sources.bits import Bits
-
-_VP8, _VP9 = b"vp80", b"vp90"
+VP9, _VP8 = b"vp90", b"vp80"
 # A packet of so few bytes stands for no change in codecs that refer to other frames.
 _NO_CHANGE = 8
 
@@ -33,7 +31,7 @@ _AS_SHOWN, _ALONE = Codec(empty=_NO_CHANGE), Codec()
 _CODECS = {
     **dict.fromkeys((b"h264", b"hevc"), _REORDERED),
     **dict.fromkeys((b"mpg1", b"mpg2", b"fmp4"), _OF_MPEG),
-    **dict.fromkeys((_VP8, _VP9, b"h263", b"flv1"), _AS_SHOWN),
+    **dict.fromkeys((_VP8, VP9, b"h263", b"flv1"), _AS_SHOWN),
     **dict.fromkeys((b"mp42", b"mp43", b"wmv1", b"wmv2"), _AS_SHOWN),
     **dict.fromkeys((b"mjpg", b"mpng", b"avdn", b"gif ", b"rle ", b"\0\0\0\0"), _ALONE),
     **dict.fromkeys((b"hfyu", b"ffvh", b"ffv1"), _ALONE),
@@ -59,16 +57,4 @@ def codec_of(name: bytes) -> Codec | None:
 
 def shows_frame(packet: bytes, name: bytes) -> bool:
     """Whether a packet of this codec that is not empty shows a frame, and is not for others to refer to alone."""
-    if name == _VP8:  # RFC 6386, 9.1
-        return bool(packet[0] & 0x10)
-    if name != _VP9 or packet[-1] & 0xE0 == 0xC0:  # several in one, of which the last is shown
-        return True
-    # VP9 Bitstream Specification, 6.2: one that is shown again, or one that says so itself.
-    bits = Bits(packet[:2])
-    bits.take(2)
-    if bits.take(2) == 3:
-        bits.take(1)
-    if bits.take(1):
-        return True
-    bits.take(1)
-    return bool(bits.take(1))
+    return name != _VP8 or bool(packet[0] & 0x10)  # RFC 6386, 9.1

@@ -13,10 +13,11 @@ import cv2
 
 from logvggt_jax.reconstruction.sources.h264_frame_numbers import FrameNumbers
 from logvggt_jax.reconstruction.sources.mpeg_picture_numbers import PictureNumbers
-from logvggt_jax.reconstruction.sources.opencv_codecs import codec_name, codec_of, shows_frame
+from logvggt_jax.reconstruction.sources.opencv_codecs import VP9, codec_name, codec_of, shows_frame
 from logvggt_jax.reconstruction.sources.opencv_messages import captured_messages, tells_corrupt_packet
 from logvggt_jax.reconstruction.sources.orientation import noted_orientation
 from logvggt_jax.reconstruction.sources.stated_sizes import stated_size
+from logvggt_jax.reconstruction.sources.vp9_frames import FrameSizes
 
 _H264, _OF_CAMERAS, _OF_MPEG = b"h264", b"mjpg", (b"mpg1", b"mpg2")
 # What a description begins with of a stream whose units have their lengths before them, which OpenCV replaces.
@@ -107,6 +108,7 @@ class PacketReader:
             numbers = FrameNumbers(description)
         elif self._codec in _OF_MPEG:
             numbers = PictureNumbers()
+        frames = FrameSizes() if self._codec == VP9 else None
         while self._capture.isOpened() and errors < _MOST_ERRORS:
             with captured_messages() as messages:
                 read, content = self._capture.retrieve() if self._capture.grab() else (False, None)
@@ -135,6 +137,9 @@ class PacketReader:
             lossy = numbers is not None and numbers.follows_loss(data, key)
             whole, self._told_corrupt = not self._told_corrupt, False
             shows = content.size > self._empty and shows_frame(data, self._codec)
+            if frames is not None and shows:
+                shows, changed = frames.follow(data)
+                size = changed or size
             yield Packet(stamp, shows, key, size, orientation, whole, lossy)
 
     def _since_beginning(self) -> float:

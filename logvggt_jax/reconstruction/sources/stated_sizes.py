@@ -21,9 +21,7 @@ _HEVC = re.compile(rb"\x00\x00\x01\x42.", re.DOTALL)
 _MPEG = re.compile(rb"\x00\x00\x01\xb3")
 _MPEG_EXTENSION = re.compile(rb"\x00\x00\x01\xb5(?=[\x10-\x1f])")
 _MPEG4 = re.compile(rb"\x00\x00\x01[\x20-\x2f]")
-_VP8, _VP9 = b"\x9d\x01\x2a", 0x498342
-# VP9's name for colours without a range.
-_SRGB = 7
+_VP8 = b"\x9d\x01\x2a"
 # Bits of what MPEG-4 tells of the buffer of a decoder.
 _BUFFER_BITS = 79
 # Sizes (H, W) that H.263 and Sorenson's codec have numbers for.
@@ -156,30 +154,6 @@ def _of_vp8(packet: bytes) -> Size | None:
     return height, width
 
 
-def _of_vp9(packet: bytes) -> Size | None:
-    """VP9 Bitstream Specification, 6.2, of a key frame."""
-    bits = Bits(packet[:16])
-    bits.take(2)
-    profile = bits.take(1) + 2 * bits.take(1)
-    if profile == 3:
-        bits.take(1)
-    # A frame that is shown again has no head; of others, those that refer to one before.
-    if bits.take(1) or bits.take(1):
-        return None
-    bits.take(2)
-    if bits.take(24) != _VP9:
-        return None
-    if profile >= 2:
-        bits.take(1)
-    odd = profile in (1, 3)
-    if bits.take(3) != _SRGB:
-        bits.take(1 + 3 * odd)
-    else:
-        bits.take(odd)
-    width, height = bits.take(16) + 1, bits.take(16) + 1
-    return height, width
-
-
 def _of_picture(packet: bytes) -> Size | None:
     try:
         with warnings.catch_warnings():
@@ -204,7 +178,6 @@ _STATED = {
     b"h263": _of_h263,
     b"flv1": _of_sorenson,
     b"vp80": _of_vp8,
-    b"vp90": _of_vp9,
     b"mjpg": _of_picture,
     b"mpng": _of_picture,
     b"avdn": _of_dnxhd,
