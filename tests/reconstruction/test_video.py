@@ -1245,7 +1245,7 @@ def test_a_matroska_video_that_is_damaged_to_its_end_says_so(
     assert len(list(open_source(path))) == 40
     place = packets(path)[20][0]
     path.write_bytes(content[:place] + b"\xff" * (len(content) - place))
-    with pytest.warns(UserWarning, match=r"ends early: 0\.\d+ s decoded, its header announces 1\.6 s"):
+    with pytest.warns(UserWarning, match=r"ends early: 0\.\d+ s decoded, its header announces 1\.(6|56) s"):
         assert len(list(open_source(path, most_broken=1.0))) <= 20
 
 
@@ -1387,6 +1387,15 @@ def with_sound(path: Path, source: Path, seconds: float) -> Path:
                 packet.stream = stream
                 output.mux(packet)
     return path
+
+
+def test_a_duration_that_ends_before_the_first_frame_is_none(tmp_path: Path, library: str) -> None:
+    path = of_kind(tmp_path, "wmv2.wmv", late=125)
+    content = bytearray(path.read_bytes())
+    place = content.index(bytes.fromhex("a1dcab8c47a9cf118ee400c00c205365")) + 64
+    content[place : place + 8] = (45_000_000).to_bytes(8, "little")  # 3.1 s lead in
+    path.write_bytes(content)
+    assert names(open_source(path)) == list(range(40))
 
 
 def test_of_sound_that_goes_on_pictures_are_not_missing(tmp_path: Path, library: str) -> None:

@@ -129,6 +129,8 @@ class OpenCVDecoder:
             seconds -= self._times.begin
         if stated and rate and self._states_seconds():
             seconds = stated / rate - (self._times.begin if self._container == WINDOWS_MEDIA else 0.0)
+        if seconds is not None and seconds <= 0:  # of damaged times
+            seconds = None
         return VideoHeader(
             size=shown_size(image.shape[:2], matrix),
             rate=rate,

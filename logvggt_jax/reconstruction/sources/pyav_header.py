@@ -122,7 +122,8 @@ def duration(
     is_matroska = "matroska" in container.format.name
     if stream.duration and not is_matroska:  # which states that of the file, and the library takes it for the stream's
         before = (begins or 0) if container.format.name in STORE_DECODING_TIMES else 0
-        return float((stream.duration - before) * stream.time_base)
+        seconds = float((stream.duration - before) * stream.time_base)
+        return seconds if seconds > 0 else None  # of damaged times
     start = float((stream.start_time or begins or 0) * stream.time_base)
     if tag := re.fullmatch(r"(\d+):(\d+):(\d+\.?\d*)", stream.metadata.get("DURATION", "")):
         # Matroska's, counted from the beginning of the file.
