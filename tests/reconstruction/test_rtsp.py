@@ -5,7 +5,6 @@ from __future__ import annotations
 import signal
 import socket
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -70,15 +69,9 @@ def server() -> Iterator[Server]:
     server.stop()
 
 
-@pytest.fixture(autouse=True, params=["pyav", "opencv"])
-def library(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Each library that may decode."""
+@pytest.fixture(autouse=True)
+def patience(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(video, "_TIMEOUT", 3.0)
-    if request.param == "opencv":
-        monkeypatch.setitem(sys.modules, "av", None)
-    else:
-        pytest.importorskip("av", reason="extra `video` is not installed")
-    return request.param
 
 
 def watch(

@@ -78,16 +78,23 @@ class CodecChange(NamedTuple):
     after: str
 
 
-class VideoDecoder(Protocol):
-    """A video file, camera or stream that can be decoded from its beginning, again and again."""
+class PictureStream(Protocol):
+    """A video file, camera or network stream, of which every call of `pictures` begins anew."""
 
-    def header(self) -> VideoHeader:
-        """What is known of the video; decodes no more than its first frames.
+    def pictures(self) -> Iterator[Picture | Damage | Complaint | CodecChange]:
+        """The frames in the order in which they are shown; nothing follows a change of the codec.
 
         Raises:
           InputError: it cannot be opened, holds no video, or nothing of it can be decoded.
         """
 
-    def pictures(self) -> Iterator[Picture | Damage | Complaint | CodecChange]:
-        """The frames in the order in which they are shown; nothing follows a change of the codec. Raises InputError as
-        `header` does."""
+
+class VideoDecoder(PictureStream, Protocol):
+    """A video file that can be decoded from its beginning, again and again."""
+
+    def header(self) -> VideoHeader:
+        """What is known of the video; decodes no more than its first frames.
+
+        Raises:
+          InputError: as `pictures` does.
+        """

@@ -6,7 +6,9 @@ from typing import NamedTuple
 
 import cv2
 
-VP9, _VP8 = b"vp90", b"vp80"
+VP9 = b"vp90"
+STATE_ALL = (b"mjpg", b"gif ")
+"""Of these no header tells HDR or interlacing."""
 # A packet of so few bytes stands for no change in codecs that refer to other frames.
 _NO_CHANGE = 8
 
@@ -27,11 +29,11 @@ class Codec(NamedTuple):
 
 _REORDERED, _OF_MPEG = Codec(reordered=True, empty=_NO_CHANGE), Codec(True, _NO_CHANGE, holds_one=True)
 _AS_SHOWN, _ALONE = Codec(empty=_NO_CHANGE), Codec()
-# Of any other codec either damage within a picture draws no word, or a change of size is not seen.
+# Of any other codec damage within a picture draws no word, as of VP8 by one thread, or a change of size is not seen.
 _CODECS = {
     **dict.fromkeys((b"h264", b"hevc"), _REORDERED),
     **dict.fromkeys((b"mpg1", b"mpg2", b"fmp4"), _OF_MPEG),
-    **dict.fromkeys((_VP8, VP9, b"h263", b"flv1"), _AS_SHOWN),
+    **dict.fromkeys((VP9, b"h263", b"flv1"), _AS_SHOWN),
     **dict.fromkeys((b"mp42", b"mp43", b"wmv1", b"wmv2"), _AS_SHOWN),
     **dict.fromkeys((b"mjpg", b"mpng", b"avdn", b"gif ", b"rle ", b"\0\0\0\0"), _ALONE),
     **dict.fromkeys((b"hfyu", b"ffvh", b"ffv1"), _ALONE),
@@ -53,8 +55,3 @@ def codec_name(capture: cv2.VideoCapture) -> bytes:
 def codec_of(name: bytes) -> Codec | None:
     """None for one that OpenCV alone does not read with the checks that PyAV allows."""
     return _CODECS.get(name)
-
-
-def shows_frame(packet: bytes, name: bytes) -> bool:
-    """Whether a packet of this codec that is not empty shows a frame, and is not for others to refer to alone."""
-    return name != _VP8 or bool(packet[0] & 0x10)  # RFC 6386, 9.1

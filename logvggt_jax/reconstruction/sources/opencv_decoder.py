@@ -1,10 +1,9 @@
-"""Decoding of videos and cameras by OpenCV."""
+"""Decoding of videos by OpenCV."""
 
 from __future__ import annotations
 
 import math
 import re
-import time
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -26,7 +25,7 @@ from logvggt_jax.reconstruction.sources.decoding import CodecChange, Complaint, 
 from logvggt_jax.reconstruction.sources.matroska_track import read_matroska_view
 from logvggt_jax.reconstruction.sources.media_info import MediaHeader, media_info_is_there, read_media_header
 from logvggt_jax.reconstruction.sources.mp4_track import TrackView, read_mp4_view
-from logvggt_jax.reconstruction.sources.opencv_codecs import codec_name, codec_of
+from logvggt_jax.reconstruction.sources.opencv_codecs import STATE_ALL, codec_name, codec_of
 from logvggt_jax.reconstruction.sources.opencv_messages import (
     Message,
     captured_messages,
@@ -66,14 +65,12 @@ class OpenCVDecoder:
     """See `VideoDecoder`.
 
     Args:
-      source: a file's absolute path, the address of a stream, or the number of a camera.
+      file: its absolute path.
       name: what messages call it.
-      timeout: seconds to wait for a network stream; None for files.
     """
 
-    def __init__(self, source: str | int, name: str, timeout: float | None = None) -> None:
-        self._source, self._name, self._timeout = source, name, timeout
-        self._file = None if isinstance(source, int) or timeout is not None else str(source)
+    def __init__(self, file: str, name: str) -> None:
+        self._file, self._name = file, name
         self._looked = False
         self._container: str | None = None
         self._view = TrackView()
@@ -103,12 +100,13 @@ class OpenCVDecoder:
         if single or codec == _TEXT:
             kind = "text" if codec == _TEXT else "a single image"
             raise InputError(f"{self._name} is {kind}, not a video: give a video or the folder that holds the images")
-        if self._file is not None and self._container is None:
+        if self._container is None:
             self._refuse_unchecked("a format in which OpenCV does not notice all damage")
-        if self._file is not None and codec_of(codec) is None:
+        if codec_of(codec) is None:
             self._refuse_unchecked(
                 f"a codec ({called}) of which OpenCV does not notice all damage, or a change of size"
             )
+        self._check_heard(codec)
         frequency = capture.get(cv2.CAP_PROP_FPS)
         rate = frequency if math.isfinite(frequency) and frequency > 0 else None
         if self._media is not None and self._media.bare:
@@ -120,8 +118,7 @@ class OpenCVDecoder:
         notes = tuple(self._notes(capture, image.shape[:2], rate, follower))
         matrix = self._turned(follower)
         capture.release()
-        if follower is not None:
-            follower.close()
+        follower.close()
         seconds = self._view.seconds or (self._media.seconds if self._media else None)
         if self._container == AVI and seconds is not None:
             seconds -= begins
@@ -138,8 +135,8 @@ class OpenCVDecoder:
             announced=stated if self._container in _STATE_FRAMES else None,
             seconds=seconds,
             notes=notes,
-            lead=follower.lead if follower else 0,
-            lead_seconds=follower.lead_seconds if follower else 0.0,
+            lead=follower.lead,
+            lead_seconds=follower.lead_seconds,
         )
 
     def pictures(self) -> Iterator[Picture | Damage | Complaint | CodecChange]:
@@ -153,53 +150,40 @@ class OpenCVDecoder:
             yield from self._follow(capture, follower, said)
         finally:
             capture.release()
-            if follower is not None:
-                follower.close()
+            follower.close()
 
     def _follow(
-        self, capture: cv2.VideoCapture, follower: PacketFollower | None, said: list[str]
+        self, capture: cv2.VideoCapture, follower: PacketFollower, said: list[str]
     ) -> Iterator[Picture | Damage | Complaint | CodecChange]:
         """`said` is what was said of damage when the file was opened."""
         failures = guessed = 0
-        rate = capture.get(cv2.CAP_PROP_FPS)
-        step = 1.0 / rate if math.isfinite(rate) and rate > 0 else math.inf
         last: float | None = None
         before: np.ndarray | None = None
         first_size: tuple[int, int] | None = None
-        while failures < _MOST_FAILURES or (follower is not None and not follower.is_over(failures)):
-            asked = time.monotonic()
-            with quiet() if self._file is None else captured_messages() as messages:
+        while failures < _MOST_FAILURES or not follower.is_over(failures):
+            with captured_messages() as messages:
                 decoded, image = capture.retrieve() if capture.grab() else (False, None)
-            messages = messages or []
             said += errors_of_ffmpeg(messages)
             guessed += guessed_frames(messages)
             if not decoded or image is None or not image.size or tells_half_jpeg(messages):
                 failures += 1
-                if follower is not None and (change := follower.codec_change(failures)):
+                if change := follower.codec_change(failures):
                     yield CodecChange(None, *change)
                     return
-                # A stream that has fallen silent fails but once in that time.
-                if self._timeout is not None and time.monotonic() - asked >= self._timeout:
-                    break
                 continue
             seconds = self._stamp(capture, last, follower)
-            refers = follower is not None and chr(int(capture.get(cv2.CAP_PROP_FRAME_TYPE))) in _REFER
-            if follower is None:
-                while failures and last is not None and seconds is not None and seconds - last > 1.5 * step:
-                    failures, last = failures - 1, last + step
-                    yield Damage(last, _UNDECODED)
+            refers = chr(int(capture.get(cv2.CAP_PROP_FRAME_TYPE))) in _REFER
+            for _ in range(failures):
+                follower.fail(_UNDECODED)
+            if seconds is None or self._times.as_stored:
+                yield from follower.failures()
+                ordered = follower.next_in_order()
+                seconds = ordered if self._times.as_stored else None
+            elif follower.precedes_key_frame(stamp := round(1e6 * seconds), refers):
+                failures, said = 0, []
+                continue
             else:
-                for _ in range(failures):
-                    follower.fail(_UNDECODED)
-                if seconds is None or self._times.as_stored:
-                    yield from follower.failures()
-                    ordered = follower.next_in_order()
-                    seconds = ordered if self._times.as_stored else None
-                elif follower.precedes_key_frame(stamp := round(1e6 * seconds), refers):
-                    failures, said = 0, []
-                    continue
-                else:
-                    yield from follower.before(stamp)
+                yield from follower.before(stamp)
             if said and not failures:
                 yield Complaint(said[0])
             failures, said = 0, []
@@ -209,44 +193,29 @@ class OpenCVDecoder:
                     capture.retrieve()
                 self._check_converted(messages)
             last, before = seconds, image
-            stated = follower.size if follower else None
+            stated = follower.size
             first_size = first_size or stated
             matrix = self._turned(follower)
             size = shown_size(_stored_size(image.shape[:2], stated, first_size), matrix)
-            alone, follows_loss = (follower.key, follower.follows_loss) if follower else (None, False)
-            if follower is not None:
-                # Some files mark every packet as a key frame's, and of some it is not known which is this frame's.
-                alone = not refers and (follower.key or not follower.known)
+            # Some files mark every packet as a key frame's, and of some it is not known which is this frame's.
+            alone, follows_loss = not refers and (follower.key or not follower.known), follower.follows_loss
             convert = partial(_convert, image, matrix)
             yield Picture(seconds, size, convert, damaged=guessed > 0, alone=alone, follows_loss=follows_loss)
             guessed = max(0, guessed - 1)
-        if follower is not None:
-            in_order = self._times.exist and not self._times.as_stored
-            yield from follower.rest() if in_order or not follower.reordered else follower.failures()
+        in_order = self._times.exist and not self._times.as_stored
+        yield from follower.rest() if in_order or not follower.reordered else follower.failures()
         if said:
             yield Complaint(said[0])
 
-    def _turned(self, follower: PacketFollower | None) -> np.ndarray | None:
+    def _turned(self, follower: PacketFollower) -> np.ndarray | None:
         """The display matrix of the picture at hand: what its camera noted comes before what the file says of all."""
-        noted = matrix_of(follower.orientation) if follower else None
+        noted = matrix_of(follower.orientation)
         return self._matrix if noted is None else noted
 
     def _notes(
-        self, capture: cv2.VideoCapture, size: tuple[int, int], rate: float | None, follower: PacketFollower | None
+        self, capture: cv2.VideoCapture, size: tuple[int, int], rate: float | None, follower: PacketFollower
     ) -> Iterator[str]:
-        if self._file is None:
-            return
         media = self._media
-        if media is None and not media_info_is_there():
-            yield (
-                f"{self._name} is decoded by OpenCV, which without MediaInfo, whose library is not there for this "
-                f"system, does not notice HDR, or interlacing that only the header tells: {_PYAV}"
-            )
-        if not hears_all():
-            yield (
-                f"{self._name} is decoded by an OpenCV whose FFmpeg cannot be asked what it says of damage, and of "
-                f"interlaced pictures: {_PYAV}"
-            )
         if media is not None and len(media.sizes) > 1:
             names = [f"v:{number}" for number in range(len(media.sizes))]
             read = media.sizes.index(size) if size in media.sizes else 0
@@ -262,12 +231,12 @@ class OpenCVDecoder:
         width, height = (round(capture.get(each)) for each in (cv2.CAP_PROP_SAR_NUM, cv2.CAP_PROP_SAR_DEN))
         if width and height and width != height:
             yield oblong_pixels(self._name, width, height)
-        if follower is not None and follower.lead:
+        if follower.lead:
             yield begins_late(self._name, follower.lead)
 
     def _look_at_file(self) -> None:
         """Learns what OpenCV does not tell: how pictures are turned, what their header says, and which times hold."""
-        if self._file is None or self._looked:
+        if self._looked:
             return
         self._looked = True
         self._container = container_of(Path(self._file))
@@ -284,10 +253,22 @@ class OpenCVDecoder:
         if self._matrix is None and self._media is not None and self._media.quarter_turns:
             self._matrix = np.linalg.matrix_power(np.array([[0, 1], [-1, 0]]), self._media.quarter_turns)
 
-    def _follower(self, rate: float) -> PacketFollower | None:
-        if self._file is None:
-            return None
+    def _follower(self, rate: float) -> PacketFollower:
         return PacketFollower(self._file, rate, timed=self._times.exist, edited=self._view.edited)
+
+    def _check_heard(self, codec: bytes) -> None:
+        """Raises InputError where what only FFmpeg or MediaInfo tell would not be noticed."""
+        if not hears_all():
+            raise InputError(
+                f"{self._name} cannot be checked, as the FFmpeg of this OpenCV cannot be asked what it says of damage, "
+                f"and of interlaced pictures: {_PYAV}"
+            )
+        if self._media is None and codec not in STATE_ALL:
+            why = "cannot tell" if media_info_is_there() else "whose library is not there for this system, would tell"
+            raise InputError(
+                f"{self._name} cannot be checked for HDR, and for interlacing that only the header tells, of which "
+                f"MediaInfo{',' if 'would' in why else ''} {why}: {_PYAV}"
+            )
 
     def _check_converted(self, said: list[Message]) -> None:
         """Raises InputError if OpenCV handed out a buffer into which it could not convert the picture."""
@@ -303,9 +284,9 @@ class OpenCVDecoder:
             "ffmpeg -i INPUT -vf bwdif=send_frame OUTPUT.mp4"
         )
 
-    def _bytes(self) -> float:
+    def _bytes(self) -> int:
         """Size of the file, which has no more frames: headers that were never filled in say more."""
-        return math.inf if self._file is None else Path(self._file).stat().st_size
+        return Path(self._file).stat().st_size
 
     def _states_seconds(self) -> bool:
         """Whether the duration that OpenCV knows is that of the video, as the file states it."""
@@ -313,38 +294,25 @@ class OpenCVDecoder:
         silent = self._media is not None and not self._media.sound
         return self._container == WINDOWS_MEDIA or (self._container == FLASH and silent)
 
-    def _stamp(self, capture: cv2.VideoCapture, last: float | None, follower: PacketFollower | None) -> float | None:
-        if isinstance(self._source, int):
-            return time.monotonic()
+    def _stamp(self, capture: cv2.VideoCapture, last: float | None, follower: PacketFollower) -> float | None:
         if not self._times.exist:
             return None
         seconds = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
         # Without a time stamp OpenCV says 0.
-        known = seconds != 0 or last is None or (follower is not None and follower.begins_part())
+        known = seconds != 0 or last is None or follower.begins_part()
         return seconds if known else None
 
     def _open(self) -> cv2.VideoCapture:
-        parameters = []
-        if self._timeout is not None:
-            milliseconds = round(1000 * self._timeout)
-            parameters = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, milliseconds, cv2.CAP_PROP_READ_TIMEOUT_MSEC, milliseconds]
-        if re.search("[\ud800-\udfff]", str(self._source)):
+        if re.search("[\ud800-\udfff]", self._file):
             # A name that is no Unicode ends the process.
             raise InputError(f"{self._name!r}: OpenCV cannot open a file of this name: rename it, or {_PYAV}")
-        # What other threads than the one that reads say of damage is not heard.
-        backend, alone = (cv2.CAP_ANY, []) if self._file is None else (cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, 1])
         with quiet():
-            capture = cv2.VideoCapture(self._source, backend, parameters + alone)
+            # What other threads than the one that reads say of damage is not heard.
+            capture = cv2.VideoCapture(self._file, cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, 1])
         if capture.isOpened():
             if self._matrix is not None:
                 capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
             return capture
-        if isinstance(self._source, int):
-            raise InputError(f"{self._name} cannot be opened: is it connected, free, and allowed to be used?")
-        if self._timeout is not None:
-            raise InputError(
-                f"{self._name} cannot be opened (waited up to {self._timeout:g} s): check address, network and password"
-            )
         raise InputError(
             f"{self._name} cannot be opened as a video: expected a file that OpenCV decodes (mp4, avi, mkv, webm, …) "
             f"or a folder of images; {_PYAV} for more formats, or re-encode it, for example to H.264 mp4"

@@ -13,7 +13,7 @@ import cv2
 
 from logvggt_jax.reconstruction.sources.h264_frame_numbers import FrameNumbers
 from logvggt_jax.reconstruction.sources.mpeg_picture_numbers import PictureNumbers
-from logvggt_jax.reconstruction.sources.opencv_codecs import VP9, codec_name, codec_of, shows_frame
+from logvggt_jax.reconstruction.sources.opencv_codecs import VP9, codec_name, codec_of
 from logvggt_jax.reconstruction.sources.opencv_messages import captured_messages, tells_corrupt_packet
 from logvggt_jax.reconstruction.sources.orientation import noted_orientation
 from logvggt_jax.reconstruction.sources.stated_sizes import stated_size
@@ -27,7 +27,7 @@ STORE_DECODING_TIMES = (b"RIFF", b"\x30\x26\xb2\x75")
 # Microseconds below which a time stands for none, in a part of the file that is damaged.
 _NO_TIME = -1 << 62
 # FFmpeg reads so many packets ahead of the one that it hands out.
-_AHEAD = 3
+_AHEAD = 2
 # Errors in a row after which nothing more is to be read.
 _MOST_ERRORS = 64
 
@@ -136,7 +136,7 @@ class PacketReader:
                 size = stated_size(data, self._codec) or size
             lossy = numbers is not None and numbers.follows_loss(data, key)
             whole, self._told_corrupt = not self._told_corrupt, False
-            shows = content.size > self._empty and shows_frame(data, self._codec)
+            shows = content.size > self._empty
             if frames is not None and shows:
                 shows, changed = frames.follow(data)
                 size = changed or size

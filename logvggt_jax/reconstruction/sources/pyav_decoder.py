@@ -337,6 +337,9 @@ class PyAVDecoder:
                 if (now := self._codec(container, stream)) != codec:
                     yield CodecChange(None, codec, now)
                 return
+            except IndexError:
+                # PyAV stumbles at the end over streams that appeared on the way, as in damaged transport streams.
+                break
             except av.FFmpegError as error:
                 errors += 1
                 if errors == 1:

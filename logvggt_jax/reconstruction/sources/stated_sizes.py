@@ -21,7 +21,6 @@ _HEVC = re.compile(rb"\x00\x00\x01\x42.", re.DOTALL)
 _MPEG = re.compile(rb"\x00\x00\x01\xb3")
 _MPEG_EXTENSION = re.compile(rb"\x00\x00\x01\xb5(?=[\x10-\x1f])")
 _MPEG4 = re.compile(rb"\x00\x00\x01[\x20-\x2f]")
-_VP8 = b"\x9d\x01\x2a"
 # Bits of what MPEG-4 tells of the buffer of a decoder.
 _BUFFER_BITS = 79
 # Sizes (H, W) that H.263 and Sorenson's codec have numbers for.
@@ -146,14 +145,6 @@ def _of_sorenson(packet: bytes) -> Size | None:
     return _SORENSON_SIZES.get(form)
 
 
-def _of_vp8(packet: bytes) -> Size | None:
-    """RFC 6386, 9.1; two bits of each number tell how to enlarge it."""
-    if packet[3:6] != _VP8 or len(packet) < 10:
-        return None
-    width, height = (each & 0x3FFF for each in struct.unpack_from("<HH", packet, 6))
-    return height, width
-
-
 def _of_picture(packet: bytes) -> Size | None:
     try:
         with warnings.catch_warnings():
@@ -177,7 +168,6 @@ _STATED = {
     b"fmp4": _of_mpeg4,
     b"h263": _of_h263,
     b"flv1": _of_sorenson,
-    b"vp80": _of_vp8,
     b"mjpg": _of_picture,
     b"mpng": _of_picture,
     b"avdn": _of_dnxhd,

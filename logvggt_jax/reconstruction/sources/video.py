@@ -13,15 +13,17 @@ from typing import BinaryIO
 
 import numpy as np
 
-from logvggt_jax.errors import InputError, disk_errors
+from logvggt_jax.errors import InputError, disk_errors, install_line
 from logvggt_jax.frames import same_proportions
 from logvggt_jax.reconstruction.sources.alternate_lines import AlternateLines
 from logvggt_jax.reconstruction.sources.appended_files import another_follows
+from logvggt_jax.reconstruction.sources.camera import Camera
 from logvggt_jax.reconstruction.sources.decoding import (
     CodecChange,
     Complaint,
     Damage,
     Picture,
+    PictureStream,
     VideoDecoder,
     VideoHeader,
 )
@@ -84,6 +86,8 @@ def refuse_address(path: str | Path) -> None:
 class VideoSource(Source):
     """Frames of a video, decoded as needed: by PyAV where it is installed, else by OpenCV.
 
+    What OpenCV alone cannot check as PyAV does is refused at once, as are network streams.
+
     Frames are named after their position in the video, and have the file's own time stamps, in seconds from its first
     frame. They are upright, whole pictures of 8 bits: rotation and mirroring are applied, interlaced ones are
     deinterlaced. Frames that cannot be decoded keep their position, are left out, and are listed in `skipped`.
@@ -115,8 +119,9 @@ class VideoSource(Source):
                 raise InputError(f"{option} is for files of images, which {self.name} is not: leave it out")
         if not self._live:
             self.notes += _check_file(self.path)
-            self._decoder = _decoder(self.path, self.name)
-            self._header = self._decoder.header()
+            decoder = _decoder(self.path, self.name)
+            self._decoder: PictureStream = decoder
+            self._header = decoder.header()
             self._check_range(self._header)
             self.notes += self._header.notes
             if masks is not None:
@@ -126,7 +131,7 @@ class VideoSource(Source):
         if masks is not None:
             masks.check_live()
         if str(path).isdecimal():
-            self._decoder = OpenCVDecoder(int(str(path)), self.name)
+            self._decoder = Camera(int(str(path)), self.name)
         else:
             self._decoder = _decoder(_address(path), self.name, _TIMEOUT)
 
@@ -335,17 +340,26 @@ def _decoder(source: str | Path, name: str, timeout: float | None = None) -> Vid
     try:
         import av
     except ImportError:
-        return OpenCVDecoder(url, name, timeout)
+        return _without_pyav(url, name, timeout)
     if av.__version__.split(".")[0] not in _PYAV_MAJORS:
         warnings.warn(
             f"PyAV {av.__version__} may have another interface than {' and '.join(_PYAV_MAJORS)}, which are known "
-            f'here; OpenCV reads {name} with fewer checks: pip install "logvggt-jax[video]" brings the right one',
+            f"here; OpenCV reads {name} instead: {install_line('video')} brings the right one",
             stacklevel=2,
         )
-        return OpenCVDecoder(url, name, timeout)
+        return _without_pyav(url, name, timeout)
     from logvggt_jax.reconstruction.sources.pyav_decoder import PyAVDecoder
 
     return PyAVDecoder(url, name, timeout)
+
+
+def _without_pyav(url: str, name: str, timeout: float | None) -> OpenCVDecoder:
+    if timeout is not None:
+        raise InputError(
+            f"{name} is a network stream, of which OpenCV alone notices neither all damage nor a change of size: "
+            f"{install_line('video')}"
+        )
+    return OpenCVDecoder(url, name)
 
 
 def _check_file(path: Path) -> Iterator[str]:
