@@ -1040,6 +1040,23 @@ def test_a_jpeg_that_ends_too_soon_is_no_picture(tmp_path: Path, library: str, n
     assert [frame.name for frame in source.skipped] == [f"frame-{number:06d}"]
 
 
+@pytest.mark.parametrize("name", ["walk.avi", "walk.mjpeg"])
+@pytest.mark.parametrize("mark", [b"\xff\xc0", b"\xff\xda"], ids=["frame", "scan"])
+@pytest.mark.parametrize("number", [0, 3])
+def test_a_jpeg_without_its_header_is_not_the_picture_before(
+    tmp_path: Path, library: str, mark: bytes, number: int, name: str
+) -> None:
+    whole = write(tmp_path / f"whole.{name}", [busy(i) for i in range(6)], codec="mjpeg", pixels="yuvj420p")
+    path = rewritten(
+        tmp_path / name,
+        whole,
+        lambda at, packet: packet.replace(mark, b"\xff\xe9", 1) if at == number else packet,
+    )
+    source = open_source(path, most_broken=0.2)
+    assert names(list(source)) == [i for i in range(6) if i != number]
+    assert [frame.name for frame in source.skipped] == [f"frame-{number:06d}"]
+
+
 def test_a_jpeg_without_its_end_mark_is_a_picture(tmp_path: Path, library: str) -> None:
     """As some cameras write them."""
     whole = write(tmp_path / "whole.avi", [busy(i) for i in range(6)], codec="mjpeg", pixels="yuvj420p")

@@ -58,7 +58,7 @@ _STATE_FRAMES = (MP4, AVI)
 # How FFmpeg calls frames that refer to others, and those of which it does not know.
 _REFER = "PB?"
 _PYAV = install_line("video")
-_UNDECODED = "cannot be decoded"
+_UNDECODED, _NO_PICTURE = "cannot be decoded", "holds no picture"
 
 
 class OpenCVDecoder:
@@ -187,6 +187,10 @@ class OpenCVDecoder:
             if said and not failures:
                 yield Complaint(said[0])
             failures, said = 0, []
+            if not follower.holds_picture:
+                last = seconds
+                yield Damage(seconds, _NO_PICTURE)
+                continue
             if before is not None and np.array_equal(image, before):
                 # Either nothing moves, or the picture was not converted and the buffer holds the one before.
                 with captured_messages() as messages:

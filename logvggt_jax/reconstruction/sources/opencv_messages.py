@@ -17,8 +17,9 @@ import cv2
 _ERROR, _INFO = 16, 32
 # What is said without being called an error of a packet that is not whole, and of parts that a decoder guesses.
 _CORRUPT, _GUESSED = "Packet corrupt", "concealing "
-# The decoder of JPEG, and how begins what it says of coefficients that are missing or wrong.
-_JPEG, _HALF_JPEG = "mjpeg", re.compile(r"overread|error (?:count|dc|y=)|mjpeg_decode_dc")
+# The decoder of JPEG, and how begins what it says of coefficients that are missing or wrong, or whose header is.
+_JPEG = "mjpeg"
+_HALF_JPEG = re.compile(r"overread|error (?:count|dc|y=)|mjpeg_decode_dc|decode_sos|Can not process SOS")
 _LONGEST = 1024
 # What a line begins with: who speaks, behind those on whose behalf.
 _SPEAKERS = re.compile(r"(?:\[(\S+) @ \w+\]\s*)+")
@@ -105,7 +106,8 @@ def errors_of_ffmpeg(messages: list[Message]) -> list[str]:
 
 
 def tells_half_jpeg(messages: list[Message]) -> bool:
-    """Whether FFmpeg said in `captured_messages` that it could not decode all of a JPEG, which is then half grey."""
+    """Whether FFmpeg said in `captured_messages` that it could not decode all of a JPEG, which is then half grey,
+    or the picture before it."""
     return any(each.speaker == _JPEG and _HALF_JPEG.match(each.text) for each in messages)
 
 

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import cv2
 
 from logvggt_jax.reconstruction.sources.h264_frame_numbers import FrameNumbers
+from logvggt_jax.reconstruction.sources.jpeg_scans import holds_scan
 from logvggt_jax.reconstruction.sources.mpeg_picture_numbers import PictureNumbers
 from logvggt_jax.reconstruction.sources.opencv_codecs import VP9, codec_name, codec_of
 from logvggt_jax.reconstruction.sources.opencv_messages import captured_messages, tells_corrupt_packet
@@ -43,6 +44,7 @@ class Packet(NamedTuple):
       orientation: EXIF's, that the camera noted in a JPEG; 1 for none.
       whole: nothing of it is missing, nor anything just before it, as far as the container tells.
       follows_loss: see `Picture`.
+      holds_picture: what its decoder gives is more than what was in memory before.
     """
 
     stamp: int
@@ -52,6 +54,7 @@ class Packet(NamedTuple):
     orientation: int
     whole: bool
     follows_loss: bool
+    holds_picture: bool
 
 
 class PacketReader:
@@ -140,7 +143,8 @@ class PacketReader:
             if frames is not None and shows:
                 shows, changed = frames.follow(data)
                 size = changed or size
-            yield Packet(stamp, shows, key, size, orientation, whole, lossy)
+            holds_picture = self._codec != _OF_CAMERAS or holds_scan(data)
+            yield Packet(stamp, shows, key, size, orientation, whole, lossy, holds_picture)
 
     def _since_beginning(self) -> float:
         """Seconds of the packet at hand. Milliseconds count from the first packet, but where presentation times, which

@@ -74,6 +74,7 @@ class PacketFollower:
       known: it is known which packet a picture is of.
       reordered: see `Codec`.
       follows_loss: see `Picture`, of that at hand.
+      holds_picture: see `Packet`, of that at hand.
       lead: frames before the first key frame, which refer to some that are not there.
       lead_seconds: how long these would be shown.
 
@@ -93,9 +94,10 @@ class PacketFollower:
         self.known, self.reordered = self._reader.frame_each, self._reader.reordered
         # Whether all time stamps of frames so far were those of packets. Without times packets are numbered.
         self._trusted = (timed or not self.reordered) and not edited
-        # Time stamps of key frames, and of frames before which some are missing.
+        # Time stamps of key frames, of frames before which some are missing, and of those that hold no picture.
         self._keys: set[int] = set()
         self._after_loss: set[int] = set()
+        self._empty: set[int] = set()
         # Those of frames that were said to be missing.
         self._given_up: set[int] = set()
         # What is stated of pictures from one on, of which the first says when it is stored and shown.
@@ -106,6 +108,7 @@ class PacketFollower:
         self.size: tuple[int, int] | None = None
         self.orientation = 1
         self.key = self.follows_loss = False
+        self.holds_picture = True
         self.lead, self.lead_seconds = 0, 0.0
         self._lead_begins = math.inf
         self._begin()
@@ -226,7 +229,9 @@ class PacketFollower:
         self._last = max(self._last, stamp)
         self.key, self.follows_loss = stamp in self._keys, stamp in self._after_loss
         self._keys.discard(stamp)
+        self.holds_picture = stamp not in self._empty
         self._after_loss.discard(stamp)
+        self._empty.discard(stamp)
         by_time = self._since() is not None or (self._timed and self._reader.holds_one)
         while self._stated and (self._stated[0][1] <= stamp if by_time else self._stated[0][0] <= self._shown):
             *_, self.size, self.orientation = self._stated.popleft()
@@ -271,6 +276,8 @@ class PacketFollower:
             self._keys.add(packet.stamp)
         if packet.follows_loss:
             self._after_loss.add(packet.stamp)
+        if not packet.holds_picture:
+            self._empty.add(packet.stamp)
         if packet.holds_frame:
             self._missing.expect(packet.stamp)
             self._stored += 1

@@ -18,6 +18,7 @@ from logvggt_jax.errors import InputError
 from logvggt_jax.reconstruction.sources.decoding import CodecChange, Damage, Picture, VideoHeader
 from logvggt_jax.reconstruction.sources.deinterlacing import Deinterlacer, is_interlaced
 from logvggt_jax.reconstruction.sources.h264_frame_numbers import FrameNumbers
+from logvggt_jax.reconstruction.sources.jpeg_scans import holds_scan
 from logvggt_jax.reconstruction.sources.missing_frames import MissingFrames
 from logvggt_jax.reconstruction.sources.mpeg_picture_numbers import PictureNumbers
 from logvggt_jax.reconstruction.sources.orientation import matrix_of, noted_orientation, shown_size, turn
@@ -42,6 +43,7 @@ _NO_VIDEOS = ("image2", "tty", "bin", "xbin", "adf", "idf")
 _STATE_DURATION = ("mov", "matroska", "avi", "flv", "asf", "mxf")
 # Errors in a row after which a file that cannot be read on counts as ended.
 _MOST_READ_ERRORS = 16
+_NO_PICTURE = "holds no picture"
 # Some formats mark no key frames: after so many packets the first that decodes begins the video.
 _LONGEST_LEAD = 300
 # Pixels above which frames are decoded side by side.
@@ -216,6 +218,7 @@ class PyAVDecoder:
         elif stream.codec_context.name in _OF_MPEG:
             numbers = PictureNumbers()
         after_loss: set[int | None] = set()  # time stamps of frames before which some are missing
+        empty: set[int | None] = set()  # and of those that hold no picture
         each = False  # whether every packet is known to show a frame of its own
         for packet, before_key in self._before_what(container, stream):
             if isinstance(packet, CodecChange):
@@ -245,6 +248,8 @@ class PyAVDecoder:
                 lossy = numbers.follows_loss(bytes(packet), packet.is_keyframe) or lossy
             if lossy:
                 after_loss.add(packet.pts)
+            if packet.size and stream.codec_context.name in _OF_CAMERAS and not holds_scan(bytes(packet)):
+                empty.add(packet.pts)
             try:
                 frames = packet.decode()
             except av.error.EOFError:
@@ -257,6 +262,12 @@ class PyAVDecoder:
                     missing.fail(str(error.strerror))
             noted = matrix_of(noted_orientation(bytes(packet))) if stream.codec_context.name in _OF_CAMERAS else None
             for frame in frames:
+                if frame.pts in empty:
+                    if frame.pts is None:
+                        yield Damage(None, _NO_PICTURE), None
+                    else:
+                        missing.fail(_NO_PICTURE)
+                    continue
                 frame.opaque = PacketNotes(noted, frame.pts in after_loss)
                 after_loss.discard(frame.pts)
                 if self._numbered_as_stored:
@@ -267,6 +278,7 @@ class PyAVDecoder:
                     since = key if each and not joined else None
                     yield from ((damage, None) for damage in missing.before(frame.pts, since))
                 yield None, frame
+            empty.discard(None)
         if stream.width * stream.height > _LARGE:
             missing.fail_all("cannot be decoded")
         elif each and not joined:
