@@ -7,8 +7,8 @@ from typing import NamedTuple
 import cv2
 
 VP9 = b"vp90"
-STATE_ALL = (b"mjpg", b"gif ")
-"""Of these no header tells HDR or interlacing."""
+WITHOUT_HEADER = (b"mjpg", b"gif ")
+"""Codecs of which no file says beforehand that they are HDR, or interlaced."""
 # A packet of so few bytes stands for no change in codecs that refer to other frames.
 _NO_CHANGE = 8
 

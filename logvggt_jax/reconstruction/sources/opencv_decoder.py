@@ -25,7 +25,7 @@ from logvggt_jax.reconstruction.sources.decoding import CodecChange, Complaint, 
 from logvggt_jax.reconstruction.sources.matroska_track import read_matroska_view
 from logvggt_jax.reconstruction.sources.media_info import MediaHeader, media_info_is_there, read_media_header
 from logvggt_jax.reconstruction.sources.mp4_track import TrackView, read_mp4_view
-from logvggt_jax.reconstruction.sources.opencv_codecs import STATE_ALL, codec_name, codec_of
+from logvggt_jax.reconstruction.sources.opencv_codecs import WITHOUT_HEADER, codec_name, codec_of
 from logvggt_jax.reconstruction.sources.opencv_messages import (
     Message,
     captured_messages,
@@ -267,11 +267,11 @@ class OpenCVDecoder:
                 f"{self._name} cannot be checked, as the FFmpeg of this OpenCV cannot be asked what it says of damage, "
                 f"and of interlaced pictures: {_PYAV}"
             )
-        if self._media is None and codec not in STATE_ALL:
-            why = "cannot tell" if media_info_is_there() else "whose library is not there for this system, would tell"
+        if self._media is None and codec not in WITHOUT_HEADER:
+            why = "knows nothing of it" if media_info_is_there() else "is not there for this system"
             raise InputError(
-                f"{self._name} cannot be checked for HDR, and for interlacing that only the header tells, of which "
-                f"MediaInfo{',' if 'would' in why else ''} {why}: {_PYAV}"
+                f"{self._name} cannot be checked for HDR, and for interlacing that only the header tells, as MediaInfo "
+                f"{why}: {_PYAV}"
             )
 
     def _check_converted(self, said: list[Message]) -> None:
