@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import http.server
 import io
 import itertools
@@ -358,6 +359,21 @@ def test_another_library_gives_another_fingerprint(tmp_path: Path, monkeypatch: 
     assert open_source(path, stride=2).fingerprint(2) != first
     monkeypatch.setitem(sys.modules, "av", None)
     assert open_source(path).fingerprint(2) != first
+
+
+def test_frames_that_are_done_with_are_gone_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And not when Python next looks for what refers to itself: of large pictures that is gigabytes later."""
+    path = write(tmp_path / "walk.mp4", [busy(i) for i in range(24)], turned=(90, False))
+    gc.collect()
+    gc.disable()
+    try:
+        taken = sum(1 for _ in open_source(path))
+        left = sum(isinstance(each, av.VideoFrame) for each in gc.get_objects())
+    finally:
+        gc.enable()
+    assert taken == 24
+    # One for the header and one for the pictures tell how they are turned.
+    assert left <= 3
 
 
 def test_a_tail_converts_nothing_before_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

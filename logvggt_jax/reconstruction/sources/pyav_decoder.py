@@ -24,6 +24,7 @@ from logvggt_jax.reconstruction.sources.mpeg_picture_numbers import PictureNumbe
 from logvggt_jax.reconstruction.sources.orientation import matrix_of, noted_orientation, shown_size, turn
 from logvggt_jax.reconstruction.sources.pyav_header import (
     STORE_DECODING_TIMES,
+    DisplayMatrices,
     PacketNotes,
     average_rate,
     display_matrix,
@@ -111,7 +112,7 @@ class PyAVDecoder:
         """See `VideoDecoder.pictures`."""
         with self._open() as container:
             stream = self._stream(container)
-            deinterlacer = Deinterlacer(stream, self._name)
+            deinterlacer, matrices = Deinterlacer(stream, self._name), DisplayMatrices(stream)
             for instead, frame in self._decode(container, stream):
                 if frame is not None:
                     ready = deinterlacer.push(frame)
@@ -119,14 +120,19 @@ class PyAVDecoder:
                     # What was pushed before is shown before.
                     ready = deinterlacer.drain()
                 for decoded, whole in ready:
-                    yield self._picture(decoded, whole, stream)
+                    yield self._picture(decoded, whole, matrices.of(decoded), stream)
                 if instead is not None:
                     yield instead
             for decoded, whole in deinterlacer.drain():
-                yield self._picture(decoded, whole, stream)
+                yield self._picture(decoded, whole, matrices.of(decoded), stream)
 
-    def _picture(self, decoded: av.VideoFrame, whole: av.VideoFrame, stream: av.video.stream.VideoStream) -> Picture:
-        matrix = display_matrix(decoded, stream)
+    def _picture(
+        self,
+        decoded: av.VideoFrame,
+        whole: av.VideoFrame,
+        matrix: np.ndarray | None,
+        stream: av.video.stream.VideoStream,
+    ) -> Picture:
         # Filters pass on neither.
         whole.colorspace, whole.color_range = decoded.colorspace, decoded.color_range
         return Picture(

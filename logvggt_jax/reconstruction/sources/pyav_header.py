@@ -77,6 +77,27 @@ def display_matrix(frame: av.VideoFrame, stream: av.video.stream.VideoStream) ->
     return _clockwise(-frame.rotation) if frame.rotation else None
 
 
+class DisplayMatrices:
+    """How the frames of a stream are turned, see `display_matrix`.
+
+    What a frame tells beside its picture is read of the first one and where the rotation changes alone: a frame that is
+    asked for it lives, pixels and all, until Python looks for objects that refer to each other.
+    """
+
+    def __init__(self, stream: av.video.stream.VideoStream) -> None:
+        self._stream = stream
+        self._rotation: int | None = None
+        self._matrix: np.ndarray | None = None
+
+    def of(self, frame: av.VideoFrame) -> np.ndarray | None:
+        """None where nothing is turned."""
+        if frame.opaque is not None and frame.opaque.matrix is not None:
+            return frame.opaque.matrix
+        if frame.rotation != self._rotation:
+            self._rotation, self._matrix = frame.rotation, display_matrix(frame, self._stream)
+        return self._matrix
+
+
 def _clockwise(degrees: int) -> np.ndarray:
     return np.linalg.matrix_power(np.array([[0, 1], [-1, 0]]), round(degrees / 90) % 4)
 
