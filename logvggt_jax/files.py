@@ -19,9 +19,8 @@ from filelock import FileLock, Timeout
 
 from logvggt_jax.errors import DiskError, InputError, OutputExists, disk_errors, one_line
 
-# Held by who reads numpy's files: numpy parses an array's header with `ast`, which in Python 3.11 fails now and then
-# where several threads do so.
-NUMPY_READING = threading.Lock()
+# NumPy parses an array's header with `ast`, which in Python 3.11 fails now and then where several threads do so.
+_NUMPY_READING = threading.Lock()
 EMPTY_PATH = "the path is empty (a variable without a value?)"
 _LONGEST_NAME, _LONGEST_SUFFIX = 255, 32  # bytes
 _LOCK, _OWNER = ".lock", ".owner"
@@ -43,6 +42,22 @@ def open_regular(path: str | Path) -> Iterator[BinaryIO]:
             raise InputError(f"{path} is no file but a folder, a pipe or a device")
         with Path(path).open("rb") as stream:
             yield stream
+
+
+@contextmanager
+def numpy_reading() -> Iterator[None]:
+    """Around what reads NumPy's files, by one thread at a time. Raises ValueError, in one line, where they are damaged.
+
+    NumPy and zipfile meet damage with two dozen kinds of errors, of Python's tokens among them. Errors of the operating
+    system pass through unchanged.
+    """
+    with _NUMPY_READING:
+        try:
+            yield
+        except OSError:
+            raise
+        except Exception as error:
+            raise ValueError(one_line(error)) from error
 
 
 def read_json(path: str | Path, mend: str) -> Any:

@@ -2,12 +2,23 @@
 
 import errno
 import os
+from itertools import product
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from logvggt_jax.errors import DiskError, InputError, MissingInput, OutputExists, one_line, printable
-from logvggt_jax.files import FolderKind, atomic_file, atomic_folder, check_output, open_regular, user_path, write_text
+from logvggt_jax.files import (
+    FolderKind,
+    atomic_file,
+    atomic_folder,
+    check_output,
+    numpy_reading,
+    open_regular,
+    user_path,
+    write_text,
+)
 
 DONE = FolderKind("done", ("done", "frame-*"))
 
@@ -200,3 +211,24 @@ def test_paths_that_are_none_are_one_line(tmp_path: Path, resolved: bool) -> Non
     if resolved:
         with pytest.raises(InputError, match="loop"):
             user_path(tmp_path / "loop", resolved=True)
+
+
+def test_an_array_file_with_any_damaged_byte_is_read_or_a_value_error(tmp_path: Path) -> None:
+    """NumPy leaves a header that it does not understand to Python's tokens, whose errors are none of its own."""
+    path, other = tmp_path / "a.npy", set()
+    np.save(path, np.zeros((3, 4)))
+    whole = path.read_bytes()
+    for place, byte in product(range(128), (0, ord("("), ord("'"), 255)):
+        path.write_bytes(whole[:place] + bytes([byte]) + whole[place + 1 :])
+        try:
+            np.load(path, allow_pickle=False)
+        except Exception as error:
+            other.add(type(error))
+            with pytest.raises(ValueError), numpy_reading():
+                np.load(path, allow_pickle=False)
+    assert any(not issubclass(kind, ValueError) for kind in other)
+
+
+def test_missing_array_files_stay_missing(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError), numpy_reading():
+        np.load(tmp_path / "none.npy")

@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image
 
 from logvggt_jax.errors import InputError, MissingInput, one_line
-from logvggt_jax.files import NUMPY_READING, atomic_file, open_regular
+from logvggt_jax.files import atomic_file, numpy_reading, open_regular
 from logvggt_jax.reconstruction.cameras_file import CAMERAS_FILE
 
 DEPTH_FOLDER, IMAGE_FOLDER, ORIGINAL_FOLDER = "depth", "images", "originals"
@@ -82,13 +82,13 @@ def read_depth(path: str | Path, size: tuple[int, int] | None = None) -> tuple[n
     """
     with _result_file(path) as stream:
         try:
-            with NUMPY_READING, np.load(stream, allow_pickle=False) as arrays:
+            with numpy_reading(), np.load(stream, allow_pickle=False) as arrays:
                 # What has no array's header comes as bytes.
                 maps = np.asarray(arrays["depth"]), np.asarray(arrays["confidence"])
         except OSError:
             raise
-        except Exception as error:  # numpy and zipfile meet damaged files with two dozen kinds
-            raise InputError(f"{path}: no depth file of this program, or damaged: {one_line(error)}") from error
+        except ValueError as error:
+            raise InputError(f"{path}: no depth file of this program, or damaged: {error}") from error
     for name, values in zip(("depth", "confidence"), maps, strict=True):
         if values.dtype.kind != "f" or values.ndim != 2 or (size is not None and values.shape != size):
             expected = "[H, W]" if size is None else f"{list(size)}, as {CAMERAS_FILE} says"

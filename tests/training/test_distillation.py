@@ -19,14 +19,13 @@ import pytest
 from absl import logging
 from pixel_teacher import PixelTeacher
 
-from logvggt_jax import ModelConfig
+from logvggt_jax import ModelConfig, files
 from logvggt_jax.data import open_dataset
 from logvggt_jax.data.errors import BrokenPicture
 from logvggt_jax.data.feeding.batches import BatchIterator, training_batches
 from logvggt_jax.data.feeding.frame_range import FrameRange
 from logvggt_jax.data.feeding.listed_frames import listed_frames
 from logvggt_jax.errors import DiskError, InputError
-from logvggt_jax.files import NUMPY_READING
 from logvggt_jax.metrics.depth import depth_metrics
 from logvggt_jax.model.logvggt import LogVGGT
 from logvggt_jax.training import loop
@@ -131,9 +130,9 @@ def test_labels_that_have_changed_on_the_disk_are_made_anew(
 def test_labels_are_opened_by_one_thread_at_a_time(rooms: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Threads that read a batch ended a run now and then: numpy parses headers with Python's own parser."""
     dataset, alone, load = labelled(rooms, tmp_path), [], np.load
-    monkeypatch.setattr(np, "load", lambda *a, **k: (alone.append(NUMPY_READING.locked()), load(*a, **k))[1])
+    monkeypatch.setattr(np, "load", lambda *a, **k: (alone.append(files._NUMPY_READING.locked()), load(*a, **k))[1])
     dataset.read(dataset.sequences[0], [0, 1])
-    assert alone == [True] * 4 and not NUMPY_READING.locked()
+    assert alone == [True] * 4 and not files._NUMPY_READING.locked()
 
 
 def test_labels_that_cannot_be_written_are_one_line_and_leave_nothing(

@@ -16,7 +16,7 @@ from logvggt_jax.data.dataset import Dataset, check_indices, check_sequence
 from logvggt_jax.data.rooms.same_rooms import SameRooms
 from logvggt_jax.data.worker_processes import worker_pool
 from logvggt_jax.errors import InputError, OutputExists
-from logvggt_jax.files import atomic_folder, check_space
+from logvggt_jax.files import atomic_folder, check_space, numpy_reading
 from logvggt_jax.frames import Frames
 
 _ARRAYS = ("images", "depth", "intrinsics", "extrinsics")
@@ -133,7 +133,8 @@ def _open_arrays(folder: Path, rooms: Dataset) -> dict[str, np.ndarray]:
     arrays = {}
     for name, (shape, dtype) in _shapes(rooms).items():
         try:
-            array = np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False)
+            with numpy_reading():
+                array = np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False)
         except (OSError, ValueError) as error:
             raise InputError(f"{folder / name}.npy cannot be read ({error}): delete {folder} to render anew") from error
         if array.shape != shape or array.dtype != dtype:

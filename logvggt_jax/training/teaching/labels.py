@@ -17,7 +17,7 @@ import numpy as np
 from absl import logging
 
 from logvggt_jax.errors import InputError, OutputExists, disk_errors
-from logvggt_jax.files import NUMPY_READING, atomic_folder, read_json
+from logvggt_jax.files import atomic_folder, numpy_reading, read_json
 from logvggt_jax.weights.digests import digests, verify_digests
 
 DIGEST_BYTES = 16
@@ -70,9 +70,9 @@ def stored_labels(folder: Path) -> Labels:
     for name in Labels._fields:
         path = folder / f"{name}.npy"
         try:
-            with NUMPY_READING:
+            with numpy_reading():
                 arrays.append(np.load(path, mmap_mode="r", allow_pickle=False))
-        except (OSError, ValueError, EOFError) as error:
+        except (OSError, ValueError) as error:
             raise InputError(f"{path}: cannot be read ({error}): start the run again, which labels the clip") from error
     return Labels(*arrays)
 

@@ -1,5 +1,7 @@
 """PointOdyssey: saturated depth is sky; only two arrays are read; older releases; damage."""
 
+import io
+import tokenize
 import zipfile
 from pathlib import Path
 
@@ -10,6 +12,7 @@ from layouts.pointodyssey import STEP, write_cameras, write_sequence
 from room_views import SIZE, check_views, write_image
 
 from logvggt_jax.data.readers.pointodyssey import PointOdyssey
+from logvggt_jax.errors import InputError
 
 
 @pytest.fixture
@@ -39,6 +42,23 @@ def test_splits_are_the_folders(root: Path):
     # One that arrives later is seen.
     (root / "validation").rename(root / "val")
     assert len(PointOdyssey(root).sequences) == 3
+
+
+def test_an_array_of_unreadable_shape_is_one_line(root: Path):
+    """NumPy leaves what follows to Python's tokens, whose error is none of its own."""
+    path = root / "train/dancing/anno.npz"
+    with np.load(path) as archive:
+        arrays = dict(archive)
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, array in arrays.items():
+            buffer = io.BytesIO()
+            np.save(buffer, array)
+            header = buffer.getvalue()
+            archive.writestr(f"{name}.npy", header.replace(b"), }", b",  }") if name == "extrinsics" else header)
+    with np.load(path) as archive, pytest.raises(tokenize.TokenError):
+        archive["extrinsics"]
+    with pytest.raises(InputError, match=r"anno\.npz: truncated or damaged npz file \(.*fetch it again"):
+        PointOdyssey(root).read("train/dancing", range(4))
 
 
 def test_point_tracks_are_not_read(root: Path):
