@@ -85,8 +85,6 @@ def read_depth(path: str | Path, size: tuple[int, int] | None = None) -> tuple[n
             with numpy_reading(), np.load(stream, allow_pickle=False) as arrays:
                 # What has no array's header comes as bytes.
                 maps = np.asarray(arrays["depth"]), np.asarray(arrays["confidence"])
-        except OSError:
-            raise
         except ValueError as error:
             raise InputError(f"{path}: no depth file of this program, or damaged: {error}") from error
     for name, values in zip(("depth", "confidence"), maps, strict=True):
