@@ -15,6 +15,8 @@ from ml_collections import ConfigDict
 
 from configs import tiny
 from logvggt_jax.training.config_fields import with_all_fields
+from logvggt_jax.weights.address import resolve
+from logvggt_jax.weights.checkpoints import read_config
 
 
 def get_config(initial_weights: str = "") -> ConfigDict:
@@ -22,8 +24,8 @@ def get_config(initial_weights: str = "") -> ConfigDict:
 
     With Muon rotation is learned after six hundred steps of single windows; with AdamW it took three thousand.
 
-    From random numbers, or from `initial_weights`, which `from_pretrained` reads: without single windows then, mostly
-    on long clips, and on three times as many rooms, since 1,200 were learned by heart within hours.
+    From random numbers, or from `initial_weights`, a model folder, whose sizes it then has: without single windows,
+    mostly on long clips, and on three times as many rooms, since 1,200 were learned by heart within hours.
     """
     config = tiny.get_config()
     config.model.encoder.embed_dim = 96
@@ -37,6 +39,7 @@ def get_config(initial_weights: str = "") -> ConfigDict:
     config.validation.every = 1000
     if initial_weights:
         config.initial_weights = initial_weights
+        config.model = read_config(resolve(initial_weights)).to_dict()
         del config.stages.stage_1
         config.stages.stage_2.steps, config.stages.stage_3.steps = 300, 1400
         config.optimizer.update(learning_rate=5e-4, schedule="cosine")

@@ -35,6 +35,8 @@ from logvggt_jax.training.step.optimizer import learning_rate_schedule
 from logvggt_jax.training.step.program import abstract_parameters, make_program
 from logvggt_jax.training.step.state import TrainState
 from logvggt_jax.training.validation.validation import clip_starts
+from logvggt_jax.weights.address import resolve
+from logvggt_jax.weights.checkpoints import read_config
 from logvggt_jax.weights.folder import write_description
 from logvggt_jax.weights.provenance import Provenance
 
@@ -107,17 +109,17 @@ def test_a_model_of_rooms_goes_on_from_weights_with_its_last_stages(
     name: str, kept: int, steps: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = _config(name, monkeypatch)
-    more = TrainConfig.from_dict(importlib.import_module(f"configs.{name}").get_config("weights").to_dict())
-    assert more.initial_weights == "weights" and whole.initial_weights is None
+    more = TrainConfig.from_dict(importlib.import_module(f"configs.{name}").get_config("rooms").to_dict())
+    assert more.initial_weights == "rooms" and whole.initial_weights is None
     last = zip(whole.stages[-kept:], steps, strict=True)
     assert more.stages == tuple(dataclasses.replace(stage, steps=each) for stage, each in last)
-    assert more.model == whole.model
+    assert more.model == (read_config(resolve("rooms")) if name == "rooms" else whole.model)
     assert more.optimizer.learning_rate < whole.optimizer.learning_rate
 
 
 @pytest.mark.parametrize(
     ("name", "arguments"),
-    [*((name, ()) for name in ("tiny", "demo", "rooms", "small", "distill_rooms")), ("rooms", ("weights",))],
+    [*((name, ()) for name in ("tiny", "demo", "rooms", "small", "distill_rooms")), ("rooms", ("rooms",))],
 )
 def test_rooms_that_are_kept_in_memory_fit_there(
     name: str, arguments: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
