@@ -104,17 +104,31 @@ def test_the_small_models_step_is_traced_at_its_shortest_and_longest_clips(
         assert all(value.shape == () for value in metrics.values())
 
 
-@pytest.mark.parametrize(("name", "kept", "steps"), [("small", 1, (4000,)), ("rooms", 2, (300, 1400))])
-def test_a_model_of_rooms_goes_on_from_weights_with_its_last_stages(
-    name: str, kept: int, steps: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    whole = _config(name, monkeypatch)
+def _trained_on(name: str, whole: TrainConfig) -> TrainConfig:
     more = TrainConfig.from_dict(importlib.import_module(f"configs.{name}").get_config("rooms").to_dict())
     assert more.initial_weights == "rooms" and whole.initial_weights is None
-    last = zip(whole.stages[-kept:], steps, strict=True)
-    assert more.stages == tuple(dataclasses.replace(stage, steps=each) for stage, each in last)
-    assert more.model == (read_config(resolve("rooms")) if name == "rooms" else whole.model)
     assert more.optimizer.learning_rate < whole.optimizer.learning_rate
+    return more
+
+
+def test_the_small_model_goes_on_from_weights_with_its_last_stage(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = _config("small", monkeypatch)
+    more = _trained_on("small", whole)
+    assert more.stages == (dataclasses.replace(whole.stages[-1], steps=4000),)
+    assert more.model == whole.model
+
+
+def test_a_model_of_rooms_goes_on_from_weights_at_their_sizes_with_both_lengths_in_turn(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    whole = _config("rooms", monkeypatch)
+    more = _trained_on("rooms", whole)
+    assert more.model == read_config(resolve("rooms"))
+    assert [stage.clip_length for stage in more.stages] == 15 * [12, 32]
+    assert len({stage.steps for stage in more.stages}) == 1
+    assert {stage.sizes for stage in more.stages} == {whole.stages[0].sizes}
+    rooms = [Rooms("train", **dict(config.data.sources[0].options)) for config in (whole, more)]
+    assert len(rooms[1].sequences) > len(rooms[0].sequences)
 
 
 @pytest.mark.parametrize(
