@@ -15,7 +15,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 help:
 	@echo "make demo      reconstruct a room, evaluate and train on procedural rooms, then open runs/demo/index.html; README says how long it takes"
-	@echo "make test      linter, type checker and tests (seven to ten minutes on two cores, its installation included)"
+	@echo "make test      linter, type checker and tests (ten to fifteen minutes on two cores, its installation included)"
 	@echo "make test-all  the slow tests as well: 1B parity, compilation for TPUs, long streams"
 	@echo "make lint      linter, formatter check and type checker alone"
 	@echo "make docs      the documentation as a site, runs/site/index.html; make test builds it too"

@@ -1,10 +1,10 @@
-"""A model like the one that ships as `rooms`: 2 M parameters, images of 56 x 70 of procedural rooms, from nothing.
+"""A model like the one that ships as `rooms`, half as deep: 2 M parameters, images of 56 x 70 of procedural rooms.
 
     python train.py --config=configs/rooms.py --workdir=runs/rooms
 
 The same command goes on with the run until all steps are done; on two CPU cores that takes about seventy minutes. What
-ships went on from such a run, as `logvggt info rooms` says. To go on from there, on clips of 12 and then of 32 frames
-(scripts/train_small.sh does it):
+ships went on from such a run and was made twice as deep on the way (scripts/deepen_model.py), as `logvggt info rooms`
+says. To go on from there, on clips of 12 and of 32 frames in turn (scripts/train_small.sh does it):
 
     python train.py --config=configs/rooms.py:rooms --workdir=runs/rooms-more
 

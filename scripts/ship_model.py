@@ -30,14 +30,14 @@ MAX_BYTES = 12_000_000
 MAX_CHANGE = 1e-3  # of the parameters by rounding
 
 
-def ship(folder: Path, name: str, *, command: str, commit: str, minutes: float) -> Path:
+def ship(folder: Path, name: str, *, command: str, commit: str, minutes: float, steps: int | None = None) -> Path:
     """Writes the model of `folder` as the one that ships under `name`; the folder written.
 
     Raises InputError where the folder is no sound model, its provenance leaves something open, or it is too large.
     """
     model, variables = load_model(folder)
     config = dataclasses.replace(model.config, dtype="float32")
-    provenance = _complete(read_provenance(folder), command=command, commit=commit, minutes=minutes)
+    provenance = _complete(read_provenance(folder), command=command, commit=commit, minutes=minutes, steps=steps)
     target = shipped_models.ROOT / name
     check_destination(target)
     with tempfile.TemporaryDirectory() as trial:
@@ -53,13 +53,18 @@ def ship(folder: Path, name: str, *, command: str, commit: str, minutes: float) 
     return target
 
 
-def _complete(provenance: Provenance, *, command: str, commit: str, minutes: float) -> Provenance:
+def _complete(provenance: Provenance, *, command: str, commit: str, minutes: float, steps: int | None) -> Provenance:
     record = provenance.training or TrainingRecord()
     configuration = dict(record.configuration or {})
     if "data" in configuration:
         configuration["data"] = {**configuration["data"], "cache_dir": None}  # a path of the machine that trained
     record = dataclasses.replace(
-        record, command=command, commit=commit, minutes=minutes, configuration=configuration or None
+        record,
+        command=command,
+        commit=commit,
+        minutes=minutes,
+        steps=record.steps if steps is None else steps,
+        configuration=configuration or None,
     )
     start = configuration.get("initial_weights") or "random parameters"
     provenance = dataclasses.replace(
@@ -92,11 +97,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("name", choices=SHIPPED)
     parser.add_argument("--command", required=True, help="the training's command")
     parser.add_argument("--minutes", type=float, required=True, help="that the training took")
+    parser.add_argument(
+        "--steps", type=int, help="of all runs, where several went on from one another; default: the last's"
+    )
     parser.add_argument("--commit", help="of the code that trained; default: of this checkout")
     options = parser.parse_args(arguments)
     try:
         commit = options.commit or _commit()
-        ship(options.folder, options.name, command=options.command, commit=commit, minutes=options.minutes)
+        ship(
+            options.folder,
+            options.name,
+            command=options.command,
+            commit=commit,
+            minutes=options.minutes,
+            steps=options.steps,
+        )
     except InputError as error:
         sys.exit(f"ship_model.py: {one_line(error)}")
 

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Goes on training from the model that ships as `rooms`, with clips of 12 and of 32 frames.
+# Goes on training from the model that ships as `rooms`, with clips of 12 and of 32 frames in turn.
 #
 #     scripts/train_small.sh                                # until all steps are done
 #     scripts/train_small.sh --config.max_minutes=8         # in pieces of eight minutes

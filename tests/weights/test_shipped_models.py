@@ -199,8 +199,9 @@ def test_a_model_too_large_for_the_package_is_not_shipped(trained, shipped, monk
 
 
 def test_nothing_but_an_older_model_is_replaced(trained, shipped):
-    ship_model.ship(trained, "rooms", **{**FACTS, "minutes": 9.0})
-    assert read_provenance("rooms").training.minutes == 9.0
+    ship_model.ship(trained, "rooms", **{**FACTS, "minutes": 9.0}, steps=1200)
+    record = read_provenance("rooms").training
+    assert (record.minutes, record.steps) == (9.0, 1200), "of all runs that led to it"
     shutil.rmtree(shipped)
     shipped.mkdir()
     (shipped / "thesis.tex").write_text("years of work")
