@@ -42,7 +42,7 @@ def get_config(initial_weights: str = "") -> ConfigDict:
     if initial_weights:
         config.initial_weights = initial_weights
         config.model = read_config(resolve(initial_weights)).to_dict()
-        # What was learned of either length is lost where the other is trained alone.
+        # In turn: a model that was trained on 12 frames alone forgot 32.
         lengths = (
             tiny.stage(steps=50, clip_length=12, batch_size=8, strides=(1, 4)),
             tiny.stage(steps=50, clip_length=32, batch_size=4, strides=(1, 3)),
