@@ -129,6 +129,8 @@ def test_a_model_of_rooms_goes_on_from_weights_at_their_sizes_with_both_lengths_
     assert {stage.sizes for stage in more.stages} == {whole.stages[0].sizes}
     rooms = [Rooms("train", **dict(config.data.sources[0].options)) for config in (whole, more)]
     assert len(rooms[1].sequences) > len(rooms[0].sequences)
+    assert rooms[1].seed != rooms[0].seed
+    assert (rooms[0].facing_north, rooms[1].facing_north) == (0.5, 0.0)
 
 
 @pytest.mark.parametrize(
