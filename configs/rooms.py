@@ -50,7 +50,7 @@ def get_config(initial_weights: str = "") -> ConfigDict:
         )
         config.stages = ConfigDict({f"stage_{n + 1}": lengths[n % 2] for n in range(TURNS)}, sort_keys=False)
         config.optimizer.update(learning_rate=5e-4, schedule="cosine")
-        # What ships knows the rooms of seed 0. Rooms that face one wall help at the beginning alone.
+        # What ships knows the rooms of seed 0. Those that face one wall are for the beginning: none is evaluated.
         config.data.sources.rooms.options.update(num_rooms=2400, seed=1, facing_north=0.0)
         config.data.cache_dir = "runs/rooms-cache"  # 6.3 GB, more than is kept in memory
     return with_all_fields(config)
