@@ -11,12 +11,14 @@ says. To go on from there, on clips of 12 and of 32 frames in turn (scripts/trai
 `configs/small.py` is the larger model for a GPU, `configs/tiny.py` the one for half an hour.
 """
 
+import zlib
+
 from ml_collections import ConfigDict
 
 from configs import tiny
 from logvggt_jax.training.config_fields import with_all_fields
 from logvggt_jax.weights.address import resolve
-from logvggt_jax.weights.checkpoints import read_config
+from logvggt_jax.weights.checkpoints import read_config, read_digests
 
 TURNS = 30  # of fifty steps each
 
@@ -27,8 +29,8 @@ def get_config(initial_weights: str = "") -> ConfigDict:
     With Muon rotation is learned after six hundred steps of single windows; with AdamW it took three thousand.
 
     From random numbers, or from `initial_weights`, a model folder, whose sizes it then has: without single windows, in
-    turns on clips of 12 and of 32 frames, and on rooms that what ships has not seen, since 1,200 were learned by heart
-    within hours. A run that goes on from there is to have another `seed` of its rooms, which are quickly rendered.
+    turns on clips of 12 and of 32 frames, and on rooms that these weights have not seen: 1,200 rooms were learned by
+    heart within hours, and new ones are quickly rendered.
     """
     config = tiny.get_config()
     config.model.encoder.embed_dim = 96
@@ -42,7 +44,8 @@ def get_config(initial_weights: str = "") -> ConfigDict:
     config.validation.every = 1000
     if initial_weights:
         config.initial_weights = initial_weights
-        config.model = read_config(resolve(initial_weights)).to_dict()
+        folder = resolve(initial_weights)
+        config.model = read_config(folder).to_dict()
         # In turn: a model that was trained on 12 frames alone forgot 32.
         lengths = (
             tiny.stage(steps=50, clip_length=12, batch_size=8, strides=(1, 4)),
@@ -50,7 +53,8 @@ def get_config(initial_weights: str = "") -> ConfigDict:
         )
         config.stages = ConfigDict({f"stage_{n + 1}": lengths[n % 2] for n in range(TURNS)}, sort_keys=False)
         config.optimizer.update(learning_rate=5e-4, schedule="cosine")
-        # What ships knows the rooms of seed 0. Those that face one wall are for the beginning: none is evaluated.
-        config.data.sources.rooms.options.update(num_rooms=2400, seed=1, facing_north=0.0)
+        # The seed follows from the parameters. Rooms that face one wall are for the beginning: none is evaluated.
+        new = zlib.crc32(repr(read_digests(folder)).encode())
+        config.data.sources.rooms.options.update(num_rooms=2400, seed=new, facing_north=0.0)
         config.data.cache_dir = "runs/rooms-cache"  # 6.3 GB, more than is kept in memory
     return with_all_fields(config)

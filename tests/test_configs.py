@@ -36,7 +36,7 @@ from logvggt_jax.training.step.program import abstract_parameters, make_program
 from logvggt_jax.training.step.state import TrainState
 from logvggt_jax.training.validation.validation import clip_starts
 from logvggt_jax.weights.address import resolve
-from logvggt_jax.weights.checkpoints import read_config
+from logvggt_jax.weights.checkpoints import read_config, save_model
 from logvggt_jax.weights.folder import write_description
 from logvggt_jax.weights.provenance import Provenance
 
@@ -131,6 +131,18 @@ def test_a_model_of_rooms_goes_on_from_weights_at_their_sizes_with_both_lengths_
     assert len(rooms[1].sequences) > len(rooms[0].sequences)
     assert rooms[1].seed != rooms[0].seed
     assert (rooms[0].facing_north, rooms[1].facing_north) == (0.5, 0.0)
+
+
+def test_weights_go_on_with_rooms_of_their_own(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, small_config: ModelConfig, small_variables: dict[str, Any]
+) -> None:
+    monkeypatch.syspath_prepend(str(ROOT))
+    get_config = importlib.import_module("configs.rooms").get_config
+    save_model(tmp_path / "other", small_config, small_variables["params"])
+    shipped, again, other = (
+        get_config(weights).data.sources.rooms.options.seed for weights in ("rooms", "rooms", str(tmp_path / "other"))
+    )
+    assert shipped == again != other
 
 
 @pytest.mark.parametrize(
