@@ -53,6 +53,7 @@ def get_config(initial_weights: str = "") -> ConfigDict:
         )
         config.stages = ConfigDict({f"stage_{n + 1}": lengths[n % 2] for n in range(TURNS)}, sort_keys=False)
         config.optimizer.update(learning_rate=5e-4, schedule="cosine")
+        config.loss.translation_weight = 2.0
         # The seed follows from the parameters. Rooms that face one wall are for the beginning: none is evaluated.
         new = zlib.crc32(repr(read_digests(folder)).encode())
         config.data.sources.rooms.options.update(num_rooms=2400, seed=new, facing_north=0.0)
