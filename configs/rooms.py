@@ -11,14 +11,12 @@ says. To go on from there, on clips of 12 and of 32 frames in turn (scripts/trai
 `configs/small.py` is the larger model for a GPU, `configs/tiny.py` the one for half an hour.
 """
 
-import zlib
-
 from ml_collections import ConfigDict
 
 from configs import tiny
 from logvggt_jax.training.config_fields import with_all_fields
 from logvggt_jax.weights.address import resolve
-from logvggt_jax.weights.checkpoints import read_config, read_digests
+from logvggt_jax.weights.checkpoints import read_config
 
 TURNS = 30  # of fifty steps each
 
@@ -44,8 +42,7 @@ def get_config(initial_weights: str = "") -> ConfigDict:
     config.validation.every = 1000
     if initial_weights:
         config.initial_weights = initial_weights
-        folder = resolve(initial_weights)
-        config.model = read_config(folder).to_dict()
+        config.model = read_config(resolve(initial_weights)).to_dict()
         # In turn: a model that was trained on 12 frames alone forgot 32.
         lengths = (
             tiny.stage(steps=50, clip_length=12, batch_size=8, strides=(1, 4)),
@@ -54,8 +51,6 @@ def get_config(initial_weights: str = "") -> ConfigDict:
         config.stages = ConfigDict({f"stage_{n + 1}": lengths[n % 2] for n in range(TURNS)}, sort_keys=False)
         config.optimizer.update(learning_rate=5e-4, schedule="cosine")
         config.loss.translation_weight = 2.0
-        # The seed follows from the parameters. Rooms that face one wall are for the beginning: none is evaluated.
-        new = zlib.crc32(repr(read_digests(folder)).encode())
-        config.data.sources.rooms.options.update(num_rooms=2400, seed=new, facing_north=0.0)
+        config.data.sources.rooms.options.update(num_rooms=2400, **tiny.unseen_rooms(initial_weights))
         config.data.cache_dir = "runs/rooms-cache"  # 6.3 GB, more than is kept in memory
     return with_all_fields(config)

@@ -5,7 +5,8 @@
 Written for one large GPU, which draws the rooms itself, in pieces: a run stops after eight minutes, and the same
 command goes on, to the same numbers, until all steps are done. On a CPU it runs at less than a tenth of the pace, in
 float32: add --config.model.dtype=float32 and a larger --config.max_minutes. Where the memory of a GPU does not
-suffice, lower the stages' batch_size. To go on from weights of these sizes, with clips of the last stage alone:
+suffice, lower the stages' batch_size. To go on from weights of these sizes, with clips of the last stage alone, on
+rooms that they have not seen:
 
     python train.py --config=configs/small.py:runs/small/model --workdir=runs/small-more
 
@@ -58,4 +59,5 @@ def get_config(initial_weights: str = "") -> ConfigDict:
         for name in ("stage_1", "stage_2"):
             del config.stages[name]
         config.optimizer.learning_rate = 1e-3
+        config.data.sources.rooms.options.update(tiny.unseen_rooms(initial_weights))
     return with_all_fields(config)

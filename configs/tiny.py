@@ -8,11 +8,14 @@ Depth is learned within minutes; rotation stays at the identity for the first tw
 """
 
 import math
+import zlib
 
 from ml_collections import ConfigDict
 from ml_collections.config_dict import placeholder
 
 from logvggt_jax.training.config_fields import with_all_fields
+from logvggt_jax.weights.address import resolve
+from logvggt_jax.weights.checkpoints import read_digests
 
 HEIGHT, WIDTH = 56, 70
 # Focal lengths of `compass` rooms in units of the image width, and their middle.
@@ -132,3 +135,9 @@ def stage(
         "max_stride": strides[1],
         "sizes": (size,),
     }
+
+
+def unseen_rooms(weights: str) -> dict:
+    """Options of rooms for a run that goes on from `weights`, which have not seen them: the seed follows from their
+    parameters. None of these rooms face one wall: that is for the beginning, and no room is evaluated that does."""
+    return {"seed": zlib.crc32(repr(read_digests(resolve(weights))).encode()), "facing_north": 0.0}
